@@ -1,0 +1,1 @@
+"""Many registrations in, a head model out."""

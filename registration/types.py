@@ -1,0 +1,146 @@
+"""Every type that crosses a room. Axis letters: N views, H W pixels, V vertices, F triangles, I identity,
+E expression, J joints, L landmarks, K classes. Units: metres, radians, pixels (`_px`), millimetres (`_mm`)."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from jaxtyping import Float, Int, UInt8
+from torch import Tensor
+
+Status = Literal["converged", "stopped", "failed"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Camera:
+    """A calibrated camera: pinhole plus OpenCV distortion."""
+
+    width_px: int
+    height_px: int
+    intrinsics: Float[np.ndarray, "3 3"]  # K in px, centre of pixel (0, 0) at (0.5, 0.5)
+    T_cam_world: Float[np.ndarray, "4 4"]
+    distortion: tuple[float, ...] = ()  # OpenCV order k1 k2 p1 p2 [k3 [k4 k5 k6]]; empty = none
+
+    @property
+    def centre(self) -> Float[np.ndarray, "3"]:
+        """The camera's position in the world, metres."""
+        return -self.T_cam_world[:3, :3].T @ self.T_cam_world[:3, 3]
+
+    def scaled(self, width_px: int, height_px: int) -> "Camera":
+        """The same camera for an image resampled to this size."""
+        scale = np.diag([width_px / self.width_px, height_px / self.height_px, 1.0])
+        return replace(self, width_px=width_px, height_px=height_px, intrinsics=scale @ self.intrinsics)
+
+    def cropped(self, x_px: int, y_px: int, width_px: int, height_px: int) -> "Camera":
+        """The same camera for the window of its image whose first pixel is (x_px, y_px); may reach outside."""
+        intrinsics = self.intrinsics.copy()
+        intrinsics[:2, 2] -= (x_px, y_px)
+        return replace(self, width_px=width_px, height_px=height_px, intrinsics=intrinsics)
+
+    def project(self, points: Float[np.ndarray, "P 3"]) -> tuple[Float[np.ndarray, "P 2"], Float[np.ndarray, "P"]]:
+        """World points (m) to pixels and depths (m), *without* distortion."""
+        local = points @ self.T_cam_world[:3, :3].T + self.T_cam_world[:3, 3]
+        image = local @ self.intrinsics.T
+        return image[:, :2] / image[:, 2:], local[:, 2]
+
+
+@dataclass(frozen=True, kw_only=True)
+class View:
+    """One image of a capture, as it lies on disk: nothing is decoded, landmarks are in distorted pixels."""
+
+    name: str  # image name without its suffix, e.g. "cam00"
+    camera: Camera
+    image: Path
+    mask: Path | None = None
+    normals: Path | None = None
+    segmentation: Path | None = None
+    landmarks: Mapping[str, Float[np.ndarray, "L 3"]] = field(default_factory=dict)  # scheme -> x_px y_px confidence
+
+
+@dataclass(frozen=True, kw_only=True)
+class Capture:
+    """One moment of one subject seen by many cameras."""
+
+    root: Path
+    subject: str
+    expression: str
+    views: tuple[View, ...]
+    classes: tuple[str, ...] = ()  # names of the label indices in `segmentation`
+    tags: Mapping[str, Any] = field(default_factory=dict)
+    scan: Path | None = None
+    ground_truth: Path | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class ViewPixels:
+    """One view decoded, undistorted and resampled; arrays share one pixel grid."""
+
+    camera: Camera  # without distortion, at this size
+    rgb: Float[np.ndarray, "H W 3"]  # linear
+    mask: Float[np.ndarray, "H W"] | None  # coverage of the subject in [0, 1]
+    normals: Float[np.ndarray, "H W 3"] | None  # unit, camera frame; 0 where there is none
+    labels: UInt8[np.ndarray, "H W"] | None  # index into Capture.classes
+    valid: Float[np.ndarray, "H W"]  # 1 where undistortion found a source pixel
+
+
+@dataclass(frozen=True, kw_only=True)
+class Targets:
+    """What the losses compare with, at one pyramid level: every view cut to one common window size."""
+
+    cameras: tuple[Camera, ...]  # of the windows
+    rgb: Float[Tensor, "N H W 3"]  # linear
+    rgb_weight: Float[Tensor, "N H W"]
+    normals: Float[Tensor, "N H W 3"]  # world frame, unit or 0
+    normal_weight: Float[Tensor, "N H W"]
+    mask: Float[Tensor, "N H W"]
+    mask_weight: Float[Tensor, "N H W"]
+    classes: Float[Tensor, "N H W K"]  # share of each of the model's classes
+    class_weight: Float[Tensor, "N H W"]
+    downsample: float  # full-resolution pixels per pixel
+
+
+@dataclass(frozen=True, kw_only=True)
+class Rendered:
+    """What the renderer draws for the views of one step; nothing is shaded."""
+
+    rgb: Float[Tensor, "N H W 3"]  # the texture's colour, linear
+    normals: Float[Tensor, "N H W 3"]  # world frame, unit; 0 on a miss
+    classes: Float[Tensor, "N H W K"]  # soft share of each class; 0 on a miss
+    mask: Float[Tensor, "N H W"]  # 1 on a hit
+
+
+@dataclass(frozen=True, kw_only=True)
+class Parameters:
+    """What drives the GNM function. Tensors may carry the same leading batch axes."""
+
+    identity: Float[Tensor, "*B I"]
+    expression: Float[Tensor, "*B E"]
+    rotations: Float[Tensor, "*B J 3"]  # axis-angle, each joint relative to its parent; the root turns everything
+    translation: Float[Tensor, "*B 3"]
+    scale: Float[Tensor, "*B"]  # applied to the posed mesh before the translation; 1 unless a recipe frees it
+
+
+@dataclass(frozen=True, kw_only=True)
+class Registration:
+    """The GNM mesh of one moment and how it was found. Arrays are float32 NumPy, in the model's vertex order."""
+
+    status: Status
+    reason: str
+    identity: Float[np.ndarray, "I"]
+    expression: Float[np.ndarray, "E"]
+    rotations: Float[np.ndarray, "J 3"]
+    translation: Float[np.ndarray, "3"]
+    scale: Float[np.ndarray, ""]
+    offsets: Float[np.ndarray, "V 3"]  # bind space, metres
+    vertices: Float[np.ndarray, "V 3"]  # capture world, metres
+    triangles: Int[np.ndarray, "F 3"]
+    confidence: Float[np.ndarray, "V"]
+    texture: Float[np.ndarray, "R R 3"]  # linear
+    corner_uvs: Float[np.ndarray, "F 3 2"]  # of the texture's atlas
+    seconds: Mapping[str, float] = field(default_factory=dict)  # per stage
+    history: Mapping[str, Mapping[str, list[float]]] = field(default_factory=dict)  # stage -> term -> value per step
+    figures: Mapping[str, Any] = field(default_factory=dict)
+    config: Mapping[str, Any] = field(default_factory=dict)  # the resolved configuration
+    inputs: Mapping[str, str] = field(default_factory=dict)  # name -> sha256

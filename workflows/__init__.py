@@ -1,0 +1,1 @@
+"""Many captures, many machines: command line, durable steps, flows."""
