@@ -1,0 +1,29 @@
+"""What all tests share: shape checks on the library, where the shared data lies, and when GPU tests run."""
+
+import ctypes
+from pathlib import Path
+
+import pytest
+from jaxtyping import install_import_hook
+
+# Before any test module imports the library: every jaxtyping annotation there becomes a checked one.
+install_import_hook(["registration", "coregister"], "beartype.beartype")
+
+SHARED = Path(__file__).resolve().parents[2] / "shared"
+needs_shared = pytest.mark.skipif(not SHARED.is_dir(), reason="no folder 'shared' beside the repository")
+
+
+def _gpu_missing() -> str | None:
+    """Why Dr.Jit's CUDA backend cannot run here, or None; asks the driver, because mitsuba would take seconds."""
+    try:
+        driver = ctypes.CDLL("libcuda.so.1")
+    except OSError:
+        return "no NVIDIA driver"
+    return "the NVIDIA driver finds no GPU" if driver.cuInit(0) else None
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    missing = _gpu_missing()
+    for item in items:
+        if missing and "cuda" in item.keywords:
+            item.add_marker(pytest.mark.skip(reason=missing))
