@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-from jaxtyping import Float, Int, UInt8
+from jaxtyping import Float, Int
 from torch import Tensor
 
 Status = Literal["converged", "stopped", "failed"]
@@ -81,8 +81,8 @@ class ViewPixels:
     rgb: Float[np.ndarray, "H W 3"]  # linear
     mask: Float[np.ndarray, "H W"] | None  # coverage of the subject in [0, 1]
     normals: Float[np.ndarray, "H W 3"] | None  # unit, camera frame; 0 where there is none
-    labels: UInt8[np.ndarray, "H W"] | None  # index into Capture.classes
-    valid: Float[np.ndarray, "H W"]  # 1 where undistortion found a source pixel
+    label_shares: Float[np.ndarray, "H W K"] | None  # share of each of Capture.classes; sums to 1 where valid
+    valid: Float[np.ndarray, "H W"]  # share of the pixel for which undistortion found a source
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -139,6 +139,7 @@ class Registration:
     confidence: Float[np.ndarray, "V"]
     texture: Float[np.ndarray, "R R 3"]  # linear
     corner_uvs: Float[np.ndarray, "F 3 2"]  # of the texture's atlas
+    landmarks: Mapping[str, Float[np.ndarray, "L 3"]] = field(default_factory=dict)  # scheme -> points on `vertices`
     seconds: Mapping[str, float] = field(default_factory=dict)  # per stage
     history: Mapping[str, Mapping[str, list[float]]] = field(default_factory=dict)  # stage -> term -> value per step
     figures: Mapping[str, Any] = field(default_factory=dict)

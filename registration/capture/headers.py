@@ -1,0 +1,109 @@
+"""What can be said about an image file without decoding its pixels."""
+
+import os
+import struct
+import warnings
+from dataclasses import dataclass
+from pathlib import Path
+
+from PIL import Image, UnidentifiedImageError
+
+from registration.errors import InputError
+
+MAX_PIXELS = 2**28  # 16384 x 16384: beyond any camera, and what a hostile header must not make us allocate
+_PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
+_PNG_END = b"\x00\x00\x00\x00IEND\xaeB`\x82"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Header:
+    """The declared properties of an image file."""
+
+    width_px: int
+    height_px: int
+    png_bits: int | None  # bits per channel; None where the file is not a PNG
+
+
+def read_header(path: Path, role: str) -> Header:
+    """Size and depth that the file declares; `role` ("image", "mask" ...) is for the message.
+
+    Raises InputError if the file is missing, is no image, or declares more than `MAX_PIXELS`.
+    """
+    if not path.is_file():
+        raise InputError(
+            f"The {role} is missing", where=path, expected=f"a readable {role} file", got="no such file",
+            fix="add the file, or remove its view from the COLMAP model",
+        )
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", Image.DecompressionBombWarning)  # MAX_PIXELS below is our limit
+            with Image.open(path) as image:
+                width_px, height_px = image.size
+    except Image.DecompressionBombError as error:
+        raise _too_large(path, role, str(error)) from None
+    except (UnidentifiedImageError, OSError, ValueError, SyntaxError) as error:
+        raise InputError(
+            f"The {role} is not a readable image", where=path, expected="a PNG, JPEG or TIFF file", got=error,
+            fix="write the file again; its header is damaged",
+        ) from None
+    if width_px * height_px > MAX_PIXELS:
+        raise _too_large(path, role, f"{width_px} x {height_px}")
+    with path.open("rb") as file:
+        start = file.read(26)
+    bits = start[24] if start.startswith(_PNG_SIGNATURE) and len(start) == 26 else None
+    return Header(width_px=width_px, height_px=height_px, png_bits=bits)
+
+
+def require_size(path: Path, role: str, width_px: int, height_px: int) -> Header:
+    """`read_header`, and an InputError if the size is not the camera's."""
+    header = read_header(path, role)
+    if (header.width_px, header.height_px) != (width_px, height_px):
+        raise InputError(
+            f"The {role}'s size is not the camera's", where=path, expected=f"{width_px} x {height_px} px",
+            got=f"{header.width_px} x {header.height_px} px",
+            fix=f"store the {role} at the size of the calibrated image, or rescale the camera in the COLMAP model",
+        )
+    return header
+
+
+def require_complete(path: Path, role: str) -> None:
+    """InputError if a PNG or JPEG file was cut off. Reads a few bytes at the end, or walks a PNG's chunk heads.
+
+    A hole in the middle of a file that still ends well is only found when its pixels are decoded.
+    """
+    with path.open("rb") as file:
+        start = file.read(8)
+        size = file.seek(0, os.SEEK_END)
+        file.seek(max(0, size - 4096))
+        tail = file.read()
+    if start == _PNG_SIGNATURE:
+        complete = tail.endswith(_PNG_END) or _png_chunks_reach_end(path, size)
+    elif start.startswith(b"\xff\xd8"):
+        complete = b"\xff\xd9" in tail  # some cameras append a few bytes behind the end marker
+    else:
+        complete = True
+    if not complete:
+        raise InputError(
+            f"The {role} is truncated", where=path, expected="a file that ends with its end marker",
+            got=f"{size} bytes, then nothing", fix="copy or write the file again",
+        )
+
+
+def _png_chunks_reach_end(path: Path, size: int) -> bool:
+    """Walk the chunk heads, so that bytes appended behind a whole PNG are forgiven as decoders forgive them."""
+    with path.open("rb") as file:
+        position = len(_PNG_SIGNATURE)
+        while position + 12 <= size:
+            file.seek(position)
+            length, kind = struct.unpack(">I4s", file.read(8))
+            position += 12 + length
+            if kind == b"IEND":
+                return position <= size
+    return False
+
+
+def _too_large(path: Path, role: str, got: str) -> InputError:
+    return InputError(
+        f"The {role} declares an absurd size", where=path, expected=f"at most {MAX_PIXELS} pixels", got=got,
+        fix="write the file again, or tile the image",
+    )

@@ -1,0 +1,115 @@
+"""3D landmarks from a capture's 2D ones, robust to broken views. Pure: nothing is read from disk."""
+
+from itertools import combinations
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from registration.capture.pixels import undistort_landmarks
+from registration.types import Capture
+
+MIN_CONFIDENCE = 0.5  # at or below it a 2D landmark is not used
+MAX_PAIRS = 400  # of views that start a hypothesis; 29 views have 406
+INLIER_SHARE = 0.01  # of the image's geometric mean side: a larger residual means that a view saw something else
+MIN_ANGLE = np.radians(0.5)  # between the widest two rays; below it depth is not determined
+
+
+def triangulate(
+    capture: Capture, scheme: str
+) -> tuple[Float[np.ndarray, "L 3"], Int[np.ndarray, "L"], Float[np.ndarray, "L"]]:
+    """Triangulate every landmark of a scheme in the capture's world.
+
+    Each pair of views proposes a point (linear DLT in normalised coordinates, Hartley and Zisserman 2004, section
+    12.2); the proposal with the least truncated reprojection error over all views wins; its inliers are then solved
+    together, reweighted from algebraic to reprojection error. One broken view so costs nothing but itself.
+
+    Returns points (m, world; NaN where fewer than two views agree), the number of views used, and the
+    root-mean-square reprojection error over those views (px of the full images; NaN as the points). L = 0 if no
+    view has the scheme.
+    """
+    views = [view for view in capture.views if scheme in view.landmarks]
+    if not views:
+        return np.zeros((0, 3)), np.zeros(0, np.int64), np.zeros(0)
+    pixels = np.stack([undistort_landmarks(view, scheme) for view in views])  # N L 3
+    seen = (pixels[..., 2] > MIN_CONFIDENCE) & np.isfinite(pixels).all(-1)
+    rays = np.stack([_normalised(view.camera.intrinsics, xy) for view, xy in zip(views, pixels[..., :2], strict=True)])
+    poses = np.stack([view.camera.T_cam_world[:3] for view in views])
+    focals = np.array([[view.camera.intrinsics[0, 0], view.camera.intrinsics[1, 1]] for view in views])
+    limits = np.array([INLIER_SHARE * np.sqrt(view.camera.width_px * view.camera.height_px) for view in views])
+
+    count = pixels.shape[1]
+    points, used, residuals = np.full((count, 3), np.nan), np.zeros(count, np.int64), np.full(count, np.nan)
+    for landmark in range(count):
+        index = np.flatnonzero(seen[:, landmark])
+        if len(index) < 2:
+            continue
+        solved = _solve(rays[index, landmark], poses[index], focals[index], limits[index])
+        if solved is not None:
+            points[landmark], inliers, residuals[landmark] = solved
+            used[landmark] = inliers.sum()
+    return points, used, residuals
+
+
+def _normalised(intrinsics: Float[np.ndarray, "3 3"], xy: Float[np.ndarray, "L 2"]) -> Float[np.ndarray, "L 2"]:
+    """Pixels to the plane z = 1 of the camera."""
+    homogeneous = np.concatenate([xy, np.ones((len(xy), 1))], -1)
+    return (homogeneous @ np.linalg.inv(intrinsics).T)[:, :2]
+
+
+def _solve(
+    rays: Float[np.ndarray, "N 2"],
+    poses: Float[np.ndarray, "N 3 4"],
+    focals: Float[np.ndarray, "N 2"],
+    limits: Float[np.ndarray, "N"],
+) -> tuple[Float[np.ndarray, "3"], Bool[np.ndarray, "N"], float] | None:
+    """One landmark: best pair, then its inliers together. None if no two views agree or their rays are parallel."""
+    rows = rays[:, :, None] * poses[:, 2:3] - poses[:, :2]  # N 2 4: the two DLT equations of a view
+    pairs = np.array(list(combinations(range(len(rays)), 2)))
+    if len(pairs) > MAX_PAIRS:
+        pairs = pairs[np.linspace(0, len(pairs) - 1, MAX_PAIRS).astype(int)]
+    proposals = _null_points(rows[pairs].reshape(len(pairs), 4, 4))
+    errors = _errors(proposals, rays, poses, focals)  # P N, px
+    best = np.minimum(errors / limits, 1.0).sum(-1).argmin()
+    inliers = errors[best] < limits
+    point = proposals[best]
+    for _ in range(3):
+        if inliers.sum() < 2:
+            return None
+        # Algebraic error is depth times reprojection error: dividing by the last depth leaves the latter.
+        depth = poses[inliers, 2, :3] @ point + poses[inliers, 2, 3]
+        scaled = rows[inliers] * (focals[inliers] / depth[:, None])[:, :, None]
+        point = _null_points(scaled.reshape(1, -1, 4))[0]
+        error = _errors(point[None], rays, poses, focals)[0]
+        inliers = error < limits
+    if inliers.sum() < 2 or _widest_angle(point, poses[inliers]) < MIN_ANGLE:
+        return None
+    return point, inliers, float(np.sqrt(np.mean(error[inliers] ** 2)))
+
+
+def _null_points(systems: Float[np.ndarray, "P R 4"]) -> Float[np.ndarray, "P 3"]:
+    """The point that each homogeneous system maps closest to zero; very far where it lies at infinity."""
+    solution = np.linalg.svd(systems, full_matrices=False)[2][:, -1]
+    scale = np.where(np.abs(solution[:, 3:]) < 1e-12, 1e-12, solution[:, 3:])
+    return solution[:, :3] / scale
+
+
+def _errors(
+    points: Float[np.ndarray, "P 3"],
+    rays: Float[np.ndarray, "N 2"],
+    poses: Float[np.ndarray, "N 3 4"],
+    focals: Float[np.ndarray, "N 2"],
+) -> Float[np.ndarray, "P N"]:
+    """Reprojection errors in px; infinite behind a camera."""
+    local = np.einsum("nij,pj->pni", poses[:, :, :3], points) + poses[:, :, 3]
+    depth = local[..., 2]
+    front = depth > 1e-9
+    image = local[..., :2] / np.where(front, depth, 1.0)[..., None]
+    return np.where(front, np.linalg.norm((image - rays) * focals, axis=-1), np.inf)
+
+
+def _widest_angle(point: Float[np.ndarray, "3"], poses: Float[np.ndarray, "N 3 4"]) -> float:
+    """The largest angle (rad) at which two cameras see the point."""
+    centres = -np.einsum("nji,nj->ni", poses[:, :, :3], poses[:, :, 3])
+    rays = point - centres
+    rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
+    return float(np.arccos(np.clip((rays @ rays.T).min(), -1.0, 1.0)))

@@ -1,0 +1,252 @@
+"""Decode one view: undistorted, resampled by area, in linear light.
+
+A view is decoded at full size in its own 8 or 16 bits and turned to float in strips of rows, so that 6144 x 4096
+needs a few hundred MB. Every result is the mean over those pixels of a block that undistortion found a source for.
+"""
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from functools import cache
+from pathlib import Path
+
+import cv2
+import numpy as np
+from jaxtyping import Float, UInt8
+from PIL import Image
+
+from registration.capture.headers import require_complete, require_size
+from registration.errors import InputError
+from registration.frames import opencv_intrinsics, srgb_to_linear
+from registration.types import Camera, Capture, View, ViewPixels
+
+STRIP_PIXELS = 2**21  # turned to float at a time: 25 MB of float32 RGB
+MAX_CLASSES = 255
+_NO_LABEL = 255  # marks pixels without a source
+_COLOUR = cv2.IMREAD_COLOR_RGB | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
+_GRAY = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION
+
+
+def read_view(view: View, capture: Capture, *, downsample: int = 1) -> ViewPixels:
+    """Decode a view at 1/`downsample` of its size (whole blocks only: the remainder at the right and bottom is cut).
+
+    Image, mask, normals and labels are undistorted alike and keep K; normals stay in the camera's frame.
+    Raises InputError naming the file if one is missing, truncated, of another size or of an unusable pixel type.
+    """
+    camera = view.camera
+    if not 1 <= downsample <= min(camera.width_px, camera.height_px):
+        raise InputError(
+            "The view cannot be reduced by this factor", where=view.name,
+            expected=f"1 to {min(camera.width_px, camera.height_px)}", got=downsample, fix="choose a smaller factor",
+        )
+    strips = list(_strips(camera, downsample))
+    valid = _valid(camera, strips)
+    rgb = _resample(read_colour(view.image, camera), _to_linear, strips, valid)
+    mask = None if view.mask is None else _resample(read_mask(view.mask, camera), _to_share, strips, valid)
+    normals = None if view.normals is None else _unit(
+        _resample(read_normals(view.normals, camera), _to_normals, strips, valid)
+    )
+    labels = None if view.segmentation is None else _label_shares(
+        read_labels(view.segmentation, camera, capture.classes), strips, len(capture.classes)
+    )
+    return ViewPixels(
+        camera=reduced(camera, downsample), rgb=rgb, mask=mask, normals=normals, label_shares=labels, valid=valid
+    )
+
+
+def reduced(camera: Camera, downsample: int) -> Camera:
+    """The undistorted camera of `read_view`'s arrays: whole blocks of `downsample` x `downsample` pixels."""
+    columns, rows = camera.width_px // downsample, camera.height_px // downsample
+    whole = camera.cropped(0, 0, columns * downsample, rows * downsample)
+    return replace(whole.scaled(columns, rows), distortion=())
+
+
+def undistort_landmarks(view: View, scheme: str) -> Float[np.ndarray, "L 3"]:
+    """A view's landmarks (x_px, y_px, confidence) where the undistorted full-size image shows them."""
+    landmarks = np.array(view.landmarks[scheme], np.float64)
+    camera = view.camera
+    if camera.distortion and len(landmarks):
+        criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 100, 1e-9)
+        # Points and K share one pixel convention here, so OpenCV's own does not enter.
+        undistorted = cv2.undistortPoints(
+            landmarks[:, None, :2], camera.intrinsics, np.array(camera.distortion), P=camera.intrinsics,
+            criteria=criteria,
+        )
+        landmarks[:, :2] = undistorted[:, 0]
+    return landmarks
+
+
+def read_colour(path: Path, camera: Camera) -> np.ndarray:
+    """An image as (H, W, 3) uint8 or uint16 sRGB, still distorted. Gray is repeated, alpha and EXIF turns ignored."""
+    pixels = _imread(path, "image", camera, _COLOUR)
+    if pixels.dtype not in (np.uint8, np.uint16):
+        raise InputError(
+            "The image has an unusable pixel type", where=path, expected="8 or 16 bits per channel",
+            got=pixels.dtype, fix="convert it to 8 or 16 bit sRGB",
+        )
+    return pixels
+
+
+def read_mask(path: Path, camera: Camera) -> UInt8[np.ndarray, "H W"]:
+    """A mask, 255 = subject, still distorted."""
+    return _imread(path, "mask", camera, _GRAY)
+
+
+def read_normals(path: Path, camera: Camera) -> np.ndarray:
+    """A normal map as (H, W, 3) uint16, encoded and still distorted."""
+    pixels = _imread(path, "normal map", camera, _COLOUR)
+    if pixels.dtype != np.uint16:
+        raise InputError(
+            "The normal map has too few bits", where=path, expected="16 bit RGB PNG, n = 2 v / 65535 - 1",
+            got=pixels.dtype, fix="write it with 16 bits per channel",
+        )
+    return pixels
+
+
+def read_labels(path: Path, camera: Camera, classes: tuple[str, ...]) -> UInt8[np.ndarray, "H W"]:
+    """A label map, indices into `classes`, still distorted. Every index must have a name."""
+    require_size(path, "label map", camera.width_px, camera.height_px)
+    require_complete(path, "label map")
+    try:
+        with Image.open(path) as image:  # unlike OpenCV it leaves palette indices what they are
+            mode = image.mode
+            labels = np.array(image)
+    except (OSError, ValueError, SyntaxError) as error:
+        raise _undecodable(path, "label map", str(error)) from None
+    if mode not in ("L", "P") or labels.dtype != np.uint8:
+        raise InputError(
+            "The label map is not a map of indices", where=path, expected="8 bit, one channel",
+            got=f"mode {mode}, {labels.dtype}", fix="store the class index of each pixel in one 8 bit channel",
+        )
+    highest = int(labels.max())
+    if highest >= min(len(classes), MAX_CLASSES):
+        raise InputError(
+            "A label index has no name", where=path, expected=f"indices below {len(classes)}: {', '.join(classes)}",
+            got=f"index {highest}", fix="name every index in [segmentation] classes of capture.toml",
+        )
+    return labels
+
+
+def _imread(path: Path, role: str, camera: Camera, flags: int) -> np.ndarray:
+    require_size(path, role, camera.width_px, camera.height_px)
+    require_complete(path, role)
+    pixels = cv2.imread(str(path), flags)
+    if pixels is None or pixels.shape[:2] != (camera.height_px, camera.width_px):
+        raise _undecodable(path, role, "a decoding error")
+    return pixels
+
+
+def _undecodable(path: Path, role: str, got: str) -> InputError:
+    return InputError(
+        f"The {role} cannot be decoded", where=path, expected="a whole, undamaged image", got=got,
+        fix="copy or write the file again",
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Strip:
+    """Rows of the result and where their pixels come from."""
+
+    out: slice  # rows of the result
+    columns: int  # of the result
+    downsample: int
+    source: slice  # rows of the distorted full-size image that are needed
+    warp: tuple[np.ndarray, np.ndarray] | None  # source x and y of every full-size pixel, relative to `source`
+
+    def undistort(self, block: np.ndarray, interpolation: int, border: int = 0) -> np.ndarray:
+        """The strip's full-size pixels from the rows `source`."""
+        if self.warp is not None:
+            fill = (border,) * 4
+            return cv2.remap(block, *self.warp, interpolation, borderMode=cv2.BORDER_CONSTANT, borderValue=fill)
+        return block[:, : self.columns * self.downsample]
+
+    def mean(self, block: np.ndarray) -> np.ndarray:
+        """Block means of the strip's full-size pixels; exact, because the factor is whole."""
+        if self.downsample == 1:
+            return block
+        size = (self.columns, self.out.stop - self.out.start)
+        return cv2.resize(block, size, interpolation=cv2.INTER_AREA)
+
+
+def _strips(camera: Camera, downsample: int) -> Iterator[_Strip]:
+    rows, columns = camera.height_px // downsample, camera.width_px // downsample
+    step = max(1, STRIP_PIXELS // (camera.width_px * downsample))
+    for first in range(0, rows, step):
+        out = slice(first, min(first + step, rows))
+        source, warp = slice(out.start * downsample, out.stop * downsample), None
+        if camera.distortion:
+            source, warp = _warp(camera, source, columns * downsample)
+        yield _Strip(out=out, columns=columns, downsample=downsample, source=source, warp=warp)
+
+
+def _warp(camera: Camera, rows: slice, width_px: int) -> tuple[slice, tuple[np.ndarray, np.ndarray]]:
+    """The source rows that some undistorted rows need, and the maps into them."""
+    intrinsics = opencv_intrinsics(camera.intrinsics)
+    window = intrinsics.copy()
+    window[1, 2] -= rows.start
+    size = (width_px, rows.stop - rows.start)
+    x, y = cv2.initUndistortRectifyMap(intrinsics, np.array(camera.distortion), None, window, size, cv2.CV_32FC1)
+    x, y = np.nan_to_num(x, nan=-1e6), np.nan_to_num(y, nan=-1e6)
+    first = int(np.clip(np.floor(y.min()), 0, camera.height_px - 1))
+    last = int(np.clip(np.ceil(y.max()) + 1, first + 1, camera.height_px))
+    return slice(first, last), (x, y - first)
+
+
+def _valid(camera: Camera, strips: list[_Strip]) -> Float[np.ndarray, "H W"]:
+    """Share of each block that has a source pixel."""
+    valid = np.ones((strips[-1].out.stop, strips[-1].columns), np.float32)
+    if camera.distortion:
+        for strip in strips:
+            ones = np.ones((strip.source.stop - strip.source.start, camera.width_px), np.float32)
+            valid[strip.out] = strip.mean(strip.undistort(ones, cv2.INTER_LINEAR))
+    return valid
+
+
+def _resample(
+    raw: np.ndarray, decode: Callable[[np.ndarray], np.ndarray], strips: list[_Strip], valid: Float[np.ndarray, "H W"]
+) -> np.ndarray:
+    """Float means over the pixels that have a source: (H, W) or (H, W, 3)."""
+    result = np.empty((*valid.shape, *raw.shape[2:]), np.float32)
+    for strip in strips:
+        mean = strip.mean(strip.undistort(decode(raw[strip.source]), cv2.INTER_LINEAR))
+        if strip.warp is not None:
+            share = valid[strip.out].reshape(mean.shape[:2] + (1,) * (mean.ndim - 2))
+            mean = np.where(share > 1e-3, mean / np.maximum(share, 1e-3), 0)
+        result[strip.out] = mean
+    return result
+
+
+def _label_shares(labels: UInt8[np.ndarray, "H W"], strips: list[_Strip], count: int) -> Float[np.ndarray, "H W K"]:
+    """Share of each class in each block; sums to 1 where any pixel has a source."""
+    shares = np.zeros((strips[-1].out.stop, strips[-1].columns, count), np.float32)
+    for strip in strips:
+        block = strip.undistort(labels[strip.source], cv2.INTER_NEAREST, border=_NO_LABEL)
+        for index in np.flatnonzero(np.bincount(block.ravel(), minlength=count)[:count]):
+            shares[strip.out, :, index] = strip.mean((block == index).astype(np.float32))
+    total = shares.sum(-1, keepdims=True)
+    return np.where(total > 0, shares / np.maximum(total, 1e-6), 0)
+
+
+@cache
+def _linear_table(bits: int) -> Float[np.ndarray, "levels"]:
+    levels = 2**bits
+    return srgb_to_linear(np.arange(levels) / (levels - 1)).astype(np.float32)
+
+
+def _to_linear(raw: np.ndarray) -> Float[np.ndarray, "H W 3"]:
+    if raw.dtype == np.uint8:
+        return cv2.LUT(raw, _linear_table(8))
+    return _linear_table(16)[raw]
+
+
+def _to_share(raw: UInt8[np.ndarray, "H W"]) -> Float[np.ndarray, "H W"]:
+    return raw.astype(np.float32) / 255
+
+
+def _to_normals(raw: np.ndarray) -> Float[np.ndarray, "H W 3"]:
+    return np.where(raw.any(-1, keepdims=True), raw * np.float32(2 / 65535) - 1, np.float32(0))
+
+
+def _unit(vectors: Float[np.ndarray, "H W 3"]) -> Float[np.ndarray, "H W 3"]:
+    """Unit vectors; 0 where the mean is too short to have a direction (background, or normals that cancel)."""
+    length = np.linalg.norm(vectors, axis=-1, keepdims=True)
+    return np.where(length > 1e-2, vectors / np.maximum(length, 1e-2), 0)
