@@ -1,0 +1,184 @@
+"""The command line, `gnmreg`: every command reads its arguments, calls the library once and prints the outcome.
+
+The library is imported inside the commands, so that help and typing errors never wait for torch or mitsuba.
+Exit codes: 0 done, 1 a registration that failed, 2 arguments or input that cannot be used.
+"""
+
+import sys
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Annotated, Any, Literal, Union
+
+import tyro
+from tyro.conf import Positional, arg, subcommand
+
+from registration.errors import InputError
+
+CaptureFolder = Positional[Annotated[Path, arg(metavar="CAPTURE")]]
+RegistrationFolder = Positional[Annotated[Path, arg(metavar="REG")]]
+NeutralFolder = Annotated[Path | None, arg(metavar="REG")]
+
+
+def register(
+    capture: CaptureFolder,
+    /,
+    model: Annotated[Path, arg(metavar="NPZ")],
+    out: Annotated[Path, arg(metavar="DIR")],
+    recipe: Literal["draft", "studio"] = "draft",
+    views: Annotated[int | None, arg(metavar="N")] = None,
+    seed: Annotated[int, arg(metavar="S")] = 0,
+    neutral: NeutralFolder = None,
+    deterministic: bool = False,
+    force: bool = False,
+    variant: Literal["llvm", "cuda"] = "llvm",
+    landmarks: Annotated[tuple[str, ...], arg(metavar="SCHEME=FILE")] = (),
+) -> int:
+    """Register one capture: images and cameras in, the model's mesh of that moment out.
+
+    Args:
+        capture: The capture folder.
+        model: The head model, a GNM NPZ file.
+        out: The registration folder to write; one that gnmreg wrote before is replaced.
+        recipe: draft takes minutes and checks that a capture works; studio is the full quality.
+        views: Use only this many views, spread around the head.
+        seed: Seed of everything random.
+        neutral: Start from this registration of the same subject and keep its identity.
+        deterministic: Make every array the same from run to run; slower.
+        force: Register again although the folder holds the result of the same input.
+        variant: Render on the CPU (llvm) or on an NVIDIA GPU (cuda).
+        landmarks: The model's vertices of a landmark scheme, instead of the file beside the model.
+    """
+    landmark_files = _landmark_files(landmarks)
+    from registration.register import register
+
+    result = register(
+        capture,
+        model_path=model,
+        out=out,
+        recipe=recipe,
+        views=views,
+        seed=seed,
+        neutral=neutral,
+        deterministic=deterministic,
+        force=force,
+        variant=variant,
+        landmark_files=landmark_files,
+    )
+    print(f"{result.status}: {result.reason}\n{out}")
+    return 1 if result.status == "failed" else 0
+
+
+def evaluate(
+    registration: RegistrationFolder,
+    /,
+    capture: Annotated[Path, arg(metavar="CAPTURE")],
+    neutral: NeutralFolder = None,
+    neutral_capture: Annotated[Path | None, arg(metavar="CAPTURE")] = None,
+) -> int:
+    """Compare a registration with its capture's scan and ground truth; print the figures and store them beside it.
+
+    Args:
+        registration: The registration folder.
+        capture: The capture that it registers.
+        neutral: The same subject's neutral registration: adds the drift of the surface against it.
+        neutral_capture: The capture of that neutral registration.
+    """
+    from registration.evaluate import evaluate_folder
+
+    print(evaluate_folder(registration, capture, neutral, neutral_capture))
+    return 0
+
+
+def check_capture(capture: CaptureFolder, /, out: Annotated[Path | None, arg(metavar="PNG")] = None) -> int:
+    """Check a capture folder before any fitting.
+
+    Args:
+        capture: The capture folder.
+        out: Where to draw the contact sheet: every image with the scan and the landmarks projected into it.
+    """
+    from registration.capture.doctor import check
+
+    print(check(capture, sheet=out))
+    return 0
+
+
+def describe_model(
+    file: Positional[Annotated[Path, arg(metavar="NPZ")]], /, out: Annotated[Path | None, arg(metavar="PNG")] = None
+) -> int:
+    """Tell what is in a model file: dimensions, parts and regions.
+
+    Args:
+        file: The head model, a GNM NPZ file.
+        out: Where to draw the model.
+    """
+    from registration.model.info import describe
+
+    print(describe(file, picture=out))
+    return 0
+
+
+def fetch_model() -> int:
+    """Download Google's GNM head weights into the cache and print where they lie."""
+    from registration.model.fetch import fetch
+
+    print(fetch())
+    return 0
+
+
+Command = Callable[..., int]
+Group = tuple[str, Mapping[str, Command]]  # what the group is about, its commands
+
+COMMANDS: Mapping[str, Command | Group] = {
+    "register": register,
+    "evaluate": evaluate,
+    "capture": ("Look at captures.", {"check": check_capture}),
+    "model": ("Look at head models and get them.", {"info": describe_model, "fetch": fetch_model}),
+}
+
+
+def main(args: Sequence[str] | None = None) -> int:
+    """Run one command; `args` replaces the process' own. Returns the exit code."""
+    try:
+        return tyro.cli(
+            _choice(COMMANDS),
+            prog="gnmreg",
+            description="Multi-view captures of human heads into clean meshes of one topology.",
+            args=args,
+            config=(tyro.conf.FlagCreatePairsOff, tyro.conf.OmitSubcommandPrefixes, tyro.conf.OmitArgPrefixes),
+        )
+    except InputError as error:
+        print(error, file=sys.stderr)
+        return 2
+
+
+def _choice(commands: Mapping[str, Command | Group]) -> Any:
+    """The type that makes tyro offer these commands."""
+    choices: list[Any] = [Annotated[None, tyro.conf.Suppress]]  # tyro flattens a union of one
+    for name, command in commands.items():
+        if isinstance(command, tuple):
+            description, members = command
+            choices.append(Annotated[_choice(members), subcommand(name, description=description)])
+        else:
+            choices.append(Annotated[Any, subcommand(name, constructor=command)])
+    return Union[tuple(choices)]  # noqa: UP007  a union of types that only exist at run time
+
+
+def _landmark_files(pairs: Sequence[str]) -> dict[str, Path]:
+    """`SCHEME=FILE` arguments as a mapping."""
+    files = {}
+    for pair in pairs:
+        scheme, separator, file = pair.partition("=")
+        if not (scheme and separator and file):
+            raise InputError(
+                "Cannot read a landmark file argument",
+                where="--landmarks",
+                expected="SCHEME=FILE, e.g. 68=head_sparse_68.txt",
+                got=pair,
+                fix="write the scheme's name, an equals sign and the path of the model's landmark file",
+            )
+        files[scheme] = Path(file)
+    return files
+
+
+if __name__ == "__main__":
+    sys.exit(main())
