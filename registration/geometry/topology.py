@@ -1,0 +1,73 @@
+"""Connectivity of a triangle mesh: edges, their faces, connected parts, vertex normals."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from registration.errors import InputError
+
+
+@dataclass(frozen=True, kw_only=True)
+class Edges:
+    """The unique edges of a triangle mesh. A boundary edge has face -1 and corners -1 on its second side."""
+
+    vertices: Int[np.ndarray, "E 2"]  # ordered as the first face runs along the edge
+    faces: Int[np.ndarray, "E 2"]
+    corners: Int[np.ndarray, "E 2 2"]  # [side, end]: 3 * face + corner of that end, in the order of `vertices`
+
+
+def edges(triangles: Int[np.ndarray, "F 3"]) -> Edges:
+    """Unique edges with their one or two faces.
+
+    Raises:
+        InputError: an edge has more than two faces (the mesh is not a manifold).
+    """
+    count = len(triangles)
+    start = np.concatenate([triangles[:, k] for k in range(3)]).astype(np.int64)
+    end = np.concatenate([triangles[:, (k + 1) % 3] for k in range(3)]).astype(np.int64)
+    face = np.tile(np.arange(count), 3)
+    corner = np.repeat(np.arange(3), count)
+    low, high = np.minimum(start, end), np.maximum(start, end)
+    order = np.lexsort((face, high, low))
+    low, high, start, end, face, corner = (a[order] for a in (low, high, start, end, face, corner))
+    first = np.flatnonzero(np.r_[True, (low[1:] != low[:-1]) | (high[1:] != high[:-1])])
+    faces_per_edge = np.diff(np.r_[first, len(low)])
+    if faces_per_edge.max() > 2:
+        bad = first[faces_per_edge.argmax()]
+        raise InputError(
+            "The mesh is not a manifold",
+            where=f"edge between vertices {low[bad]} and {high[bad]}",
+            expected="at most two triangles at an edge",
+            got=f"{faces_per_edge.max()} triangles",
+            fix="remove the duplicate or inner triangles",
+        )
+    two = faces_per_edge == 2
+    second = np.where(two, first + 1, first)
+    near = 3 * face + corner
+    far = 3 * face + (corner + 1) % 3
+    # The second face normally runs along the edge the other way; a flipped neighbour does not.
+    same_way = start[second] == start[first]
+    corners = np.stack(
+        [
+            np.stack([near[first], far[first]], 1),
+            np.stack([np.where(same_way, near[second], far[second]), np.where(same_way, far[second], near[second])], 1),
+        ],
+        1,
+    )
+    corners[~two, 1] = -1
+    return Edges(
+        vertices=np.stack([start[first], end[first]], 1),
+        faces=np.stack([face[first], np.where(two, face[second], -1)], 1),
+        corners=corners,
+    )
+
+
+def vertex_normals(vertices: Float[Tensor, "V 3"], triangles: Int[Tensor, "F 3"]) -> Float[Tensor, "V 3"]:
+    """Area-weighted unit normals; zero where a vertex has no area around it. Differentiable."""
+    a, b, c = (vertices[triangles[:, k]] for k in range(3))
+    normals = torch.linalg.cross(b - a, c - a)
+    total = torch.zeros_like(vertices).index_add(0, triangles.T.reshape(-1), normals.repeat(3, 1))
+    return total / total.norm(dim=-1, keepdim=True).clamp_min(1e-20)

@@ -1,0 +1,242 @@
+"""The unshaded differentiable renderer: one wavefront of Dr.Jit over the pixels of all views of a step.
+
+Forward casts one ray through each pixel centre. The adjoint has two parts: the interior, recomputed on the hits with
+attached vertices (nothing is traced again), and the silhouettes (`silhouette.py`). Nothing else moves an image:
+there is no shading, no film and no filter; a pixel is a box.
+"""
+
+from __future__ import annotations  # mi.Float exists only once a variant is chosen
+
+from collections.abc import Sequence
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from registration.geometry.topology import edges, vertex_normals
+from registration.render import silhouette
+from registration.render.cameras import CameraBatch, pack
+from registration.render.scene import TriangleScene
+from registration.render.shading import CLASSES, MASK, NORMAL, RGB, Surface, texel_footprint
+from registration.types import Camera, Rendered
+
+_MISS = 0xFFFFFFFF
+_CENTRE = (0.5, 0.5)
+
+
+class Renderer:
+    """Draws one topology. Build it once; vertices, texture and cameras change from call to call."""
+
+    def __init__(
+        self,
+        triangles: Int[np.ndarray, "F 3"],
+        corner_uvs: Float[np.ndarray, "F 3 2"],
+        vertex_classes: Float[np.ndarray, "V K"],
+        *,
+        pixel_samples: int = 1,
+        edge_samples: float = 1.0,
+        seed: int = 0,
+    ):
+        """
+        Args:
+            triangles: of welded vertices; what is not listed is not drawn.
+            corner_uvs: in [0, 1]^2 of one atlas; (0, 0) is the texture's lower left corner.
+            vertex_classes: soft class shares of the vertices.
+            pixel_samples: rays per pixel, averaged; 1 is the pixel's centre, which aliases but is enough for a fit.
+            edge_samples: silhouette samples per pixel of projected silhouette length, in the adjoint.
+            seed: of those samples; every adjoint draws new ones.
+
+        Raises:
+            InputError: the mesh is not a manifold.
+        """
+        vertex_count, self._class_count = vertex_classes.shape
+        self._scene = TriangleScene(vertex_count, triangles)
+        self._edges = silhouette.upload(edges(triangles))
+        self._faces = mi.UInt32(triangles.astype(np.uint32).ravel())
+        self._corner_uvs = mi.Float(corner_uvs.astype(np.float32).ravel())
+        self._classes = mi.Float(vertex_classes.astype(np.float32).ravel())
+        self._triangles = torch.as_tensor(triangles.astype(np.int64))
+        self._pixel_offsets = _pixel_offsets(pixel_samples)
+        self._edge_samples = edge_samples
+        self._seed = seed
+        dr.eval(self._faces, self._corner_uvs, self._classes)
+
+    def __call__(
+        self, vertices: Float[Tensor, "V 3"], texture: Float[Tensor, "R R 3"] | None, cameras: Sequence[Camera]
+    ) -> Rendered:
+        """Draw all views; differentiable in `vertices` (world, metres) and `texture` (linear).
+
+        Without a texture the RGB channels are zero and cost nothing. Cameras have one image size, no distortion.
+        """
+        self._triangles = self._triangles.to(vertices.device)
+        normals = vertex_normals(vertices, self._triangles)
+        image = _Draw.apply(vertices, normals, texture, self, pack(cameras))
+        return Rendered(
+            rgb=image[..., RGB], normals=image[..., NORMAL], mask=image[..., MASK], classes=image[..., CLASSES:]
+        )
+
+    def unwrap(
+        self,
+        vertices: Float[Tensor, "V 3"],
+        values: Float[Tensor, "N H W D"],
+        weights: Float[Tensor, "N H W"],
+        cameras: Sequence[Camera],
+        texture_size: int,
+    ) -> tuple[Float[Tensor, "R R D"], Float[Tensor, "R R"]]:
+        """Carry images back to the texture: the transpose of the bilinear look-up.
+
+        Returns the weighted sum of `values` that fell on each texel, and the sum of the weights. Not differentiable.
+        """
+        with torch.no_grad():
+            self._triangles = self._triangles.to(vertices.device)
+            surface = self._surface(vertices, vertex_normals(vertices, self._triangles), None, texture_size)
+            self._scene.move(vertices)
+            return self._splat(surface, pack(cameras), values, weights)
+
+    def _surface(self, positions: Tensor, normals: Tensor, texture: Tensor | None, texture_size: int = 0) -> Surface:
+        return Surface(
+            faces=self._faces,
+            corner_uvs=self._corner_uvs,
+            classes=self._classes,
+            class_count=self._class_count,
+            positions=_upload(positions),
+            normals=_upload(normals),
+            texture=None if texture is None else _upload(texture),
+            texture_size=texture_size if texture is None else texture.shape[0],
+        )
+
+    def _trace(self, cameras: CameraBatch, offset: tuple[float, float]):
+        count = cameras.count * cameras.height_px * cameras.width_px
+        origin, direction = _pixel_rays(cameras, dr.arange(mi.UInt32, count), offset)
+        return self._scene.cast(origin, direction, mi.Bool(True), coherent=True)
+
+    def _forward(self, surface: Surface, cameras: CameraBatch) -> tuple[mi.Float, list[mi.UInt32]]:
+        """The image, (N H W C) flat, and for each ray of a pixel the face it meets, or _MISS."""
+        image, seen = mi.Float(0), []
+        with dr.suspend_grad():
+            for offset in self._pixel_offsets:
+                hit = self._trace(cameras, offset)
+                is_hit = hit.is_valid()
+                face = dr.select(is_hit, hit.prim_index, 0)
+                channels = surface.shade(face, hit.prim_uv.x, hit.prim_uv.y, is_hit)
+                image += dr.ravel(mi.ArrayXf(channels)) * (1 / len(self._pixel_offsets))
+                seen.append(dr.select(is_hit, hit.prim_index, _MISS))
+                dr.eval(image, seen)
+            dr.sync_thread()
+        return image, seen
+
+    def _interior(
+        self,
+        surface: Surface,
+        cameras: CameraBatch,
+        offset: tuple[float, float],
+        seen: mi.UInt32,
+        adjoint: mi.Float,
+    ) -> None:
+        """Add the part of the gradient that needs no visibility change, over the rays that hit."""
+        pixel = dr.compress(seen != _MISS)
+        if dr.width(pixel) == 0:
+            return
+        face = dr.gather(mi.UInt32, seen, pixel)
+        origin, direction = _pixel_rays(cameras, pixel, offset)
+        b1, b2 = surface.barycentrics(face, origin, direction)
+        channels = surface.shade(face, b1, b2, mi.Bool(True))
+        g = dr.gather(mi.ArrayXf, adjoint, pixel, shape=(surface.channel_count, dr.width(pixel)))
+        first = 0 if surface.texture is not None else NORMAL.start
+        value = sum((g[k] * channels[k] for k in range(first, len(channels)) if k != MASK), mi.Float(0))
+        dr.backward(value * (1 / len(self._pixel_offsets)))
+
+    def _splat(self, surface: Surface, cameras: CameraBatch, values: Tensor, weights: Tensor):
+        size, depth = surface.texture_size, values.shape[-1]
+        with dr.suspend_grad():
+            hit = self._trace(cameras, _CENTRE)
+            active = hit.is_valid()
+            face = dr.select(active, hit.prim_index, 0)
+            b = [1 - hit.prim_uv.x - hit.prim_uv.y, hit.prim_uv.x, hit.prim_uv.y]
+            uvs = [dr.gather(mi.Point2f, surface.corner_uvs, 3 * face + k, active) for k in range(3)]
+            index, fx, fy = texel_footprint(b[0] * uvs[0] + b[1] * uvs[1] + b[2] * uvs[2], size)
+            weight = _upload(weights)
+            active &= weight > 0
+            total, density = dr.zeros(mi.Float, size * size * depth), dr.zeros(mi.Float, size * size)
+            lane = dr.arange(mi.UInt32, weights.numel())
+            value = dr.gather(mi.ArrayXf, _upload(values), lane, shape=(depth, weights.numel()))
+            corners = ((0, (1 - fx) * (1 - fy)), (1, fx * (1 - fy)), (size, (1 - fx) * fy), (size + 1, fx * fy))
+            for step, share in corners:
+                w = share * weight
+                dr.scatter_reduce(dr.ReduceOp.Add, density, w, index + step, active)
+                for k in range(depth):
+                    dr.scatter_reduce(dr.ReduceOp.Add, total, w * value[k], (index + step) * depth + k, active)
+            dr.eval(total, density)
+            dr.sync_thread()
+        return total.torch().view(size, size, depth).clone(), density.torch().view(size, size).clone()
+
+
+class _Draw(torch.autograd.Function):
+    """The bridge: torch tensors in and out, Dr.Jit between. Memory is shared, so every hand-over waits."""
+
+    @staticmethod
+    def forward(ctx, positions, normals, texture, renderer: Renderer, cameras: CameraBatch):
+        renderer._scene.move(positions)
+        surface = renderer._surface(positions, normals, texture)
+        image, ctx.seen = renderer._forward(surface, cameras)
+        ctx.renderer, ctx.cameras = renderer, cameras
+        ctx.save_for_backward(positions, normals, *(() if texture is None else (texture,)))
+        return image.torch().view(cameras.count, cameras.height_px, cameras.width_px, surface.channel_count)
+
+    @staticmethod
+    def backward(ctx, *grad_outputs):
+        positions, normals, *rest = ctx.saved_tensors
+        renderer: Renderer = ctx.renderer
+        renderer._scene.move(positions)
+        surface = renderer._surface(positions, normals, rest[0] if rest else None)
+        adjoint = _upload(grad_outputs[0])
+        attached = [surface.positions, surface.normals] + ([surface.texture] if rest else [])
+        dr.enable_grad(*attached)
+        for offset, seen in zip(renderer._pixel_offsets, ctx.seen, strict=True):
+            renderer._interior(surface, ctx.cameras, offset, seen, adjoint)
+        moving = mi.Float(dr.detach(surface.positions))
+        dr.enable_grad(moving)
+        renderer._seed += 1
+        silhouette.backward(
+            renderer._scene,
+            renderer._surface(positions, normals, rest[0] if rest else None),
+            moving,
+            renderer._edges,
+            ctx.cameras,
+            adjoint,
+            samples_per_px=renderer._edge_samples,
+            seed=renderer._seed,
+        )
+        gradients = [dr.grad(a) for a in attached]
+        gradients[0] = gradients[0] + dr.grad(moving)
+        dr.eval(gradients)
+        dr.sync_thread()
+        shapes = [positions.shape, normals.shape] + [t.shape for t in rest]
+        out = [g.torch().reshape(shape).clone() for g, shape in zip(gradients, shapes, strict=True)]
+        return out[0], out[1], out[2] if rest else None, None, None
+
+
+def _upload(tensor: Tensor) -> mi.Float:
+    """A torch tensor as a flat Dr.Jit array; shares memory where it can."""
+    return mi.Float(tensor.detach().contiguous().reshape(-1))
+
+
+def _pixel_offsets(count: int) -> list[tuple[float, float]]:
+    """Where in a pixel its rays go: the centre, or a low-discrepancy (golden ratio) lattice."""
+    if count == 1:
+        return [_CENTRE]
+    return [((i + 0.5) / count, (i * 0.6180339887498949 + 0.25) % 1) for i in range(count)]
+
+
+def _pixel_rays(cameras: CameraBatch, pixel: mi.UInt32, offset: tuple[float, float]) -> tuple[mi.Point3f, mi.Vector3f]:
+    """Rays through pixels, given as flat indices into (N H W), at an offset from the pixel's corner."""
+    height, width = dr.opaque(mi.UInt32, cameras.height_px), dr.opaque(mi.UInt32, cameras.width_px)
+    row = pixel // width
+    view = row // height
+    camera = cameras.gather(view)
+    x, y = (dr.opaque(mi.Float, value) for value in offset)
+    x, y = x + mi.Float(pixel - row * width), y + mi.Float(row - view * height)
+    return camera.centre, camera.direction(x, y)

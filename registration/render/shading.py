@@ -1,0 +1,95 @@
+"""What a surface point looks like, unshaded: texture colour, world normal, soft classes, mask.
+
+Everything is a Dr.Jit gather; looking a point up needs its face and barycentrics only.
+"""
+
+from __future__ import annotations  # mi.Float exists only once a variant is chosen
+
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+
+RGB, NORMAL, MASK, CLASSES = slice(0, 3), slice(3, 6), 6, 7  # channels of an image; classes run to its end
+
+
+@dataclass(frozen=True, kw_only=True)
+class Surface:
+    """The arrays of one mesh on the device. `positions` and `normals` may carry gradients, `texture` too."""
+
+    faces: mi.UInt32  # 3F
+    corner_uvs: mi.Float  # 6F
+    classes: mi.Float  # V * class_count
+    class_count: int
+    positions: mi.Float  # 3V, world, metres
+    normals: mi.Float  # 3V, unit
+    texture: mi.Float | None  # 3 R^2, row 0 at v = 1
+    texture_size: int
+
+    @property
+    def channel_count(self) -> int:
+        return CLASSES + self.class_count
+
+    def corners(self, face: mi.UInt32, active: mi.Bool) -> mi.Point3u:
+        return dr.gather(mi.Point3u, self.faces, face, active)
+
+    def position(self, vertex: mi.UInt32, active: mi.Bool = True) -> mi.Point3f:
+        return dr.gather(mi.Point3f, self.positions, vertex, active)
+
+    def barycentrics(self, face: mi.UInt32, origin: mi.Point3f, direction: mi.Vector3f) -> tuple[mi.Float, mi.Float]:
+        """Where a fixed ray meets the plane of a face (Moeller and Trumbore); differentiable in `positions`."""
+        corners = self.corners(face, True)
+        a, b, c = (self.position(corners[k]) for k in range(3))
+        ab, ac = b - a, c - a
+        p = dr.cross(direction, ac)
+        scale = dr.rcp(dr.dot(ab, p))
+        t = origin - a
+        return dr.dot(t, p) * scale, dr.dot(direction, dr.cross(t, ab)) * scale
+
+    def shade(self, face: mi.UInt32, b1: mi.Float, b2: mi.Float, active: mi.Bool) -> list[mi.Float]:
+        """The channels of the surface point (face; 1 - b1 - b2, b1, b2); zero where not active."""
+        corners = self.corners(face, active)
+        return self._mix(
+            [1 - b1 - b2, b1, b2], [corners[k] for k in range(3)], [3 * face + k for k in range(3)], active
+        )
+
+    def shade_edge(self, vertex: mi.Point2u, corner: mi.Point2u, t: mi.Float, active: mi.Bool) -> list[mi.Float]:
+        """The channels of a point on an edge, at share t of the way from its first to its second end."""
+        return self._mix([1 - t, t], [vertex.x, vertex.y], [corner.x, corner.y], active)
+
+    def _mix(self, weights, vertices, corners, active) -> list[mi.Float]:
+        # prim_uv is undefined on a miss: weights must be silenced there or NaNs spread.
+        weights = [dr.select(active, w, 0) for w in weights]
+        pairs = list(zip(weights, vertices, strict=True))
+        normal = sum((w * dr.gather(mi.Vector3f, self.normals, v, active) for w, v in pairs), mi.Vector3f(0))
+        normal *= dr.rsqrt(dr.maximum(dr.squared_norm(normal), 1e-12))
+        classes = [mi.Float(0)] * self.class_count
+        for w, v in pairs:
+            row = dr.gather(mi.ArrayXf, self.classes, v, active, shape=(self.class_count, dr.width(v)))
+            classes = [total + w * row[k] for k, total in enumerate(classes)]
+        colour = [mi.Float(0)] * 3
+        if self.texture is not None:
+            uv = sum(
+                (w * dr.gather(mi.Point2f, self.corner_uvs, c, active) for w, c in zip(weights, corners, strict=True)),
+                mi.Point2f(0),
+            )
+            colour = list(self._lookup(uv, active))
+        mask = dr.select(active, mi.Float(1), 0)
+        return [*colour, normal.x, normal.y, normal.z, mask, *classes]
+
+    def _lookup(self, uv: mi.Point2f, active: mi.Bool) -> mi.Color3f:
+        def texel(index):
+            return dr.gather(mi.Color3f, self.texture, index, active)
+
+        index, fx, fy = texel_footprint(uv, self.texture_size)
+        top = dr.lerp(texel(index), texel(index + 1), fx)
+        bottom = dr.lerp(texel(index + self.texture_size), texel(index + self.texture_size + 1), fx)
+        return dr.lerp(top, bottom, fy)
+
+
+def texel_footprint(uv: mi.Point2f, size: int) -> tuple[mi.UInt32, mi.Float, mi.Float]:
+    """The first texel of a bilinear footprint and the position inside it. Row 0 of the texture is at v = 1."""
+    x = dr.clip(uv.x * size - 0.5, 0, size - 1.001)
+    y = dr.clip((1 - uv.y) * size - 0.5, 0, size - 1.001)
+    column, row = mi.UInt32(dr.detach(x)), mi.UInt32(dr.detach(y))
+    return row * size + column, x - mi.Float(column), y - mi.Float(row)

@@ -1,0 +1,183 @@
+"""The gradient of visibility: primary edge sampling (Li et al. 2018) over the silhouettes of all views at once.
+
+An edge is a silhouette of a view if exactly one of its faces looks at the camera, or if it has one face only.
+Samples are uniform over the projected length L (px) of all silhouettes of all views; with N samples
+
+    dLoss = (L / N) sum [g(pixel) . (f_in - f_out)] n . [(1 - s) dx_A + s dx_B]
+
+where x_A, x_B are the projected ends (px), n is the outward normal of the edge in the image, s the position on it
+(linear on the screen), g the adjoint image, f_in the channels on the edge and f_out those just beyond it.
+"""
+
+from __future__ import annotations  # mi.Float exists only once a variant is chosen
+
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+
+from registration.geometry.topology import Edges
+from registration.render.cameras import CameraBatch, CameraLanes
+from registration.render.scene import TriangleScene
+from registration.render.shading import MASK, Surface
+
+# How far beyond the edge the outside ray goes, in focal lengths (px). Larger biases, smaller meets float32.
+_STEP = 1e-6
+# An outside hit nearer than the edge by more than this share of its depth hides the edge.
+_DEPTH_TOLERANCE = 1e-5
+_SEARCH_END = (1 << 22) - 1  # fixed, so that the number of silhouette edges never compiles a new kernel
+_SAMPLE_BLOCK = 4096
+_NONE = 0xFFFFFFFF
+
+
+@dataclass(frozen=True, kw_only=True)
+class EdgeArrays:
+    """`topology.Edges` on the device; a missing second side is _NONE."""
+
+    vertices: mi.UInt32  # 2E
+    faces: mi.UInt32  # 2E
+    corners: mi.UInt32  # 4E
+    count: int
+
+
+def upload(edges: Edges) -> EdgeArrays:
+    import numpy as np
+
+    def flat(array):
+        return mi.UInt32(np.where(array < 0, _NONE, array).astype(np.uint32).ravel())
+
+    return EdgeArrays(
+        vertices=flat(edges.vertices), faces=flat(edges.faces), corners=flat(edges.corners), count=len(edges.vertices)
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Silhouettes:
+    """The silhouette edges of all views: which, how they lie in the cumulated length, which side is seen."""
+
+    ids: mi.UInt32  # view * edge count + edge
+    side: mi.UInt32  # 0 or 1: the side that faces the camera
+    length_px: mi.Float  # cumulated
+    count: mi.UInt32
+    total_px: mi.Float
+
+
+def _find(surface: Surface, edges: EdgeArrays, cameras: CameraBatch) -> _Silhouettes | None:
+    face_count = dr.width(surface.faces) // 3
+    faces, edge_count = dr.opaque(mi.UInt32, face_count), dr.opaque(mi.UInt32, edges.count)
+
+    lane = dr.arange(mi.UInt32, cameras.count * face_count)
+    view = lane // faces
+    corners = surface.corners(lane - view * faces, True)
+    a, b, c = (surface.position(corners[k]) for k in range(3))
+    facing = dr.dot(dr.cross(b - a, c - a), cameras.centre(view) - a) > 0
+    dr.eval(facing)
+
+    lane = dr.arange(mi.UInt32, cameras.count * edges.count)
+    view = lane // edge_count
+    edge = lane - view * edge_count
+    pair = dr.gather(mi.Point2u, edges.faces, edge)
+    boundary = pair.y == _NONE
+    first = dr.gather(mi.Bool, facing, view * faces + pair.x)
+    second = dr.gather(mi.Bool, facing, view * faces + pair.y, ~boundary)
+    ids = dr.compress(boundary | (first != second))
+    if dr.width(ids) == 0:
+        return None
+    side = dr.gather(mi.UInt32, dr.select(boundary | first, mi.UInt32(0), 1), ids)
+
+    view = ids // edge_count
+    ends = dr.gather(mi.Point2u, edges.vertices, ids - view * edge_count)
+    camera = cameras.gather(view)
+    xa, za = camera.project(surface.position(ends.x))
+    xb, zb = camera.project(surface.position(ends.y))
+    length = dr.cumsum(dr.select((za > 0) & (zb > 0), dr.norm(xb - xa), 0))
+    count = dr.opaque(mi.UInt32, dr.width(ids))
+    total = dr.gather(mi.Float, length, count - 1)
+    dr.eval(ids, side, length, total)
+    return _Silhouettes(ids=ids, side=side, length_px=length, count=count, total_px=total)
+
+
+def _sample(found: _Silhouettes, samples: int, seed: int) -> tuple[mi.UInt32, mi.Float]:
+    """Stratified samples uniform over length: which silhouette, and where on it (screen-linear)."""
+    lane = dr.arange(mi.UInt32, samples)
+    random, _ = mi.sample_tea_32(lane, dr.opaque(mi.UInt32, seed))
+    jitter = mi.Float(random) * (1 / 4294967296)
+    position = (mi.Float(lane) + jitter) / dr.opaque(mi.Float, samples) * found.total_px
+    last = found.count - 1
+
+    def before(index):
+        index = mi.UInt32(index)
+        return (index < last) & (dr.gather(mi.Float, found.length_px, dr.minimum(index, last)) < position)
+
+    which = dr.minimum(dr.binary_search(0, _SEARCH_END, before), last)
+    start = dr.select(which > 0, dr.gather(mi.Float, found.length_px, dr.maximum(which, 1) - 1), 0)
+    end = dr.gather(mi.Float, found.length_px, which)
+    return which, dr.clip((position - start) / dr.maximum(end - start, 1e-12), 0, 1)
+
+
+def _outward(surface: Surface, camera: CameraLanes, face: mi.UInt32, xa: mi.Point2f, xb: mi.Point2f) -> mi.Vector2f:
+    """The unit normal of an edge in the image that points away from its face."""
+    along = xb - xa
+    along /= dr.maximum(dr.norm(along), 1e-12)
+    normal = mi.Vector2f(-along.y, along.x)
+    corners = surface.corners(face, True)
+    centre, _ = camera.project(sum((surface.position(corners[k]) for k in range(3)), mi.Point3f(0)) / 3)
+    return dr.select(dr.dot(centre - xa, normal) > 0, -normal, normal)
+
+
+def backward(
+    scene: TriangleScene,
+    surface: Surface,
+    moving: mi.Float,
+    edges: EdgeArrays,
+    cameras: CameraBatch,
+    adjoint: mi.Float,
+    *,
+    samples_per_px: float,
+    seed: int,
+) -> None:
+    """Add the silhouettes' part of d(adjoint . image)/d(positions) to the gradient of `moving`.
+
+    `surface` is detached, `moving` is the same positions with gradients enabled; `adjoint` is (N H W C) flat.
+    """
+    with dr.suspend_grad():
+        found = _find(surface, edges, cameras)
+        if found is None:
+            return
+        samples = int(samples_per_px * float(dr.slice(found.total_px, 0)))
+        samples = _SAMPLE_BLOCK * (1 + samples // _SAMPLE_BLOCK)  # few distinct sizes: memory is reused
+        which, s = _sample(found, samples, seed)
+        view_edge, side = dr.gather(mi.UInt32, found.ids, which), dr.gather(mi.UInt32, found.side, which)
+        edge_count = dr.opaque(mi.UInt32, edges.count)
+        view = view_edge // edge_count
+        edge = view_edge - view * edge_count
+        ends = dr.gather(mi.Point2u, edges.vertices, edge)
+        camera = cameras.gather(view)
+        xa, za = camera.project(surface.position(ends.x))
+        xb, zb = camera.project(surface.position(ends.y))
+        normal = _outward(surface, camera, dr.gather(mi.UInt32, edges.faces, 2 * edge + side), xa, xb)
+
+        x = dr.lerp(xa, xb, s)
+        depth = dr.rcp((1 - s) / za + s / zb)
+        height, width = dr.opaque(mi.UInt32, cameras.height_px), dr.opaque(mi.UInt32, cameras.width_px)
+        inside = (x.x >= 0) & (x.y >= 0) & (x.x < mi.Float(width)) & (x.y < mi.Float(height)) & (za > 0) & (zb > 0)
+        pixel = (view * height + mi.UInt32(dr.select(inside, x.y, 0))) * width + mi.UInt32(dr.select(inside, x.x, 0))
+        channels = surface.channel_count
+        g = dr.gather(mi.ArrayXf, adjoint, pixel, inside, shape=(channels, samples))
+
+        beyond = x + normal * (_STEP * camera.fx)
+        hit = scene.cast(camera.centre, camera.direction(beyond.x, beyond.y), inside, coherent=False)
+        is_hit = inside & hit.is_valid()
+        seen = inside & ~(is_hit & (hit.t < depth * (1 - _DEPTH_TOLERANCE)))
+        face = dr.select(is_hit, hit.prim_index, 0)
+        f_out = surface.shade(face, hit.prim_uv.x, hit.prim_uv.y, is_hit & seen)
+        corners = dr.gather(mi.Point2u, edges.corners, 2 * edge + side, seen)
+        perspective = s * za / dr.maximum((1 - s) * zb + s * za, 1e-9)
+        f_in = surface.shade_edge(ends, corners, perspective, seen)
+        first = 0 if surface.texture is not None else MASK - 3
+        jump = sum((g[k] * (f_in[k] - f_out[k]) for k in range(first, channels)), mi.Float(0))
+        weight = dr.select(seen, jump, 0) * (found.total_px / dr.opaque(mi.Float, samples))
+
+    a, b = (dr.gather(mi.Point3f, moving, end, seen) for end in (ends.x, ends.y))
+    speed = dr.lerp(dr.dot(normal, camera.project(a)[0]), dr.dot(normal, camera.project(b)[0]), s)
+    dr.backward(weight * speed)
