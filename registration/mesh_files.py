@@ -1,0 +1,38 @@
+"""Meshes for people's tools: binary PLY and Wavefront OBJ, vertices in the model's order."""
+
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float, Int
+
+
+def write_ply(file: Path, vertices: Float[np.ndarray, "V 3"], triangles: Int[np.ndarray, "F 3"]) -> None:
+    """Binary little-endian PLY with exactly these vertices, float32, in this order; no uvs, so nothing is split."""
+    header = (
+        "ply\nformat binary_little_endian 1.0\n"
+        f"element vertex {len(vertices)}\nproperty float x\nproperty float y\nproperty float z\n"
+        f"element face {len(triangles)}\nproperty list uchar int vertex_indices\nend_header\n"
+    )
+    faces = np.empty(len(triangles), [("count", "u1"), ("corners", "<i4", 3)])
+    faces["count"], faces["corners"] = 3, triangles
+    file.write_bytes(header.encode("ascii") + vertices.astype("<f4").tobytes() + faces.tobytes())
+
+
+def write_obj(
+    file: Path,
+    vertices: Float[np.ndarray, "V 3"],
+    triangles: Int[np.ndarray, "F 3"],
+    corner_uvs: Float[np.ndarray, "F 3 2"],
+    texture: str,
+) -> None:
+    """OBJ with uvs (v = 0 at the texture's bottom) and, beside it, an MTL that names the texture file."""
+    uvs, index = np.unique(corner_uvs.reshape(-1, 2), axis=0, return_inverse=True)
+    corners = np.stack([triangles, index.reshape(-1, 3)], -1).reshape(-1, 6) + 1
+    material = file.with_suffix(".mtl")
+    lines = [f"mtllib {material.name}"]
+    lines += ["v {:.7g} {:.7g} {:.7g}".format(*row) for row in vertices.tolist()]
+    lines += ["vt {:.7g} {:.7g}".format(*row) for row in uvs.tolist()]
+    lines += ["usemtl head"]
+    lines += ["f {}/{} {}/{} {}/{}".format(*row) for row in corners.tolist()]
+    file.write_text("\n".join(lines) + "\n", encoding="ascii")
+    material.write_text(f"newmtl head\nKa 0 0 0\nKd 1 1 1\nKs 0 0 0\nillum 1\nmap_Kd {texture}\n", encoding="ascii")
