@@ -1,0 +1,155 @@
+"""What a model file holds, told to a person: tables on the terminal and a picture of the template."""
+
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float, Int
+from rich.console import Console
+from rich.table import Table
+
+from registration.frames import MM_PER_M
+from registration.model import gnm_npz, landmarks, regions
+from registration.model.gnm_npz import GNMData
+
+COLOURS = {  # linear shades of the classes in pictures
+    "skin": (0.86, 0.70, 0.60),
+    "left_eye": (0.35, 0.55, 0.95),
+    "right_eye": (0.30, 0.75, 0.85),
+    "upper_lip": (0.80, 0.25, 0.30),
+    "lower_lip": (0.95, 0.45, 0.45),
+    "ears": (0.95, 0.75, 0.30),
+    "mouth_interior": (0.55, 0.35, 0.60),
+}
+_VIEWS = {"the subject's right": 75.0, "front": 0.0, "the subject's left": -75.0}  # turn of the head about +Y, degrees
+
+
+def describe(path: Path, picture: Path | None = None, console: Console | None = None) -> GNMData:
+    """Print dimensions, parts, joints, regions and landmark schemes of a model file; draw its template to `picture`.
+
+    Raises InputError for a file that is not a GNM model.
+    """
+    console = console or Console()
+    data = gnm_npz.read(path)
+    schemes = landmarks.schemes_beside(path, len(data.template_vertex_positions))
+    console.print(f"[bold]{path}[/]  GNM {data.variant} {data.version}  sha256 {gnm_npz.content_hash(data)[:12]}")
+    for table in (_dimensions(data), _parts(data), _joints(data), _regions(data)):
+        console.print(table)
+    told = [f"{scheme.name} ({len(scheme.indices)} points)" for scheme in schemes.values()]
+    console.print(f"landmark schemes: {', '.join(told) or 'none beside the file'}")
+    if data.extra:
+        console.print(f"fields outside the schema, kept: {', '.join(data.extra)}")
+    if picture is not None:
+        draw(data, picture, schemes)
+        console.print(f"picture: {picture}")
+    return data
+
+
+def draw(data: GNMData, path: Path, schemes: dict[str, landmarks.LandmarkScheme]) -> None:
+    """A picture of the template from three sides, coloured by class, with the landmarks of every scheme."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.collections import PolyCollection
+    from matplotlib.figure import Figure
+    from matplotlib.patches import Patch
+
+    vertices = data.template_vertex_positions.astype(np.float64)
+    names, shares = regions.vertex_classes(data)
+    colours = shares @ np.array([COLOURS[name] for name in names])
+    centre = (vertices.min(0) + vertices.max(0)) / 2
+    half = 0.52 * np.ptp(vertices, axis=0).max()
+    figure = Figure(figsize=(13, 5.2), dpi=110, layout="constrained")
+    FigureCanvasAgg(figure)
+    for axes, (title, turn) in zip(figure.subplots(1, 3), _VIEWS.items(), strict=True):
+        rotation = _turned(turn)
+        seen = (vertices - centre) @ rotation.T
+        polygons, shades = _shaded(seen, data.triangles, colours)
+        axes.add_collection(PolyCollection(polygons, facecolors=shades, edgecolors=shades, linewidths=0.3))
+        for scheme in schemes.values():
+            points, outward = _landmarks_in_view(scheme, seen, data.triangles)
+            axes.scatter(*points[outward].T[:2], s=5, color="black", linewidths=0)
+        axes.set(xlim=(-half, half), ylim=(-half, half), aspect="equal", title=title)
+        axes.set_axis_off()
+    patches = [Patch(color=COLOURS[name], label=name) for name in names]
+    figure.legend(handles=patches, loc="outside lower center", ncols=len(names), frameon=False)
+    size_mm = np.ptp(vertices, axis=0) * MM_PER_M
+    figure.suptitle(f"GNM {data.variant} {data.version}: {size_mm[0]:.0f} x {size_mm[1]:.0f} x {size_mm[2]:.0f} mm")
+    path.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(path)
+
+
+def _turned(degrees: float) -> Float[np.ndarray, "3 3"]:
+    c, s = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
+    return np.array([[c, 0, s], [0, 1, 0], [-s, 0, c]])
+
+
+def _shaded(
+    seen: Float[np.ndarray, "V 3"], triangles: Int[np.ndarray, "F 3"], colours: Float[np.ndarray, "V 3"]
+) -> tuple[Float[np.ndarray, "G 3 2"], Float[np.ndarray, "G 3"]]:
+    """The triangles that face +Z, far ones first, and their lit colours."""
+    corners = seen[triangles]
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True) + 1e-20
+    front = np.flatnonzero(normals[:, 2] > 0)
+    front = front[np.argsort(corners[front, :, 2].mean(1))]
+    light = np.array([0.35, 0.5, 0.79])
+    shade = 0.30 + 0.70 * np.clip(normals[front] @ light, 0, 1)
+    return corners[front, :, :2], np.clip(colours[triangles[front]].mean(1) * shade[:, None], 0, 1)
+
+
+def _landmarks_in_view(
+    scheme: landmarks.LandmarkScheme, seen: Float[np.ndarray, "V 3"], triangles: Int[np.ndarray, "F 3"]
+) -> tuple[Float[np.ndarray, "L 3"], np.ndarray]:
+    corners = seen[triangles]
+    normals = np.zeros_like(seen)
+    np.add.at(normals, triangles, np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])[:, None])
+    return scheme.points(seen), scheme.points(normals)[:, 2] > 0
+
+
+def _table(title: str, *columns: str) -> Table:
+    table = Table(title=title, title_justify="left", title_style="bold", box=None, pad_edge=False)
+    for column in columns:
+        table.add_column(column, justify="left" if column in ("name", "parent", "names", "field") else "right")
+    return table
+
+
+def _dimensions(data: GNMData) -> Table:
+    table = _table("dimensions", "name", "count")
+    for name, count in (
+        ("vertices", len(data.template_vertex_positions)),
+        ("triangles", len(data.triangles)),
+        ("quads", len(data.quads)),
+        ("identity", len(data.identity_names)),
+        ("expression", len(data.expression_names)),
+        ("joints", len(data.joint_names)),
+        ("vertex groups", len(data.vertex_group_names)),
+    ):
+        table.add_row(name, f"{count:,}")
+    table.add_row("pose correctives", "yes" if data.pose_correctives_regressor.any() else "all zero")
+    return table
+
+
+def _parts(data: GNMData) -> Table:
+    table = _table("parts", "name", "vertices", "triangles")
+    part = regions.components(data)
+    for k, name in enumerate(data.mesh_component_names.tolist()):
+        table.add_row(name, f"{(part == k).sum():,}", f"{(part[data.triangles[:, 0]] == k).sum():,}")
+    return table
+
+
+def _joints(data: GNMData) -> Table:
+    table = _table("joints", "name", "parent", "x mm", "y mm", "z mm")
+    names = data.joint_names.tolist()
+    for name, parent, at in zip(names, data.joint_parent_indices, data.template_joint_positions, strict=True):
+        table.add_row(name, names[parent] if parent >= 0 else "-", *(f"{c * MM_PER_M:.1f}" for c in at))
+    return table
+
+
+def _regions(data: GNMData) -> Table:
+    table = _table("classes and vertex groups", "name", "vertices")
+    names, shares = regions.vertex_classes(data)
+    for name, count in zip(names, shares.sum(0), strict=True):
+        table.add_row(f"[bold]class {name}[/]", f"{count:,.0f}")
+    for role, mask in (("exterior", regions.exterior(data)), ("neck_other", regions.neck_other(data))):
+        table.add_row(f"[bold]role {role}[/]", f"{mask.sum():,}")
+    for name, weights in zip(data.vertex_group_names.tolist(), data.vertex_groups, strict=True):
+        table.add_row(name, f"{(weights > 0).sum():,}")
+    return table

@@ -1,0 +1,78 @@
+"""Regions of a model by *role*. This file alone knows how the file's vertex groups are called."""
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from registration.errors import InputError
+from registration.model.gnm_npz import GNMData
+
+CLASSES = ("skin", "left_eye", "right_eye", "upper_lip", "lower_lip", "ears", "mouth_interior")
+# Every class but `skin`, which is what these leave over.
+_SOURCES = {
+    "left_eye": ("left_eye",),
+    "right_eye": ("right_eye",),
+    "upper_lip": ("upper_lip",),
+    "lower_lip": ("lower_lip",),
+    "ears": ("ears",),
+    "mouth_interior": ("mouth_sock", "teeth", "gums", "tongue"),
+}
+_INSIDE = 0.5  # a weight above this counts as membership where a yes or no is needed
+
+
+def group(data: GNMData, name: str) -> Float[np.ndarray, "V"]:
+    """The weights of one vertex group, float32. Raises InputError, with the names there are, if it is missing."""
+    names = data.vertex_group_names.tolist()
+    if name not in names:
+        raise InputError(
+            f"the model has no vertex group '{name}'",
+            where="vertex_group_names",
+            expected=f"a group '{name}'",
+            got=", ".join(names),
+            fix="use a model file that carries the official vertex groups",
+        )
+    return data.vertex_groups[names.index(name)].astype(np.float32)
+
+
+def vertex_classes(data: GNMData) -> tuple[tuple[str, ...], Float[np.ndarray, "V K"]]:
+    """The classes' names, in order, and each vertex' soft share of each; rows sum to one.
+
+    `skin` is what no other class claims, so the captures' `neck_other` is in it.
+    """
+    claimed = {
+        label: np.max([np.clip(group(data, name), 0, 1) for name in sources], axis=0)
+        for label, sources in _SOURCES.items()
+    }
+    shares = np.stack([claimed.get(label, np.zeros(len(data.template_vertex_positions))) for label in CLASSES], 1)
+    shares[:, 0] = np.clip(1 - shares.sum(1), 0, 1)
+    return CLASSES, (shares / shares.sum(1, keepdims=True)).astype(np.float32)
+
+
+def neck_other(data: GNMData) -> Bool[np.ndarray, "V"]:
+    """Neck, nape and chest: skin outside the face mask and the ears, below the face mask's lowest vertex."""
+    face = group(data, "hockey_mask") > _INSIDE
+    height = data.template_vertex_positions[:, 1]
+    skin = (group(data, "skin") > _INSIDE) & ~face & ~(group(data, "ears") > _INSIDE)
+    return skin & (height < height[face].min(initial=np.inf))
+
+
+def exterior(data: GNMData) -> Bool[np.ndarray, "V"]:
+    """The skin that can be seen from outside, lips and lid rims with it, and so may carry offsets.
+
+    Sockets, nostril and mouth linings are not in it, nor are the eyeballs, which move but keep their shape.
+    """
+    return group(data, "skin_exterior") > _INSIDE
+
+
+def components(data: GNMData) -> Int[np.ndarray, "V"]:
+    """Each vertex' index into `mesh_component_names`. Raises InputError for a vertex of no component."""
+    weights = np.stack([group(data, name) for name in data.mesh_component_names.tolist()])
+    lost = np.flatnonzero(weights.max(0) <= _INSIDE)
+    if len(lost):
+        raise InputError(
+            "some vertices belong to no mesh component",
+            where="vertex_groups, mesh_component_names",
+            expected="every vertex in the vertex group of one component",
+            got=f"{len(lost)} vertices in none, first {lost[0]}",
+            fix="use a model file whose components' vertex groups cover the mesh",
+        )
+    return weights.argmax(0)
