@@ -1,12 +1,13 @@
 """Every type that crosses a room. Axis letters: N views, H W pixels, V vertices, F triangles, I identity,
 E expression, J joints, L landmarks, K classes. Units: metres, radians, pixels (`_px`), millimetres (`_mm`)."""
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
+import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
@@ -87,18 +88,39 @@ class ViewPixels:
 
 @dataclass(frozen=True, kw_only=True)
 class Targets:
-    """What the losses compare with, at one pyramid level: every view cut to one common window size."""
+    """What the losses compare with, at one pyramid level: every view cut to one common window size.
 
+    Levels are kept in float16; `select` gives the float32 batch of a step. A weight of 0 means: not compared.
+    """
+
+    names: tuple[str, ...]  # of the views
     cameras: tuple[Camera, ...]  # of the windows
+    class_names: tuple[str, ...]  # the K classes that model and capture share
     rgb: Float[Tensor, "N H W 3"]  # linear
     rgb_weight: Float[Tensor, "N H W"]
     normals: Float[Tensor, "N H W 3"]  # world frame, unit or 0
     normal_weight: Float[Tensor, "N H W"]
-    mask: Float[Tensor, "N H W"]
+    mask: Float[Tensor, "N H W"]  # coverage of the subject
     mask_weight: Float[Tensor, "N H W"]
-    classes: Float[Tensor, "N H W K"]  # share of each of the model's classes
+    classes: Float[Tensor, "N H W K"]
     class_weight: Float[Tensor, "N H W"]
-    downsample: float  # full-resolution pixels per pixel
+    landmarks: Mapping[str, Float[Tensor, "N L 3"]]  # scheme -> x_px y_px confidence, in the windows
+    px_per_head: float  # the subject's height in pixels, median over views
+
+    def select(self, views: Sequence[int], device: torch.device) -> "Targets":
+        """The batch of some views, float32, on a device."""
+        index = list(views)
+
+        def take(value: Tensor) -> Tensor:
+            return value[index].to(device, torch.float32)
+
+        return replace(
+            self,
+            names=tuple(self.names[i] for i in index),
+            cameras=tuple(self.cameras[i] for i in index),
+            landmarks={scheme: take(points) for scheme, points in self.landmarks.items()},
+            **{f.name: take(getattr(self, f.name)) for f in fields(self) if isinstance(getattr(self, f.name), Tensor)},
+        )
 
 
 @dataclass(frozen=True, kw_only=True)

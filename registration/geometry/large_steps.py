@@ -1,0 +1,94 @@
+"""Large steps (Nicolet 2021): smooth displacements through a preconditioner, and quadratic penalties on them.
+
+The unknown is u = M d with M = I + lambda L, L the combinatorial Laplacian; d = M^-1 u and dLoss/du = M^-1 dLoss/dd.
+On a regular triangulation of edge length h this smooths over l = h sqrt(1.5 lambda).
+"""
+
+import cholespy
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from scipy.sparse import coo_matrix, csr_matrix, diags, identity
+from torch import Tensor
+
+
+def combinatorial_laplacian(triangles: Int[np.ndarray, "F 3"], vertex_count: int) -> csr_matrix:
+    """L = D - A over the mesh's edges, (V, V); every row sums to zero."""
+    adjacency = _adjacency(triangles, vertex_count)
+    return (diags(np.asarray(adjacency.sum(1)).ravel()) - adjacency).tocsr()
+
+
+def normalised_laplacian(triangles: Int[np.ndarray, "F 3"], vertex_count: int) -> csr_matrix:
+    """D^-1 (D - A): a vertex minus the mean of its neighbours, (V, V); empty rows for isolated vertices."""
+    adjacency = _adjacency(triangles, vertex_count)
+    degree = np.asarray(adjacency.sum(1)).ravel()
+    return (diags(1 / np.maximum(degree, 1)) @ (diags(degree) - adjacency)).tocsr()
+
+
+def _adjacency(triangles, vertex_count: int) -> csr_matrix:
+    start = np.concatenate([triangles[:, k] for k in range(3)])
+    end = np.concatenate([triangles[:, (k + 1) % 3] for k in range(3)])
+    one_way = coo_matrix((np.ones(len(start)), (start, end)), (vertex_count, vertex_count)).tocsr()
+    return ((one_way + one_way.T) > 0).astype(np.float64)
+
+
+def to_torch(matrix: csr_matrix, device: torch.device) -> Tensor:
+    """A SciPy sparse matrix as a float32 torch one, for products that carry gradients."""
+    matrix = matrix.tocsr()
+    return torch.sparse_csr_tensor(
+        torch.as_tensor(matrix.indptr.astype(np.int64)),
+        torch.as_tensor(matrix.indices.astype(np.int64)),
+        torch.as_tensor(matrix.data.astype(np.float32)),
+        matrix.shape,
+        device=device,
+        check_invariants=False,
+    )
+
+
+class LargeSteps:
+    """M of one mesh and one smoothing length, factorised once."""
+
+    def __init__(
+        self,
+        triangles: Int[np.ndarray, "F 3"],
+        vertex_count: int,
+        *,
+        edge_length_m: float,
+        smoothing_m: float,
+        device: torch.device,
+    ):
+        strength = (smoothing_m / edge_length_m) ** 2 / 1.5
+        matrix = identity(vertex_count) + strength * combinatorial_laplacian(triangles, vertex_count)
+        coo = matrix.tocoo()
+        self._matrix = to_torch(matrix.tocsr(), device)
+        self._solver = cholespy.CholeskySolverF(
+            vertex_count,
+            torch.as_tensor(coo.row.astype(np.int32), device=device),
+            torch.as_tensor(coo.col.astype(np.int32), device=device),
+            torch.as_tensor(coo.data, device=device),
+            cholespy.MatrixType.COO,
+        )
+
+    def latent(self, displacement: Float[Tensor, "V 3"]) -> Float[Tensor, "V 3"]:
+        """u = M d."""
+        return self._matrix @ displacement
+
+    def displacement(self, latent: Float[Tensor, "V 3"]) -> Float[Tensor, "V 3"]:
+        """d = M^-1 u; differentiable."""
+        return _Solve.apply(latent, self._solver)
+
+
+class _Solve(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx, right, solver):
+        ctx.solver = solver
+        out = torch.zeros_like(right)
+        solver.solve(right.detach().contiguous(), out)
+        return out
+
+    @staticmethod
+    def backward(ctx, *grad_outputs):
+        # M is symmetric, so its adjoint is the same solve.
+        out = torch.zeros_like(grad_outputs[0])
+        ctx.solver.solve(grad_outputs[0].contiguous(), out)
+        return out, None

@@ -1,0 +1,42 @@
+"""How a capture's label classes meet the model's."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+
+from registration.model.regions import CLASSES
+
+BACKGROUND = "background"
+NECK = "neck_other"
+SKIN = CLASSES[0]
+
+
+@dataclass(frozen=True, kw_only=True)
+class ClassMap:
+    """K shared classes; what the capture does not tell apart is skin, what the model does not know is excluded."""
+
+    names: tuple[str, ...]
+    from_capture: Float[np.ndarray, "C K"]
+    from_model: Float[np.ndarray, "M K"]
+    excluded: Float[np.ndarray, "C"]  # 1 for hair, clothes and other classes without a counterpart
+    neck: Float[np.ndarray, "C"]  # 1 for the neck, which is skin, but whose silhouette is not the model's
+
+
+def class_map(capture_classes: tuple[str, ...]) -> ClassMap:
+    """The classes that a capture and every model share."""
+    names = tuple(name for name in CLASSES if name == SKIN or name in capture_classes)
+    shared = {name: name for name in names} | {NECK: SKIN}
+
+    def one_hot(labels: tuple[str, ...], otherwise: str | None) -> Float[np.ndarray, "R K"]:
+        return np.array(
+            [[shared.get(label, otherwise) == name for name in names] for label in labels], np.float32
+        ).reshape(len(labels), len(names))
+
+    return ClassMap(
+        names=names,
+        from_capture=one_hot(capture_classes, None),
+        from_model=one_hot(CLASSES, SKIN),
+        excluded=np.array([c not in shared and c != BACKGROUND for c in capture_classes], np.float32),
+        neck=np.array([c == NECK for c in capture_classes], np.float32),
+    )
