@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from registration.capture.pixels import undistort_landmarks
-from registration.types import Capture
+from registration.types import Camera, Capture, View
 
 MIN_CONFIDENCE = 0.5  # at or below it a 2D landmark is not used
 MAX_PAIRS = 400  # of views that start a hypothesis; 29 views have 406
@@ -35,7 +35,7 @@ def triangulate(
     rays = np.stack([_normalised(view.camera.intrinsics, xy) for view, xy in zip(views, pixels[..., :2], strict=True)])
     poses = np.stack([view.camera.T_cam_world[:3] for view in views])
     focals = np.array([[view.camera.intrinsics[0, 0], view.camera.intrinsics[1, 1]] for view in views])
-    limits = np.array([INLIER_SHARE * np.sqrt(view.camera.width_px * view.camera.height_px) for view in views])
+    limits = np.array([inlier_limit_px(view.camera) for view in views])
 
     count = pixels.shape[1]
     points, used, residuals = np.full((count, 3), np.nan), np.zeros(count, np.int64), np.full(count, np.nan)
@@ -113,3 +113,38 @@ def _widest_angle(point: Float[np.ndarray, "3"], poses: Float[np.ndarray, "N 3 4
     rays = point - centres
     rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
     return float(np.arccos(np.clip((rays @ rays.T).min(), -1.0, 1.0)))
+
+
+def residuals(view: View, scheme: str, points: Float[np.ndarray, "L 3"]) -> Float[np.ndarray, "L"]:
+    """Distances (px, full image) of a view's landmarks from the projected 3D ones (m); NaN where one is not used."""
+    landmarks = undistort_landmarks(view, scheme)
+    projected, depth = view.camera.project(points)
+    distance = np.linalg.norm(projected - landmarks[:, :2], axis=-1)
+    return np.where((landmarks[:, 2] > MIN_CONFIDENCE) & (depth > 0), distance, np.nan)
+
+
+def inlier_limit_px(camera: Camera) -> float:
+    """The reprojection error above which a landmark is taken to show something else."""
+    return INLIER_SHARE * float(np.sqrt(camera.width_px * camera.height_px))
+
+
+def jaw_disorder(points: Float[np.ndarray, "68 3"]) -> list[int]:
+    """Jaw points (0 to 16 of the 68 scheme) that do not follow their neighbours around the face.
+
+    Seen from the front, the jaw runs from the subject's right ear (0) over the chin (8) to the left ear (16): the
+    angle around the point between the brows only ever grows. Returns the indices of every run that goes backwards
+    by more than two degrees; NaN points are passed over, and empty comes back if the eyes or nose are missing.
+    """
+    right, left, brow, nose = points[36], points[45], points[27], points[33]
+    x = left - right
+    down = nose - brow
+    x = x / np.linalg.norm(x)
+    down = down - (down @ x) * x
+    down = down / np.linalg.norm(down)
+    if not np.isfinite([x, down]).all():
+        return []
+    known = np.flatnonzero(np.isfinite(points[:17]).all(-1))
+    local = points[known] - brow
+    angles = np.unwrap(np.arctan2(local @ down, -(local @ x)))  # 0 at the subject's right, a quarter turn at the chin
+    back = np.flatnonzero(np.diff(angles) < -np.radians(2.0))
+    return sorted({int(known[i]) for step in back for i in (step, step + 1)})

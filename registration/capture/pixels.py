@@ -185,7 +185,8 @@ def _warp(camera: Camera, rows: slice, width_px: int) -> tuple[slice, tuple[np.n
     window[1, 2] -= rows.start
     size = (width_px, rows.stop - rows.start)
     x, y = cv2.initUndistortRectifyMap(intrinsics, np.array(camera.distortion), None, window, size, cv2.CV_32FC1)
-    x, y = np.nan_to_num(x, nan=-1e6), np.nan_to_num(y, nan=-1e6)
+    if not np.isfinite(y).all():  # a rational model's denominator crosses zero: no source
+        x, y = np.nan_to_num(x, nan=-1e6), np.nan_to_num(y, nan=-1e6)
     first = int(np.clip(np.floor(y.min()), 0, camera.height_px - 1))
     last = int(np.clip(np.ceil(y.max()) + 1, first + 1, camera.height_px))
     return slice(first, last), (x, y - first)
@@ -243,7 +244,10 @@ def _to_share(raw: UInt8[np.ndarray, "H W"]) -> Float[np.ndarray, "H W"]:
 
 
 def _to_normals(raw: np.ndarray) -> Float[np.ndarray, "H W 3"]:
-    return np.where(raw.any(-1, keepdims=True), raw * np.float32(2 / 65535) - 1, np.float32(0))
+    background = (raw[..., 0] | raw[..., 1] | raw[..., 2]) == 0
+    normals = raw * np.float32(2 / 65535) - 1
+    normals[background] = 0
+    return normals
 
 
 def _unit(vectors: Float[np.ndarray, "H W 3"]) -> Float[np.ndarray, "H W 3"]:
