@@ -35,7 +35,10 @@ def validate(capture: Capture) -> None:
     """
     if len(capture.views) < 2:
         raise InputError(
-            "There are too few views", where=capture.root, expected="at least 2 views", got=len(capture.views),
+            "There are too few views",
+            where=capture.root,
+            expected="at least 2 views",
+            got=len(capture.views),
             fix="add calibrated images; in images.txt of COLMAP every image takes two lines, the second may be empty",
         )
     for view in capture.views:
@@ -55,14 +58,19 @@ def _check_camera(capture: Capture, view: View) -> None:
     K, rotation = camera.intrinsics, camera.T_cam_world[:3, :3]
     if not (np.isfinite(K).all() and np.isfinite(camera.distortion).all() and K[0, 0] > 0 and K[1, 1] > 0):
         raise InputError(
-            "The intrinsics are singular or not finite", where=f"{capture.root}: view {view.name}",
-            expected="finite numbers, focal lengths > 0", got=np.array2string(K), fix="calibrate the camera again",
+            "The intrinsics are singular or not finite",
+            where=f"{capture.root}: view {view.name}",
+            expected="finite numbers, focal lengths > 0",
+            got=np.array2string(K),
+            fix="calibrate the camera again",
         )
     rigid = np.isfinite(camera.T_cam_world).all() and np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-4)
     if not (rigid and np.linalg.det(rotation) > 0):
         raise InputError(
-            "The pose is singular or not finite", where=f"{capture.root}: view {view.name}",
-            expected="a rotation and a finite translation", got=np.array2string(camera.T_cam_world),
+            "The pose is singular or not finite",
+            where=f"{capture.root}: view {view.name}",
+            expected="a rotation and a finite translation",
+            got=np.array2string(camera.T_cam_world),
             fix="calibrate the camera again, or remove its view",
         )
 
@@ -73,20 +81,24 @@ def _check_headers(capture: Capture, view: View) -> None:
         headers.require_complete(path, role)
         if role == "normal map" and header.png_bits != 16:
             raise InputError(
-                "The normal map has too few bits", where=path, expected="16 bit RGB PNG, n = 2 v / 65535 - 1",
-                got="no PNG" if header.png_bits is None else f"{header.png_bits} bits", fix="write it with 16 bits",
+                "The normal map has too few bits",
+                where=path,
+                expected="16 bit RGB PNG, n = 2 v / 65535 - 1",
+                got="no PNG" if header.png_bits is None else f"{header.png_bits} bits",
+                fix="write it with 16 bits",
             )
     if view.segmentation is not None and not capture.classes:
         raise InputError(
-            "The label maps have no class names", where=capture.root / "capture.toml",
-            expected='[segmentation] classes = ["background", ...]', got="nothing", fix="name every label index",
+            "The label maps have no class names",
+            where=capture.root / "capture.toml",
+            expected='[segmentation] classes = ["background", ...]',
+            got="nothing",
+            fix="name every label index",
         )
 
 
 def _files(view: View) -> list[tuple[Path, str]]:
-    files = (
-        (view.image, "image"), (view.mask, "mask"), (view.normals, "normal map"), (view.segmentation, "label map")
-    )
+    files = ((view.image, "image"), (view.mask, "mask"), (view.normals, "normal map"), (view.segmentation, "label map"))
     return [(path, role) for path, role in files if path is not None]
 
 
@@ -94,8 +106,11 @@ def _check_landmarks(capture: Capture) -> None:
     counts = {len(view.landmarks["68"]) for view in capture.views if "68" in view.landmarks}
     if counts - {68}:
         raise InputError(
-            'The landmark scheme "68" has another length', where=capture.root / "landmarks", expected="68 points",
-            got=", ".join(map(str, sorted(counts))), fix="give another scheme another name",
+            'The landmark scheme "68" has another length',
+            where=capture.root / "landmarks",
+            expected="68 points",
+            got=", ".join(map(str, sorted(counts))),
+            fix="give another scheme another name",
         )
     points = landmarks3d.triangulate(capture, "68")[0]
     distance = eye_distance(points)
@@ -106,7 +121,8 @@ def _check_landmarks(capture: Capture) -> None:
             "The outer eye corners are too near or too far apart: are the units metres?",
             where=capture.root / "sparse",
             expected=f"{EYE_DISTANCE_M[0]} to {EYE_DISTANCE_M[1]} m between the triangulated landmarks 36 and 45",
-            got=f"{distance:.4g} m", fix=hint,
+            got=f"{distance:.4g} m",
+            fix=hint,
         )
 
 
@@ -125,7 +141,9 @@ def _check_pixels(capture: Capture, view: View) -> None:
         brightest = int(pixels.read_mask(view.mask, camera).max())
         if brightest < 128:
             raise InputError(
-                "The mask is empty", where=view.mask, expected="255 where the subject is",
+                "The mask is empty",
+                where=view.mask,
+                expected="255 where the subject is",
                 got=f"no pixel above {brightest}",
                 fix="write 255 for the subject" if brightest else "draw the mask, or remove this view or its mask",
             )
@@ -313,9 +331,13 @@ def _folds(camera: Camera) -> bool:
     coarse = camera.scaled(64, 64)
     size = (64, 64)
     x, y = cv2.initUndistortRectifyMap(
-        opencv_intrinsics(camera.intrinsics), np.array(camera.distortion), None,
-        opencv_intrinsics(coarse.intrinsics), size, cv2.CV_32FC1,
-    )  # fmt: skip
+        opencv_intrinsics(camera.intrinsics),
+        np.array(camera.distortion),
+        None,
+        opencv_intrinsics(coarse.intrinsics),
+        size,
+        cv2.CV_32FC1,
+    )
     (x_down, x_right), (y_down, y_right) = np.gradient(x), np.gradient(y)
     inside = (x >= 0) & (x <= camera.width_px - 1) & (y >= 0) & (y <= camera.height_px - 1)
     return bool((x_right * y_down - x_down * y_right)[inside].min(initial=1.0) <= 0)

@@ -31,7 +31,10 @@ def read_header(path: Path, role: str) -> Header:
     """
     if not path.is_file():
         raise InputError(
-            f"The {role} is missing", where=path, expected=f"a readable {role} file", got="no such file",
+            f"The {role} is missing",
+            where=path,
+            expected=f"a readable {role} file",
+            got="no such file",
             fix="add the file, or remove its view from the COLMAP model",
         )
     try:
@@ -43,7 +46,10 @@ def read_header(path: Path, role: str) -> Header:
         raise _too_large(path, role, str(error)) from None
     except (UnidentifiedImageError, OSError, ValueError, SyntaxError) as error:
         raise InputError(
-            f"The {role} is not a readable image", where=path, expected="a PNG, JPEG or TIFF file", got=error,
+            f"The {role} is not a readable image",
+            where=path,
+            expected="a PNG, JPEG or TIFF file",
+            got=error,
             fix="write the file again; its header is damaged",
         ) from None
     if width_px * height_px > MAX_PIXELS:
@@ -59,7 +65,9 @@ def require_size(path: Path, role: str, width_px: int, height_px: int) -> Header
     header = read_header(path, role)
     if (header.width_px, header.height_px) != (width_px, height_px):
         raise InputError(
-            f"The {role}'s size is not the camera's", where=path, expected=f"{width_px} x {height_px} px",
+            f"The {role}'s size is not the camera's",
+            where=path,
+            expected=f"{width_px} x {height_px} px",
             got=f"{header.width_px} x {header.height_px} px",
             fix=f"store the {role} at the size of the calibrated image, or rescale the camera in the COLMAP model",
         )
@@ -84,8 +92,11 @@ def require_complete(path: Path, role: str) -> None:
         complete = True
     if not complete:
         raise InputError(
-            f"The {role} is truncated", where=path, expected="a file that ends with its end marker",
-            got=f"{size} bytes, then nothing", fix="copy or write the file again",
+            f"The {role} is truncated",
+            where=path,
+            expected="a file that ends with its end marker",
+            got=f"{size} bytes, then nothing",
+            fix="copy or write the file again",
         )
 
 
@@ -104,6 +115,9 @@ def _png_chunks_reach_end(path: Path, size: int) -> bool:
 
 def _too_large(path: Path, role: str, got: str) -> InputError:
     return InputError(
-        f"The {role} declares an absurd size", where=path, expected=f"at most {MAX_PIXELS} pixels", got=got,
+        f"The {role} declares an absurd size",
+        where=path,
+        expected=f"at most {MAX_PIXELS} pixels",
+        got=got,
         fix="write the file again, or tile the image",
     )

@@ -38,8 +38,11 @@ def read(root: Path) -> Capture:
     root = Path(root)
     if not root.is_dir():
         raise InputError(
-            "The capture folder is missing", where=root, expected="a folder with capture.toml and sparse/",
-            got="no such folder", fix="check the path",
+            "The capture folder is missing",
+            where=root,
+            expected="a folder with capture.toml and sparse/",
+            got="no such folder",
+            fix="check the path",
         )
     settings = _read_settings(root / "capture.toml")
     cameras = read_cameras(root / "sparse")
@@ -67,8 +70,11 @@ def read_cameras(sparse: Path) -> dict[str, Camera]:
     """The cameras of a COLMAP model (text or binary) by image name. Raises InputError as `read` does."""
     if not sparse.is_dir():
         raise InputError(
-            "The COLMAP model is missing", where=sparse, expected="cameras, images and points3D as .txt or .bin",
-            got="no such folder", fix="store the calibration there; architecture: docs/formats.md",
+            "The COLMAP model is missing",
+            where=sparse,
+            expected="cameras, images and points3D as .txt or .bin",
+            got="no such folder",
+            fix="store the calibration there; architecture: docs/formats.md",
         )
     try:
         model = pycolmap.Reconstruction(str(sparse))
@@ -78,7 +84,10 @@ def read_cameras(sparse: Path) -> dict[str, Camera]:
     for image in model.images.values():
         if image.name in cameras:
             raise InputError(
-                "Two images of the COLMAP model have one name", where=sparse, expected="unique names", got=image.name,
+                "Two images of the COLMAP model have one name",
+                where=sparse,
+                expected="unique names",
+                got=image.name,
                 fix="rename one of them",
             )
         where = f"{sparse}: image {image.name}"
@@ -89,19 +98,28 @@ def read_cameras(sparse: Path) -> dict[str, Camera]:
 def _camera(source: pycolmap.Camera, T_cam_world: Float[np.ndarray, "4 4"], where: str) -> Camera:
     if source.model_name not in _MODELS:
         raise InputError(
-            "The camera model is not supported", where=where, expected=", ".join(_MODELS), got=source.model_name,
+            "The camera model is not supported",
+            where=where,
+            expected=", ".join(_MODELS),
+            got=source.model_name,
             fix="undistort the images with COLMAP's image_undistorter, or calibrate with a supported model",
         )
     fx, fy, cx, cy, *distortion = _MODELS[source.model_name](*map(float, source.params))
     if not all(map(math.isfinite, (fx, fy, cx, cy, *distortion))) or fx <= 0 or fy <= 0:
         raise InputError(
-            "The intrinsics are singular or not finite", where=where, expected="finite numbers, focal lengths > 0",
-            got=source.params_to_string(), fix="calibrate the camera again",
+            "The intrinsics are singular or not finite",
+            where=where,
+            expected="finite numbers, focal lengths > 0",
+            got=source.params_to_string(),
+            fix="calibrate the camera again",
         )
     if not (0 < source.width < 2**16 and 0 < source.height < 2**16):
         raise InputError(
-            "The camera's image size is absurd", where=where, expected="1 to 65535 px a side",
-            got=f"{source.width} x {source.height}", fix="write the image's size into the COLMAP model",
+            "The camera's image size is absurd",
+            where=where,
+            expected="1 to 65535 px a side",
+            got=f"{source.width} x {source.height}",
+            fix="write the image's size into the COLMAP model",
         )
     return Camera(
         width_px=source.width,
@@ -121,7 +139,9 @@ def _pose(image: pycolmap.Image, where: str) -> Float[np.ndarray, "4 4"]:
     # pycolmap turns a zero quaternion into the identity without a word: only the quaternion itself tells.
     if not np.isfinite(T_cam_world).all() or not np.linalg.norm(quaternion) > 1e-6:
         raise InputError(
-            "The pose is singular or not finite", where=where, expected="a unit quaternion and a finite translation",
+            "The pose is singular or not finite",
+            where=where,
+            expected="a unit quaternion and a finite translation",
             got="no pose" if pose is None else f"quaternion xyzw {quaternion}, translation {pose.translation}",
             fix="calibrate the camera again, or remove its image from the COLMAP model",
         )
@@ -132,8 +152,11 @@ def _read_view(root: Path, file_name: str, camera: Camera) -> View:
     relative = PurePosixPath(file_name)
     if relative.is_absolute() or ".." in relative.parts or not relative.suffix:
         raise InputError(
-            "An image name cannot be used", where=root / "sparse", expected="a path inside images/, with a suffix",
-            got=file_name, fix="rename the image",
+            "An image name cannot be used",
+            where=root / "sparse",
+            expected="a path inside images/, with a suffix",
+            got=file_name,
+            fix="rename the image",
         )
     image = root / "images" / relative
     require_size(image, "image", camera.width_px, camera.height_px)
@@ -158,17 +181,21 @@ def _check_names(root: Path, views: tuple[View, ...]) -> None:
     for first, second in zip(views, views[1:], strict=False):
         if first.name == second.name:
             raise InputError(
-                "Two images differ in their suffix only", where=root / "images",
+                "Two images differ in their suffix only",
+                where=root / "images",
                 expected="names that stay unique without it: masks and landmarks are found by them",
-                got=f"{first.image.name} and {second.image.name}", fix="rename one of them",
+                got=f"{first.image.name} and {second.image.name}",
+                fix="rename one of them",
             )
     for view in views:
         for scheme, points in view.landmarks.items():
             count, name = lengths.setdefault(scheme, (len(points), view.name))
             if len(points) != count:
                 raise InputError(
-                    "A landmark scheme has two lengths", where=root / "landmarks" / f"{view.name}.json",
-                    expected=f'{count} points in scheme "{scheme}", as for {name}', got=f"{len(points)} points",
+                    "A landmark scheme has two lengths",
+                    where=root / "landmarks" / f"{view.name}.json",
+                    expected=f'{count} points in scheme "{scheme}", as for {name}',
+                    got=f"{len(points)} points",
                     fix="give every view the whole scheme, with confidence 0 where a point is not seen",
                 )
 
@@ -178,7 +205,10 @@ def read_landmarks(path: Path) -> dict[str, Float[np.ndarray, "L 3"]]:
 
     def refuse(expected: str, got: object) -> InputError:
         return InputError(
-            "The landmark file is malformed", where=path, expected=expected, got=got,
+            "The landmark file is malformed",
+            where=path,
+            expected=expected,
+            got=got,
             fix='write {"<scheme>": [[x_px, y_px, confidence], ...]}',
         )
 
@@ -234,13 +264,18 @@ def _unreadable_model(sparse: Path, error: Exception) -> InputError:
         for number, line in enumerate(lines, 1):
             if not line.startswith("#") and _NOT_FINITE.search(line):
                 return InputError(
-                    "The intrinsics are singular or not finite" if path.stem == "cameras"
+                    "The intrinsics are singular or not finite"
+                    if path.stem == "cameras"
                     else "The pose is singular or not finite",
-                    where=f"{path}, line {number}", expected="finite numbers", got=line[:120],
+                    where=f"{path}, line {number}",
+                    expected="finite numbers",
+                    got=line[:120],
                     fix="calibrate the camera again, or remove its image from the COLMAP model",
                 )
     return InputError(
-        "The COLMAP model cannot be read", where=sparse,
-        expected="cameras, images and points3D as .txt or .bin, as COLMAP writes them", got=error,
+        "The COLMAP model cannot be read",
+        where=sparse,
+        expected="cameras, images and points3D as .txt or .bin, as COLMAP writes them",
+        got=error,
         fix="export the model again with COLMAP's model_converter",
     )

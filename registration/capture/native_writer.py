@@ -57,7 +57,10 @@ def write(
     root = Path(root)
     if root.exists():
         raise InputError(
-            "The capture folder exists already", where=root, expected="a path that is free", got="a file or folder",
+            "The capture folder exists already",
+            where=root,
+            expected="a path that is free",
+            got="a file or folder",
             fix="choose another folder, or remove this one",
         )
     root.parent.mkdir(parents=True, exist_ok=True)
@@ -142,9 +145,7 @@ def _numbers(values: Sequence[float]) -> str:
     return " ".join(repr(float(value)) for value in values)
 
 
-def _write_settings(
-    path: Path, subject: str, expression: str, classes: Sequence[str], tags: Mapping[str, Any]
-) -> None:
+def _write_settings(path: Path, subject: str, expression: str, classes: Sequence[str], tags: Mapping[str, Any]) -> None:
     settings = {"subject": subject, "expression": expression, "units": "m", **tags}
     lines = [f"{json.dumps(key)} = {_toml(value)}" for key, value in settings.items()]
     if classes:

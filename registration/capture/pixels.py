@@ -35,18 +35,25 @@ def read_view(view: View, capture: Capture, *, downsample: int = 1) -> ViewPixel
     camera = view.camera
     if not 1 <= downsample <= min(camera.width_px, camera.height_px):
         raise InputError(
-            "The view cannot be reduced by this factor", where=view.name,
-            expected=f"1 to {min(camera.width_px, camera.height_px)}", got=downsample, fix="choose a smaller factor",
+            "The view cannot be reduced by this factor",
+            where=view.name,
+            expected=f"1 to {min(camera.width_px, camera.height_px)}",
+            got=downsample,
+            fix="choose a smaller factor",
         )
     strips = list(_strips(camera, downsample))
     valid = _valid(camera, strips)
     rgb = _resample(read_colour(view.image, camera), _to_linear, strips, valid)
     mask = None if view.mask is None else _resample(read_mask(view.mask, camera), _to_share, strips, valid)
-    normals = None if view.normals is None else _unit(
-        _resample(read_normals(view.normals, camera), _to_normals, strips, valid)
+    normals = (
+        None
+        if view.normals is None
+        else _unit(_resample(read_normals(view.normals, camera), _to_normals, strips, valid))
     )
-    labels = None if view.segmentation is None else _label_shares(
-        read_labels(view.segmentation, camera, capture.classes), strips, len(capture.classes)
+    labels = (
+        None
+        if view.segmentation is None
+        else _label_shares(read_labels(view.segmentation, camera, capture.classes), strips, len(capture.classes))
     )
     return ViewPixels(
         camera=reduced(camera, downsample), rgb=rgb, mask=mask, normals=normals, label_shares=labels, valid=valid
@@ -68,7 +75,10 @@ def undistort_landmarks(view: View, scheme: str) -> Float[np.ndarray, "L 3"]:
         criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 100, 1e-9)
         # Points and K share one pixel convention here, so OpenCV's own does not enter.
         undistorted = cv2.undistortPoints(
-            landmarks[:, None, :2], camera.intrinsics, np.array(camera.distortion), P=camera.intrinsics,
+            landmarks[:, None, :2],
+            camera.intrinsics,
+            np.array(camera.distortion),
+            P=camera.intrinsics,
             criteria=criteria,
         )
         landmarks[:, :2] = undistorted[:, 0]
@@ -80,8 +90,11 @@ def read_colour(path: Path, camera: Camera) -> np.ndarray:
     pixels = _imread(path, "image", camera, _COLOUR)
     if pixels.dtype not in (np.uint8, np.uint16):
         raise InputError(
-            "The image has an unusable pixel type", where=path, expected="8 or 16 bits per channel",
-            got=pixels.dtype, fix="convert it to 8 or 16 bit sRGB",
+            "The image has an unusable pixel type",
+            where=path,
+            expected="8 or 16 bits per channel",
+            got=pixels.dtype,
+            fix="convert it to 8 or 16 bit sRGB",
         )
     return pixels
 
@@ -96,8 +109,11 @@ def read_normals(path: Path, camera: Camera) -> np.ndarray:
     pixels = _imread(path, "normal map", camera, _COLOUR)
     if pixels.dtype != np.uint16:
         raise InputError(
-            "The normal map has too few bits", where=path, expected="16 bit RGB PNG, n = 2 v / 65535 - 1",
-            got=pixels.dtype, fix="write it with 16 bits per channel",
+            "The normal map has too few bits",
+            where=path,
+            expected="16 bit RGB PNG, n = 2 v / 65535 - 1",
+            got=pixels.dtype,
+            fix="write it with 16 bits per channel",
         )
     return pixels
 
@@ -114,14 +130,20 @@ def read_labels(path: Path, camera: Camera, classes: tuple[str, ...]) -> UInt8[n
         raise _undecodable(path, "label map", str(error)) from None
     if mode not in ("L", "P") or labels.dtype != np.uint8:
         raise InputError(
-            "The label map is not a map of indices", where=path, expected="8 bit, one channel",
-            got=f"mode {mode}, {labels.dtype}", fix="store the class index of each pixel in one 8 bit channel",
+            "The label map is not a map of indices",
+            where=path,
+            expected="8 bit, one channel",
+            got=f"mode {mode}, {labels.dtype}",
+            fix="store the class index of each pixel in one 8 bit channel",
         )
     highest = int(labels.max())
     if highest >= min(len(classes), MAX_CLASSES):
         raise InputError(
-            "A label index has no name", where=path, expected=f"indices below {len(classes)}: {', '.join(classes)}",
-            got=f"index {highest}", fix="name every index in [segmentation] classes of capture.toml",
+            "A label index has no name",
+            where=path,
+            expected=f"indices below {len(classes)}: {', '.join(classes)}",
+            got=f"index {highest}",
+            fix="name every index in [segmentation] classes of capture.toml",
         )
     return labels
 
@@ -137,7 +159,10 @@ def _imread(path: Path, role: str, camera: Camera, flags: int) -> np.ndarray:
 
 def _undecodable(path: Path, role: str, got: str) -> InputError:
     return InputError(
-        f"The {role} cannot be decoded", where=path, expected="a whole, undamaged image", got=got,
+        f"The {role} cannot be decoded",
+        where=path,
+        expected="a whole, undamaged image",
+        got=got,
         fix="copy or write the file again",
     )
 
@@ -216,7 +241,7 @@ def _resample(
     return result
 
 
-def _label_shares(labels: UInt8[np.ndarray, "H W"], strips: list[_Strip], count: int) -> Float[np.ndarray, "H W K"]:
+def _label_shares(labels: UInt8[np.ndarray, "H W"], strips: list[_Strip], count: int) -> Float[np.ndarray, "h w K"]:
     """Share of each class in each block; sums to 1 where any pixel has a source."""
     shares = np.zeros((strips[-1].out.stop, strips[-1].columns, count), np.float32)
     for strip in strips:

@@ -26,7 +26,7 @@ def read_scan(path: Path) -> Scan:
     """
     try:
         mesh = trimesh.load(path, file_type="ply", process=False, maintain_order=True)
-        vertices = np.array(mesh.vertices, np.float64)
+        vertices = np.array(getattr(mesh, "vertices", ()), np.float64)
         triangles = np.array(getattr(mesh, "faces", np.zeros((0, 3))), np.int64)
     except Exception as error:  # trimesh's parsers raise whatever a damaged file makes them trip over
         raise _refuse(path, "a PLY file with vertices and faces", f"{type(error).__name__}: {error}") from None
@@ -44,8 +44,11 @@ def read_truth(path: Path) -> Float[np.ndarray, "N 3"]:
 
     def refuse(expected: str, got: object) -> InputError:
         return InputError(
-            "The ground truth cannot be used", where=path, expected=expected, got=got,
-            fix='np.savez(path, vertices=...) with float (N, 3) vertices in metres, capture world',
+            "The ground truth cannot be used",
+            where=path,
+            expected=expected,
+            got=got,
+            fix="np.savez(path, vertices=...) with float (N, 3) vertices in metres, capture world",
         )
 
     try:

@@ -24,8 +24,13 @@ JAW = 17  # the first points of the 68 scheme: joined by a line, so that a wrong
 VISIBLE_M = 0.008  # a point this much behind the nearest one in its neighbourhood is hidden
 _BACKGROUND, _INK, _FAINT = (24, 24, 28), (235, 235, 235), (165, 165, 170)
 _SCAN, _MASK, _USED, _UNUSED, _SOLVED, _WRONG = (
-    (60, 200, 255), (255, 210, 60), (70, 255, 90), (170, 170, 170), (255, 90, 220), (255, 50, 40),
-)  # fmt: skip
+    (60, 200, 255),
+    (255, 210, 60),
+    (70, 255, 90),
+    (170, 170, 170),
+    (255, 90, 220),
+    (255, 50, 40),
+)
 
 
 def draw(
@@ -75,9 +80,11 @@ def _write_heading(page: Image.Image, capture: Capture, scan: bool, scheme: str 
     entries += [(_SCAN, "scan, visible points")] if scan else []
     if scheme is not None:
         entries += [
-            (_USED, f"landmarks {scheme}"), (_UNUSED, f"confidence up to {MIN_CONFIDENCE}: unused"),
-            (_SOLVED, "triangulated"), (_WRONG, "contradicted by other views"),
-        ]  # fmt: skip
+            (_USED, f"landmarks {scheme}"),
+            (_UNUSED, f"confidence up to {MIN_CONFIDENCE}: unused"),
+            (_SOLVED, "triangulated"),
+            (_WRONG, "contradicted by other views"),
+        ]
     x = 8.0
     for colour, text in entries:
         pen.rectangle((x, 49, x + 12, 61), fill=colour)
