@@ -49,7 +49,8 @@ def drift(
 
     Each true vertex of the neutral (those in `face`) is carried to its closest point on the neutral registration;
     the same face and barycentrics on the other registration are compared with that vertex in the other truth.
-    `carried_mm` is the mean distance of the first step, which the drift holds too. Both registrations must have one topology.
+    `carried_mm` is the mean distance of the first step, which the drift holds too. Both registrations must have one
+    topology.
     """
     carried, hit, barycentric = closest_points(neutral_truth[face], neutral.vertices, neutral.triangles)
     there = barycentric_points(registration.vertices.astype(np.float64), registration.triangles, hit, barycentric)
