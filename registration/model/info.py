@@ -62,7 +62,7 @@ def draw(data: GNMData, path: Path, schemes: dict[str, landmarks.LandmarkScheme]
         rotation = _turned(turn)
         seen = (vertices - centre) @ rotation.T
         polygons, shades = _shaded(seen, data.triangles, colours)
-        axes.add_collection(PolyCollection(polygons, facecolors=shades, edgecolors=shades, linewidths=0.3))
+        axes.add_collection(PolyCollection(list(polygons), facecolors=shades, edgecolors=shades, linewidths=0.3))
         for scheme in schemes.values():
             points, outward = _landmarks_in_view(scheme, seen, data.triangles)
             axes.scatter(*points[outward].T[:2], s=5, color="black", linewidths=0)

@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import overload
 
 import numpy as np
+import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
@@ -26,11 +27,11 @@ class LandmarkScheme:
     def points(self, vertices: Float[np.ndarray, "*B V 3"]) -> Float[np.ndarray, "*B L 3"]: ...
     @overload
     def points(self, vertices: Float[Tensor, "*B V 3"]) -> Float[Tensor, "*B L 3"]: ...
-    def points(self, vertices):
+    def points(self, vertices: np.ndarray | Tensor) -> np.ndarray | Tensor:
         """The landmarks on these vertices, in their units and frame; NumPy in, NumPy out, torch in, torch out."""
         if isinstance(vertices, Tensor):
-            weights = vertices.new_tensor(self.weights)
-            return (vertices[..., vertices.new_tensor(self.indices).long(), :] * weights[..., None]).sum(-2)
+            indices = torch.as_tensor(self.indices, device=vertices.device)
+            return (vertices[..., indices, :] * vertices.new_tensor(self.weights)[..., None]).sum(-2)
         return (vertices[..., self.indices, :] * self.weights.astype(vertices.dtype)[..., None]).sum(-2)
 
 

@@ -1,0 +1,107 @@
+"""The GNM function in torch: parameters in, posed vertices out; batched and differentiable.
+
+Paper, Model Formulation; `gnm_numpy.py` is the same written out plainly.
+"""
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from registration.frames import axis_angle_to_matrix
+from registration.model.gnm_npz import GNMData
+from registration.types import Parameters
+
+
+class GNM(torch.nn.Module):
+    """A model ready to be evaluated on one device in one floating-point type.
+
+    V vertices, I identity, E expression, J joints, *B any batch axes. Metres and radians, the model's frame.
+    """
+
+    template: Float[Tensor, "3*V"]
+    identity_basis: Float[Tensor, "I 3*V"]
+    expression_basis: Float[Tensor, "E 3*V"]
+    joint_template: Float[Tensor, "3*J"]
+    joint_basis: Float[Tensor, "I 3*J"]
+    weights: Float[Tensor, "V J"]
+    corrective_basis: Float[Tensor, "9*J 3*V"] | None
+    triangles: Int[Tensor, "F 3"]
+
+    def __init__(self, data: GNMData, dtype: torch.dtype = torch.float32, device: torch.device | str = "cpu"):
+        super().__init__()
+        joints, vertices = data.skinning_weights.shape
+
+        def keep(name: str, array: np.ndarray | None, *shape: int) -> None:
+            tensor = None if array is None else torch.from_numpy(np.ascontiguousarray(array)).reshape(shape)
+            self.register_buffer(name, None if tensor is None else tensor.to(device, dtype), persistent=False)
+
+        keep("template", data.template_vertex_positions, 3 * vertices)
+        keep("identity_basis", data.vertex_identity_basis, -1, 3 * vertices)
+        keep("expression_basis", data.expression_basis, -1, 3 * vertices)
+        keep("joint_template", data.template_joint_positions, 3 * joints)
+        keep("joint_basis", data.joint_identity_basis, -1, 3 * joints)
+        # The paper's inverse homogeneous map divides by the sum of a vertex' weights.
+        weights = data.skinning_weights.astype(np.float64)
+        keep("weights", (weights / weights.sum(0)).T, vertices, joints)
+        # Released models ship zeros here; a product with them would cost as much as a tenth of the bases.
+        correctives = data.pose_correctives_regressor
+        keep("corrective_basis", correctives if correctives.any() else None, 9 * joints, 3 * vertices)
+        triangles = torch.from_numpy(data.triangles.astype(np.int64)).to(device)
+        self.register_buffer("triangles", triangles, persistent=False)
+        self.parents: list[int] = data.joint_parent_indices.tolist()
+
+    def neutral(self, *batch: int) -> Parameters:
+        """All parameters at rest: zeros, and scale one."""
+        shapes = {"identity": len(self.identity_basis), "expression": len(self.expression_basis), "translation": 3}
+        zeros = {name: self.template.new_zeros(*batch, size) for name, size in shapes.items()}
+        rotations = self.template.new_zeros(*batch, len(self.parents), 3)
+        return Parameters(**zeros, rotations=rotations, scale=self.template.new_ones(batch))
+
+    def forward(
+        self, parameters: Parameters, offsets: Float[Tensor, "*C V 3"] | None = None
+    ) -> Float[Tensor, "*B V 3"]:
+        """Posed vertices in world metres: scale * LBS(bind + correctives + offsets) + translation.
+
+        `offsets` are added in bind space and broadcast over the batch.
+        """
+        bind = self.bind(parameters.identity, parameters.expression)
+        if self.corrective_basis is not None:
+            bind = bind + self.correctives(parameters.rotations)
+        if offsets is not None:
+            bind = bind + offsets
+        skinned = self.skin(bind, self.joints(parameters.identity), parameters.rotations)
+        return parameters.scale[..., None, None] * skinned + parameters.translation[..., None, :]
+
+    def bind(self, identity: Float[Tensor, "*B I"], expression: Float[Tensor, "*B E"]) -> Float[Tensor, "*B V 3"]:
+        """The bind pose: template plus both bases (paper, equation `gnm_feedforward`), without pose correctives."""
+        flat = self.template + identity @ self.identity_basis + expression @ self.expression_basis
+        return flat.unflatten(-1, (-1, 3))
+
+    def joints(self, identity: Float[Tensor, "*B I"]) -> Float[Tensor, "*B J 3"]:
+        """Joint positions in the bind pose."""
+        return (self.joint_template + identity @ self.joint_basis).unflatten(-1, (-1, 3))
+
+    def correctives(self, rotations: Float[Tensor, "*B J 3"]) -> Float[Tensor, "*B V 3"]:
+        """What the rotations add to the bind pose before skinning; in the released file, not in the paper."""
+        if self.corrective_basis is None:
+            return self.template.new_zeros(*rotations.shape[:-2], *self.weights.shape[:1], 3)
+        turned = axis_angle_to_matrix(rotations)
+        turned = turned - torch.eye(3, dtype=turned.dtype, device=turned.device)
+        return (turned.flatten(-3) @ self.corrective_basis).unflatten(-1, (-1, 3))
+
+    def skin(
+        self, bind: Float[Tensor, "*B V 3"], joints: Float[Tensor, "*C J 3"], rotations: Float[Tensor, "*D J 3"]
+    ) -> Float[Tensor, "*E V 3"]:
+        """Linear blend skinning by the kinematic chain; batch axes broadcast."""
+        local = axis_angle_to_matrix(rotations)
+        turned, moved = [local[..., 0, :, :]], [joints[..., 0, :]]
+        for j, parent in enumerate(self.parents[1:], start=1):
+            bone = joints[..., j, :] - joints[..., parent, :]
+            moved.append(moved[parent] + (turned[parent] @ bone[..., None])[..., 0])
+            turned.append(turned[parent] @ local[..., j, :, :])
+        rotation = torch.stack(turned, -3)
+        shift = torch.stack(moved, -2) - (rotation @ joints[..., None])[..., 0]
+        affine = self.weights @ torch.cat([rotation, shift[..., None]], -1).flatten(-2)
+        affine = affine.unflatten(-1, (3, 4))
+        return (affine[..., :3] @ bind[..., None])[..., 0] + affine[..., 3]
