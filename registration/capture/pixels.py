@@ -20,8 +20,6 @@ from registration.frames import opencv_intrinsics, srgb_to_linear
 from registration.types import Camera, Capture, View, ViewPixels
 
 STRIP_PIXELS = 2**21  # turned to float at a time: 25 MB of float32 RGB
-MAX_CLASSES = 255
-_NO_LABEL = 255  # marks pixels without a source
 _COLOUR = cv2.IMREAD_COLOR_RGB | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
 _GRAY = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION
 
@@ -53,7 +51,7 @@ def read_view(view: View, capture: Capture, *, downsample: int = 1) -> ViewPixel
     labels = (
         None
         if view.segmentation is None
-        else _label_shares(read_labels(view.segmentation, camera, capture.classes), strips, len(capture.classes))
+        else _label_shares(read_labels(view.segmentation, camera, capture.classes), strips, valid, len(capture.classes))
     )
     return ViewPixels(
         camera=reduced(camera, downsample), rgb=rgb, mask=mask, normals=normals, label_shares=labels, valid=valid
@@ -137,7 +135,7 @@ def read_labels(path: Path, camera: Camera, classes: tuple[str, ...]) -> UInt8[n
             fix="store the class index of each pixel in one 8 bit channel",
         )
     highest = int(labels.max())
-    if highest >= min(len(classes), MAX_CLASSES):
+    if highest >= len(classes):
         raise InputError(
             "A label index has no name",
             where=path,
@@ -177,19 +175,24 @@ class _Strip:
     source: slice  # rows of the distorted full-size image that are needed
     warp: tuple[np.ndarray, np.ndarray] | None  # source x and y of every full-size pixel, relative to `source`
 
-    def undistort(self, block: np.ndarray, interpolation: int, border: int = 0) -> np.ndarray:
-        """The strip's full-size pixels from the rows `source`."""
-        if self.warp is not None:
-            fill = (border,) * 4
-            return cv2.remap(block, *self.warp, interpolation, borderMode=cv2.BORDER_CONSTANT, borderValue=fill)
-        return block[:, : self.columns * self.downsample]
-
-    def mean(self, block: np.ndarray) -> np.ndarray:
-        """Block means of the strip's full-size pixels; exact, because the factor is whole."""
+    def reduce(self, block: np.ndarray) -> np.ndarray:
+        """Block means of the undistorted full-size pixels, from the float rows `source`; no source counts as 0."""
+        if self.warp is None:
+            block = block[:, : self.columns * self.downsample]
+        else:
+            block = cv2.remap(block, *self.warp, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=(0,) * 4)
         if self.downsample == 1:
             return block
         size = (self.columns, self.out.stop - self.out.start)
-        return cv2.resize(block, size, interpolation=cv2.INTER_AREA)
+        return cv2.resize(block, size, interpolation=cv2.INTER_AREA)  # exact, because the factor is whole
+
+    def average(self, block: np.ndarray, valid: Float[np.ndarray, "H W"]) -> np.ndarray:
+        """`reduce`, over those pixels alone that have a source; 0 where none has."""
+        mean = self.reduce(block)
+        if self.warp is None:
+            return mean
+        share = valid[self.out].reshape(mean.shape[:2] + (1,) * (mean.ndim - 2))
+        return np.where(share > 1e-3, mean / np.maximum(share, 1e-3), 0)
 
 
 def _strips(camera: Camera, downsample: int) -> Iterator[_Strip]:
@@ -222,34 +225,32 @@ def _valid(camera: Camera, strips: list[_Strip]) -> Float[np.ndarray, "H W"]:
     valid = np.ones((strips[-1].out.stop, strips[-1].columns), np.float32)
     if camera.distortion:
         for strip in strips:
-            ones = np.ones((strip.source.stop - strip.source.start, camera.width_px), np.float32)
-            valid[strip.out] = strip.mean(strip.undistort(ones, cv2.INTER_LINEAR))
+            valid[strip.out] = strip.reduce(
+                np.ones((strip.source.stop - strip.source.start, camera.width_px), np.float32)
+            )
     return valid
 
 
 def _resample(
-    raw: np.ndarray, decode: Callable[[np.ndarray], np.ndarray], strips: list[_Strip], valid: Float[np.ndarray, "H W"]
+    raw: np.ndarray, decode: Callable[[np.ndarray], np.ndarray], strips: list[_Strip], valid: Float[np.ndarray, "h w"]
 ) -> np.ndarray:
-    """Float means over the pixels that have a source: (H, W) or (H, W, 3)."""
+    """Means of the decoded pixels: (h, w) or (h, w, 3)."""
     result = np.empty((*valid.shape, *raw.shape[2:]), np.float32)
     for strip in strips:
-        mean = strip.mean(strip.undistort(decode(raw[strip.source]), cv2.INTER_LINEAR))
-        if strip.warp is not None:
-            share = valid[strip.out].reshape(mean.shape[:2] + (1,) * (mean.ndim - 2))
-            mean = np.where(share > 1e-3, mean / np.maximum(share, 1e-3), 0)
-        result[strip.out] = mean
+        result[strip.out] = strip.average(decode(raw[strip.source]), valid)
     return result
 
 
-def _label_shares(labels: UInt8[np.ndarray, "H W"], strips: list[_Strip], count: int) -> Float[np.ndarray, "h w K"]:
-    """Share of each class in each block; sums to 1 where any pixel has a source."""
-    shares = np.zeros((strips[-1].out.stop, strips[-1].columns, count), np.float32)
+def _label_shares(
+    labels: UInt8[np.ndarray, "H W"], strips: list[_Strip], valid: Float[np.ndarray, "h w"], count: int
+) -> Float[np.ndarray, "h w K"]:
+    """Share of each class in each block: the classes are resampled one by one, as masks are, so nothing jumps."""
+    shares = np.zeros((*valid.shape, count), np.float32)
     for strip in strips:
-        block = strip.undistort(labels[strip.source], cv2.INTER_NEAREST, border=_NO_LABEL)
-        for index in np.flatnonzero(np.bincount(block.ravel(), minlength=count)[:count]):
-            shares[strip.out, :, index] = strip.mean((block == index).astype(np.float32))
-    total = shares.sum(-1, keepdims=True)
-    return np.where(total > 0, shares / np.maximum(total, 1e-6), 0)
+        block = labels[strip.source]
+        for index in np.flatnonzero(np.bincount(block.ravel(), minlength=count)):
+            shares[strip.out, :, index] = strip.average((block == index).astype(np.float32), valid)
+    return shares
 
 
 @cache

@@ -1,0 +1,123 @@
+"""A small synthetic capture with known everything: a coloured ball of 9 cm with the 68 landmarks on it.
+
+Rays are traced through OpenCV's `undistortPoints`, pixel by pixel, so the pictures owe nothing to the image warp
+that the tests look at.
+"""
+
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+from jaxtyping import Float
+
+from registration.capture.native_writer import PlainView, write
+from registration.capture.scan import Scan
+from registration.types import Camera
+
+RADIUS_M = 0.09
+CLASSES = ("background", "right", "left")
+DISTORTIONS = {
+    "SIMPLE_RADIAL": (0.9, 0.0, 0.0, 0.0),
+    "RADIAL": (-1.5, 4.0, 0.0, 0.0),
+    "OPENCV": (-1.2, 3.0, 0.02, -0.015),
+    "FULL_OPENCV": (-1.0, 3.0, 0.02, -0.015, 2.0, 0.1, 0.3, -0.5),
+}
+
+
+def camera(
+    turn: float = 0.0, *, distortion: tuple[float, ...] = (), width_px: int = 120, height_px: int = 160
+) -> Camera:
+    """45 cm away on a circle around the head, `turn` radians from the front towards the subject's left."""
+    z = -np.array([np.sin(turn), 0.15, np.cos(turn)])
+    z /= np.linalg.norm(z)
+    x = np.cross([0, -1.0, 0], z)
+    x /= np.linalg.norm(x)
+    T_cam_world = np.eye(4)
+    T_cam_world[:3, :3] = [x, np.cross(z, x), z]
+    T_cam_world[2, 3] = 0.45
+    focal = 2.0 * width_px
+    intrinsics = np.array(
+        [[focal, 0, 0.52 * width_px], [0, 1.01 * focal, 0.47 * height_px], [0, 0, 1]], dtype=np.float64
+    )
+    return Camera(
+        width_px=width_px, height_px=height_px, intrinsics=intrinsics, T_cam_world=T_cam_world, distortion=distortion
+    )
+
+
+def landmarks_68() -> Float[np.ndarray, "68 3"]:
+    """Points on the ball in the 68 scheme's layout: a jaw in order, outer eye corners 9 cm apart."""
+    rng = np.random.default_rng(68)
+    xy = rng.uniform(-0.03, 0.03, (68, 2))
+    angles = np.linspace(np.pi, 2 * np.pi, 17)
+    xy[:17] = np.stack([0.07 * np.cos(angles), 0.07 * np.sin(angles)], -1)
+    xy[27], xy[33], xy[36], xy[45] = (0, 0.03), (0, -0.01), (-0.045, 0.03), (0.045, 0.03)
+    return np.column_stack([xy, np.sqrt(RADIUS_M**2 - (xy**2).sum(-1))])
+
+
+def distorted(cam: Camera, points: Float[np.ndarray, "P 3"]) -> Float[np.ndarray, "P 2"]:
+    """Project with distortion, by OpenCV."""
+    rotation = cv2.Rodrigues(cam.T_cam_world[:3, :3])[0]
+    coefficients = np.array(cam.distortion) if cam.distortion else None
+    return cv2.projectPoints(points, rotation, cam.T_cam_world[:3, 3], cam.intrinsics, coefficients)[0][:, 0]
+
+
+def picture(name: str, cam: Camera) -> PlainView:
+    """What the camera sees, distortion included; landmarks on the far side have confidence 0.2."""
+    y, x = np.mgrid[: cam.height_px, : cam.width_px] + 0.5
+    grid = np.stack([x, y], -1).reshape(-1, 1, 2)
+    coefficients = np.array(cam.distortion) if cam.distortion else None
+    criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 200, 1e-12)
+    plane = cv2.undistortPoints(grid, cam.intrinsics, coefficients, criteria=criteria)[:, 0]
+    rays = np.column_stack([plane, np.ones(len(plane))])
+    rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
+    centre = cam.T_cam_world[:3, 3]  # of the ball, camera frame
+    along = rays @ centre
+    inside = along**2 - centre @ centre + RADIUS_M**2
+    hit = inside > 0
+    local = (along - np.sqrt(np.maximum(inside, 0)))[:, None] * rays - centre
+    normals = np.where(hit[:, None], local / RADIUS_M, 0)
+    world = normals @ cam.T_cam_world[:3, :3]
+    rgb = np.where(hit[:, None], 0.45 + 0.35 * np.sin(6 * world + [0, 1, 2]), 0.1)
+    shape = (cam.height_px, cam.width_px)
+    points = landmarks_68()
+    facing = ((cam.centre - points) * points).sum(-1) > 0
+    landmarks = np.column_stack([distorted(cam, points), np.where(facing, 1.0, 0.2)])
+    return PlainView(
+        name=name,
+        camera=cam,
+        rgb=rgb.reshape(*shape, 3),
+        mask=hit.reshape(shape),
+        normals=normals.reshape(*shape, 3),
+        labels=np.where(hit, 1 + (world[:, 0] > 0), 0).astype(np.uint8).reshape(shape),
+        landmarks={"68": landmarks},
+    )
+
+
+def ball(scale: float = 1.0) -> Scan:
+    """The ball as a scan."""
+    import trimesh
+
+    mesh = trimesh.creation.icosphere(subdivisions=4, radius=scale * RADIUS_M)
+    return Scan(vertices=np.array(mesh.vertices), triangles=np.array(mesh.faces, np.int64))
+
+
+TURNS = (-1.0, -0.4, 0.1, 0.5, 1.1)
+
+
+def make(root: Path, *, distortion: tuple[float, ...] = (), drop: tuple[str, ...] = (), bits: int = 8) -> Path:
+    """Write a capture of five views, cam0 to cam4; `drop` names optional parts of the views to leave out."""
+    views = [picture(f"cam{i}", camera(turn, distortion=distortion)) for i, turn in enumerate(TURNS)]
+    views = [replace(view, **{part: {} if part == "landmarks" else None for part in drop}) for view in views]
+    return write(
+        root,
+        views,
+        subject="ball",
+        expression="neutral",
+        classes=CLASSES,
+        tags={"age": 30, "notes": 'with "quotes"', "lists": [1.5, 2.5], "real": False},
+        points=landmarks_68(),
+        scan=ball(),
+        truth=landmarks_68(),
+        bits=bits,
+    )
