@@ -11,6 +11,11 @@ from tests.conftest import SHARED, needs_shared
 from tests.fixtures.make_fixtures import tiny_model
 
 
+@pytest.fixture(autouse=True)
+def _same_numbers_every_time():
+    torch.manual_seed(0)
+
+
 def random_parameters(model: GNM, *batch: int, seed: int = 0) -> Parameters:
     generator = torch.Generator().manual_seed(seed)
     rest = model.neutral(*batch)

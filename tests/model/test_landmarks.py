@@ -1,0 +1,96 @@
+import numpy as np
+import pytest
+import torch
+
+from registration.errors import InputError
+from registration.model import landmarks
+from tests.conftest import SHARED, needs_shared
+from tests.fixtures.make_fixtures import HERE, tiny_model
+
+TINY = HERE / "head_sparse_68.txt"
+
+
+def test_points_are_weighted_means(tmp_path):
+    path = tmp_path / "head_sparse_two.txt"
+    path.write_text("0 0.25 1 0.75 2 0\n\n3 1 3 0 3 0\n")
+    scheme = landmarks.read_scheme(path, 4)
+    vertices = np.random.default_rng(0).normal(size=(2, 4, 3))
+    expected = np.stack([0.25 * vertices[:, 0] + 0.75 * vertices[:, 1], vertices[:, 3]], 1)
+    assert scheme.name == "two"
+    np.testing.assert_allclose(scheme.points(vertices), expected)
+    tensor = torch.from_numpy(vertices).requires_grad_(True)
+    points = scheme.points(tensor)
+    np.testing.assert_allclose(points.detach().numpy(), expected)
+    points[0, 0, 2].backward()
+    np.testing.assert_allclose(tensor.grad[0, :, 2].numpy(), [0.25, 0.75, 0, 0])
+    assert scheme.points(vertices.astype(np.float32)).dtype == np.float32
+
+
+def test_rounded_weights_are_made_to_sum_to_one(tmp_path):
+    path = tmp_path / "head_sparse_a.txt"
+    path.write_text("0 0.333 1 0.333 2 0.333\n")
+    np.testing.assert_allclose(landmarks.read_scheme(path, 3).weights.sum(1), 1)
+
+
+@pytest.mark.parametrize(
+    ("text", "told"),
+    [
+        ("", "is empty"),
+        ("0 1 1 0\n", "row 0"),
+        ("0 0.5 1 0.5 2 0\n0 nan 1 0.5 2 0\n", "row 1"),
+        ("0 0.5 1 0.5 9 0\n", "wrong vertex index"),
+        ("-1 0.5 1 0.5 2 0\n", "wrong vertex index"),
+        ("0.5 0.5 1 0.5 2 0\n", "wrong vertex index"),
+        ("0 0.5 1 0.7 2 0\n", "wrong weights"),
+        ("zero 1 1 0 2 0\n", "cannot be read"),
+        ("\xe9", "cannot be read"),
+    ],
+)
+def test_bad_files_are_refused(tmp_path, text, told):
+    path = tmp_path / "head_sparse_x.txt"
+    path.write_text(text, encoding="utf-8")
+    with pytest.raises(InputError) as caught:
+        landmarks.read_scheme(path, 9)
+    assert told in str(caught.value) and str(path) in str(caught.value)
+
+
+def test_a_missing_file_is_refused(tmp_path):
+    with pytest.raises(InputError, match="cannot be read"):
+        landmarks.read_scheme(tmp_path / "head_sparse_x.txt", 9)
+
+
+def test_schemes_beside_a_model(tmp_path):
+    assert landmarks.schemes_beside(tmp_path / "model.npz", 10) == {}
+    for name in ("5", "68"):
+        (tmp_path / f"head_sparse_{name}.txt").write_text("0 1 1 0 2 0\n")
+    assert list(landmarks.schemes_beside(tmp_path / "model.npz", 10)) == ["5", "68"]
+    assert landmarks.read_scheme(tmp_path / "head_sparse_5.txt", 10, name="mine").name == "mine"
+
+
+def check_68(points: np.ndarray) -> None:
+    """What the 68-point scheme means: the subject's right first, and this anatomy."""
+    x, y, z = points.T
+    assert x[0] < 0 < x[16] and x[36] < x[39] < x[42] < x[45]
+    assert y[8] < y[57] < y[33] < y[27] < y[24] and z[30] > z[27]
+    assert 0.05 < np.linalg.norm(points[36] - points[45]) < 0.15
+
+
+def test_tiny_head():
+    data = tiny_model()
+    points = landmarks.read_scheme(TINY, len(data.template_vertex_positions)).points(data.template_vertex_positions)
+    check_68(points)
+    np.testing.assert_allclose(points[16::-1] * (-1, 1, 1), points[:17], atol=2e-3)
+
+
+@needs_shared
+def test_full_head_keeps_the_file_order():
+    """The official file lists rows 2-6 of the jaw from chin to ear; the reader must not repair that in silence."""
+    folder = SHARED / "data" / "gnm"
+    with np.load(folder / "gnm_head_reconstructed.npz") as archive:
+        vertices = archive["template_vertex_positions"]
+    schemes = landmarks.schemes_beside(folder / "gnm_head_reconstructed.npz", len(vertices))
+    points = schemes["68"].points(vertices)
+    check_68(points)
+    assert (np.diff(points[2:7, 1]) > 0).all() and (np.diff(points[10:16, 1]) > 0).all()
+    raw = np.loadtxt(folder / "head_sparse_68.txt")
+    np.testing.assert_array_equal(schemes["68"].indices, raw[:, ::2])

@@ -1,0 +1,111 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from registration.errors import InputError
+from registration.model import gnm_npz, regions
+from tests.conftest import SHARED, needs_shared
+from tests.fixtures.make_fixtures import tiny_model
+
+
+@pytest.fixture(scope="module")
+def tiny() -> gnm_npz.GNMData:
+    return tiny_model()
+
+
+@pytest.fixture(scope="module")
+def full() -> gnm_npz.GNMData:
+    return gnm_npz.read(SHARED / "data" / "gnm" / "gnm_head_reconstructed.npz")
+
+
+def without(data: gnm_npz.GNMData, name: str) -> gnm_npz.GNMData:
+    keep = data.vertex_group_names != name
+    return replace(data, vertex_groups=data.vertex_groups[keep], vertex_group_names=data.vertex_group_names[keep])
+
+
+def test_classes_are_shares_of_the_groups(tiny):
+    names, shares = regions.vertex_classes(tiny)
+    assert names == ("skin", "left_eye", "right_eye", "upper_lip", "lower_lip", "ears", "mouth_interior")
+    np.testing.assert_allclose(shares.sum(1), 1, atol=1e-6)
+    for name in ("left_eye", "right_eye", "upper_lip", "lower_lip", "ears"):
+        np.testing.assert_array_equal(shares[:, names.index(name)], regions.group(tiny, name))
+    inside = np.max([regions.group(tiny, name) for name in ("mouth_sock", "teeth", "gums", "tongue")], axis=0)
+    np.testing.assert_array_equal(shares[:, -1], inside)
+    assert (regions.group(tiny, "skin")[shares[:, 0] > 0] == 1).all()
+
+
+def test_fractional_memberships_stay_fractional(tiny):
+    groups = tiny.vertex_groups.copy()
+    names = tiny.vertex_group_names.tolist()
+    at = int(regions.group(tiny, "upper_lip").argmax())
+    groups[:, at] = 0
+    groups[names.index("skin"), at] = 1
+    groups[names.index("upper_lip"), at] = 0.25
+    np.testing.assert_allclose(regions.vertex_classes(replace(tiny, vertex_groups=groups))[1][at, [0, 3]], [0.75, 0.25])
+    groups[names.index("upper_lip"), at] = groups[names.index("lower_lip"), at] = 1
+    shares = regions.vertex_classes(replace(tiny, vertex_groups=groups))[1][at]
+    np.testing.assert_allclose(shares[[0, 3, 4]], [0, 0.5, 0.5])
+
+
+@pytest.mark.parametrize(
+    "name", ["left_eye", "right_eye", "upper_lip", "lower_lip", "ears", "mouth_sock", "teeth", "gums", "tongue"]
+)
+def test_a_missing_source_group_is_named(tiny, name):
+    with pytest.raises(InputError, match=f"no vertex group '{name}'"):
+        regions.vertex_classes(without(tiny, name))
+
+
+@pytest.mark.parametrize(
+    ("role", "name"),
+    [(regions.neck_other, "hockey_mask"), (regions.exterior, "skin_exterior"), (regions.components, "tongue")],
+)
+def test_roles_name_the_group_they_lack(tiny, role, name):
+    with pytest.raises(InputError, match=f"no vertex group '{name}'"):
+        role(without(tiny, name))
+
+
+def test_neck_is_below_the_face(tiny):
+    neck = regions.neck_other(tiny)
+    height = tiny.template_vertex_positions[:, 1]
+    assert height[neck].max() < height[regions.group(tiny, "hockey_mask") > 0].min()
+    assert (regions.group(tiny, "skin")[neck] == 1).all() and neck[height < 0.13].all()
+
+
+def test_components_are_the_connected_parts(tiny):
+    part = regions.components(tiny)
+    assert (part[tiny.triangles] == part[tiny.triangles[:, :1]]).all()
+    assert np.bincount(part).tolist() == [889, 98, 98, 26, 26, 26]
+
+
+def test_vertices_of_no_component_are_told(tiny):
+    groups = tiny.vertex_groups.copy()
+    groups[:, 11] = 0
+    with pytest.raises(InputError, match="no mesh component") as caught:
+        regions.components(replace(tiny, vertex_groups=groups))
+    assert caught.value.got == "1 vertices in none, first 11"
+
+
+@needs_shared
+def test_full_head(full):
+    names, shares = regions.vertex_classes(full)
+    assert dict(zip(names, shares.sum(0).tolist(), strict=True)) == {
+        "skin": 10716,
+        "left_eye": 771,
+        "right_eye": 771,
+        "upper_lip": 145,
+        "lower_lip": 145,
+        "ears": 1054,
+        "mouth_interior": 4219,
+    }
+    part = regions.components(full)
+    assert np.bincount(part).tolist() == [12466, 771, 771, 1440, 1440, 933]
+    assert (part[full.triangles] == part[full.triangles[:, :1]]).all()
+    upper, lower = (full.template_vertex_positions[part == k, 1].mean() for k in (3, 4))
+    assert upper > lower
+    exterior = regions.exterior(full)
+    assert exterior.sum() == 11460 and not exterior[regions.group(full, "mouth_sock") > 0].any()
+    assert exterior[shares[:, 3] + shares[:, 4] > 0].all() and (part[exterior] == 0).all()
+    neck = regions.neck_other(full)
+    x, y, z = full.template_vertex_positions.T
+    assert neck[(part == 0) & (y < 0.15)].all() and not neck[y > 0.19].any() and 2000 < neck.sum() < 2500
