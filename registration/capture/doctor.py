@@ -186,8 +186,7 @@ class ViewReport:
     @property
     def caption(self) -> str:
         """One line for the contact sheet."""
-        parts = [f"{self.camera.width_px} x {self.camera.height_px}"]
-        parts += [] if self.coverage is None else [f"mask {100 * self.coverage:.0f} %"]
+        parts = [] if self.coverage is None else [f"mask {100 * self.coverage:.0f} %"]
         parts += [f"{self.landmarks} landmarks"] if self.landmarks else []
         parts += [] if np.isnan(self.residual_px) else [f"off by {self.residual_px:.2f} px"]
         parts += [f"{len(self.outliers)} wrong"] if self.outliers else []

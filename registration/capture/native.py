@@ -81,7 +81,7 @@ def read_cameras(sparse: Path) -> dict[str, Camera]:
     except (ValueError, IndexError, RuntimeError) as error:
         raise _unreadable_model(sparse, error) from None
     cameras: dict[str, Camera] = {}
-    for image in model.images.values():
+    for image in sorted(model.images.values(), key=lambda image: image.name):
         if image.name in cameras:
             raise InputError(
                 "Two images of the COLMAP model have one name",

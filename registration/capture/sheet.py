@@ -59,6 +59,8 @@ def draw(
         x, y = 8 + number % columns * cell[0], 72 + number // columns * cell[1]
         page.paste(Image.fromarray(picture), (x + (tile[0] - picture.shape[1]) // 2, y + tile[1] - picture.shape[0]))
         pen.text((x, y + tile[1] + 3), view.name, _INK, _font(14))
+        size = f"{view.camera.width_px} x {view.camera.height_px}"
+        pen.text((x + tile[0], y + tile[1] + 5), size, _FAINT, _font(12), anchor="ra")
         pen.text((x, y + tile[1] + 20), captions[view.name], _FAINT, _font(12))
     path.parent.mkdir(parents=True, exist_ok=True)
     fresh = path.with_name(f".{path.name}.{secrets.token_hex(4)}.tmp")

@@ -78,7 +78,7 @@ def picture(name: str, cam: Camera) -> PlainView:
     local = (along - np.sqrt(np.maximum(inside, 0)))[:, None] * rays - centre
     normals = np.where(hit[:, None], local / RADIUS_M, 0)
     world = normals @ cam.T_cam_world[:3, :3]
-    rgb = np.where(hit[:, None], 0.45 + 0.35 * np.sin(6 * world + [0, 1, 2]), 0.1)
+    rgb = np.where(hit[:, None], 0.3 + 0.1 * np.sin(6 * world + [0, 1, 2]), 0.1)
     shape = (cam.height_px, cam.width_px)
     points = landmarks_68()
     facing = ((cam.centre - points) * points).sum(-1) > 0

@@ -34,13 +34,17 @@ def test_round_trip(tmp_path: Path) -> None:
     np.testing.assert_array_equal(read_truth(capture.ground_truth), landmarks_68())
 
 
-def test_a_binary_model_reads_as_its_text(tmp_path: Path) -> None:
+@pytest.mark.parametrize("rigs", [True, False])
+def test_a_binary_model_reads_as_its_text(tmp_path: Path, rigs: bool) -> None:
+    """Also as older versions of COLMAP wrote it, without rigs and frames."""
     root = make(tmp_path / "capture", distortion=DISTORTIONS["FULL_OPENCV"])
     text = native.read(root)
     model = pycolmap.Reconstruction(str(root / "sparse"))
     shutil.rmtree(root / "sparse")
     (root / "sparse").mkdir()
     model.write_binary(str(root / "sparse"))
+    for name in () if rigs else ("rigs.bin", "frames.bin"):
+        (root / "sparse" / name).unlink()
     assert {path.suffix for path in (root / "sparse").iterdir()} == {".bin"}
     for a, b in zip(text.views, native.read(root).views, strict=True):
         assert (a.name, a.camera.distortion) == (b.name, b.camera.distortion)
