@@ -24,21 +24,22 @@ def rasterize(
     """
     width, height = camera.width_px, camera.height_px
     corners, depth, kept = _projected(vertices, triangles, camera)
+    planes = _weight_planes(corners)
     low = np.ceil(corners.min(1) - 0.5).astype(np.int64)
     high = np.floor(corners.max(1) - 0.5).astype(np.int64)
     nearness = np.zeros(width * height)
     front = np.full(width * height, -1)
     for item, x, y in _box_cells(low, high, width, height):
-        weight = _screen_weights(np.stack([x, y], 1) + 0.5, corners[item])
-        inside = (weight >= 0).all(1)
+        weight = _weights(planes, item, x + 0.5, y + 0.5)
+        inside = np.flatnonzero(weight.min(0) >= 0)
         item, pixel = item[inside], (y * width + x)[inside]
-        near = (weight[inside] / depth[item]).sum(1)
+        near = (weight[:, inside].T / depth[item]).sum(1)
         np.maximum.at(nearness, pixel, near)
         first = near == nearness[pixel]
         front[pixel[first]] = item[first]
     pixel = np.flatnonzero(front >= 0)
     item = front[pixel]
-    weight = _screen_weights(np.stack([pixel % width, pixel // width], 1) + 0.5, corners[item]) / depth[item]
+    weight = _weights(planes, item, pixel % width + 0.5, pixel // width + 0.5).T / depth[item]
     face = np.full(width * height, -1)
     barycentric = np.zeros((width * height, 3))
     face[pixel] = kept[item]
@@ -64,7 +65,7 @@ def visible(
     if not len(rows):
         return seen
     corners, depth, _ = _projected(vertices, triangles, camera)
-    nearest = depth.min(1)
+    planes, nearest = _weight_planes(corners), depth.min(1)
     xy, z = xy[rows], z[rows]
     origin = xy.min(0)
     side = max(1e-3, float(np.sqrt(np.ptp(xy, 0).prod() / len(rows))) / 2)  # px; about four cells a point
@@ -81,9 +82,9 @@ def visible(
         item, point = item[pair], order[start[here[pair]] + rank]
         could = nearest[item] < z[point] - tolerance
         item, point = item[could], point[could]
-        weight = _screen_weights(xy[point], corners[item])
-        hit = (weight >= 0).all(1)
-        before = 1 / (weight[hit] / depth[item[hit]]).sum(1) < z[point[hit]] - tolerance
+        weight = _weights(planes, item, xy[point, 0], xy[point, 1])
+        hit = np.flatnonzero(weight.min(0) >= 0)
+        before = 1 / (weight[:, hit].T / depth[item[hit]]).sum(1) < z[point[hit]] - tolerance
         seen[rows[point[hit][before]]] = False
     return seen
 
@@ -100,11 +101,21 @@ def _projected(
     return corners[solid], depth[solid], kept[solid]
 
 
-def _screen_weights(at: Float[np.ndarray, "M 2"], corners: Float[np.ndarray, "M 3 2"]) -> Float[np.ndarray, "M 3"]:
-    """Barycentrics in the image plane; all are >= 0 inside, whichever way the triangle winds."""
-    a, b, c = (corners[:, k] - at for k in range(3))
-    weight = np.stack([_cross(b, c), _cross(c, a), _cross(a, b)], 1)
-    return weight / _cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])[:, None]
+def _weight_planes(corners: Float[np.ndarray, "T 3 2"]) -> Float[np.ndarray, "3 T 3"]:
+    """Barycentrics in the image plane as linear functions (a, b, c) of a pixel: weight k = a x + b y + c."""
+    planes = np.empty((3, len(corners), 3))
+    for k in range(3):
+        p, q = corners[:, (k + 1) % 3], corners[:, (k + 2) % 3]
+        planes[k] = np.stack([p[:, 1] - q[:, 1], q[:, 0] - p[:, 0], _cross(p, q)], 1)
+    return planes / _cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])[:, None]
+
+
+def _weights(
+    planes: Float[np.ndarray, "3 T 3"], item: Int[np.ndarray, "M"], x: np.ndarray, y: np.ndarray
+) -> Float[np.ndarray, "3 M"]:
+    """All three are >= 0 inside, whichever way the triangle winds."""
+    a, b, c = (planes[:, :, n][:, item] for n in range(3))
+    return a * x + b * y + c
 
 
 def _cross(p: np.ndarray, q: np.ndarray) -> np.ndarray:
