@@ -45,7 +45,9 @@ def draw(
 
     `captions` has a line for each view's name; `points` (m, world) are the triangulated landmarks of `scheme`.
     """
-    cloud, normals = (np.zeros((0, 3)), None) if scan is None else _cloud(scan)
+    cloud = np.zeros((0, 3))
+    if scan is not None:  # evenly picked
+        cloud = scan.vertices[np.unique(np.linspace(0, len(scan.vertices) - 1, SCAN_POINTS).astype(int))]
     aspect = float(np.median([view.camera.height_px / view.camera.width_px for view in capture.views]))
     tile = (TILE_WIDTH_PX, round(TILE_WIDTH_PX * aspect))
     columns = min(len(capture.views), math.ceil(math.sqrt(1.6 * len(capture.views) * aspect)))
@@ -55,7 +57,7 @@ def draw(
     _write_heading(page, capture, scan is not None, scheme)
     pen = ImageDraw.Draw(page)
     for number, view in enumerate(capture.views):
-        picture = _picture(view, capture, tile, scheme, points, cloud, normals)
+        picture = _picture(view, capture, tile, scheme, points, cloud)
         x, y = 8 + number % columns * cell[0], 72 + number // columns * cell[1]
         page.paste(Image.fromarray(picture), (x + (tile[0] - picture.shape[1]) // 2, y + tile[1] - picture.shape[0]))
         pen.text((x, y + tile[1] + 3), view.name, _INK, _font(14))
@@ -94,18 +96,6 @@ def _write_heading(page: Image.Image, capture: Capture, scan: bool, scheme: str 
         x += 18 + pen.textlength(text, _font(14)) + 22
 
 
-def _cloud(scan: Scan) -> tuple[Float[np.ndarray, "P 3"], Float[np.ndarray, "P 3"] | None]:
-    """Evenly picked vertices (m) and, if there are faces, their unnormalised normals."""
-    pick = np.unique(np.linspace(0, len(scan.vertices) - 1, SCAN_POINTS).astype(int))
-    if not len(scan.triangles):
-        return scan.vertices[pick], None
-    a, b, c = (scan.vertices[scan.triangles[:, corner]] for corner in range(3))
-    normals = np.zeros_like(scan.vertices)
-    for corner in range(3):
-        np.add.at(normals, scan.triangles[:, corner], np.cross(b - a, c - a))
-    return scan.vertices[pick], normals[pick]
-
-
 def _picture(
     view: View,
     capture: Capture,
@@ -113,7 +103,6 @@ def _picture(
     scheme: str | None,
     points: Float[np.ndarray, "L 3"],
     cloud: Float[np.ndarray, "P 3"],
-    normals: Float[np.ndarray, "P 3"] | None,
 ) -> UInt8[np.ndarray, "h w 3"]:
     """One tile, at most `tile` (width, height) px."""
     full = view.camera
@@ -131,7 +120,7 @@ def _picture(
         inside = (cv2.resize(decoded.mask, size, interpolation=cv2.INTER_LINEAR) > 0.5).astype(np.uint8)
         contours, _ = cv2.findContours(inside, cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)
         cv2.drawContours(picture, contours, -1, _MASK, 1, cv2.LINE_AA)
-    _draw_scan(picture, camera, cloud, normals)
+    _draw_scan(picture, camera, cloud)
     if scheme is not None and scheme in view.landmarks:
         _draw_landmarks(picture, camera, view, scheme, points)
     return picture
@@ -141,9 +130,8 @@ def _draw_scan(
     picture: UInt8[np.ndarray, "h w 3"],
     camera: Camera,
     cloud: Float[np.ndarray, "P 3"],
-    normals: Float[np.ndarray, "P 3"] | None,
 ) -> None:
-    """Every tenth scan point that faces the camera and is not behind others."""
+    """Every tenth scan point that is not behind others."""
     if not len(cloud):
         return
     height, width = picture.shape[:2]
@@ -155,8 +143,6 @@ def _draw_scan(
     nearest = cv2.erode(nearest, np.ones((3, 3), np.uint8), borderType=cv2.BORDER_REPLICATE)
     visible = np.zeros(len(cloud), bool)
     visible[inside] = depth[inside] < nearest[cells[:, 1], cells[:, 0]] + VISIBLE_M
-    if normals is not None:
-        visible &= ((camera.centre - cloud) * normals).sum(-1) > 0
     shown = np.flatnonzero(visible)
     for x, y in xy[shown[:: max(1, min(10, len(shown) // 500))]]:
         cv2.circle(picture, _subpixel(x, y), 10, _SCAN, -1, cv2.LINE_AA, shift=4)

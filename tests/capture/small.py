@@ -98,7 +98,7 @@ def ball(scale: float = 1.0) -> Scan:
     """The ball as a scan."""
     import trimesh
 
-    mesh = trimesh.creation.icosphere(subdivisions=4, radius=scale * RADIUS_M)
+    mesh = trimesh.creation.icosphere(subdivisions=5, radius=scale * RADIUS_M)
     return Scan(vertices=np.array(mesh.vertices), triangles=np.array(mesh.faces, np.int64))
 
 

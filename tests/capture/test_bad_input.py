@@ -317,10 +317,15 @@ def state(folder: Path) -> dict[str, tuple[int, int]]:
     }
 
 
+@pytest.fixture(scope="module")
+def good(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return make(tmp_path_factory.mktemp("good") / "capture")
+
+
 @pytest.mark.parametrize("name", BAD)
-def test_bad_input(tmp_path: Path, name: str) -> None:
+def test_bad_input(good: Path, tmp_path: Path, name: str) -> None:
     spoil, what, where, got, fix = BAD[name]
-    root = make(tmp_path / "capture")
+    root = shutil.copytree(good, tmp_path / "capture")
     spoil(root)
     before = state(tmp_path)
     with pytest.raises(InputError) as caught:

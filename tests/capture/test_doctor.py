@@ -209,6 +209,15 @@ def test_a_point_cloud_is_drawn_too(tmp_path: Path) -> None:
     assert (np.abs(sheet.astype(int) - BLUE).max(-1) < 30).sum() > 1000
 
 
+def test_hidden_scan_points_are_not_drawn(tmp_path: Path) -> None:
+    root = make(tmp_path / "capture")
+    check(root, sheet=tmp_path / "sheet.png")
+    with_core = np.concatenate([ball().vertices, 0.5 * ball().vertices])
+    write_ply(root / "scan.ply", with_core, ball().triangles)
+    check(root, sheet=tmp_path / "again.png")
+    assert (tmp_path / "sheet.png").read_bytes() == (tmp_path / "again.png").read_bytes()
+
+
 @needs_shared
 def test_shared_captures_pass(tmp_path: Path) -> None:
     captures = SHARED / "data" / "captures"
