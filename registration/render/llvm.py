@@ -5,6 +5,7 @@ version 14 switches the backend off and the first kernel divides by zero. So the
 process, and the library that passed is named to Dr.Jit in `DRJIT_LIBLLVM_PATH`. Linux only.
 """
 
+import contextlib
 import importlib.metadata
 import json
 import os
@@ -102,8 +103,8 @@ def _probe(candidate: str | None) -> tuple[Path | None, str]:
     if run.returncode == 0:
         return Path(run.stdout.splitlines()[-1]), ""
     lines = [line.strip() for line in run.stderr.splitlines() if line.strip()]
-    # A Python error stands on the last line, LLVM's and Dr.Jit's on the first.
-    told = "no message" if not lines else lines[-1] if "Traceback" in run.stderr else lines[0]
+    # LLVM and Dr.Jit say the reason first; of chained Python errors the first one is the cause.
+    told = ([line for line in lines if re.match(r"[\w.]+Error: ", line)] or lines or ["no message"])[0]
     return None, f"{told} (exit code {run.returncode})"
 
 
@@ -134,6 +135,7 @@ def _packages() -> list[str]:
 
 
 def _cache_file() -> Path:
+    """Where proofs are kept. Raises RuntimeError for a user without a home."""
     home = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
     return Path(home) / "gnm-registration" / "llvm.json"
 
@@ -151,25 +153,24 @@ def _recall(named: str | None) -> Path | None:
         proven = json.loads(_cache_file().read_text())[named or ""]
         library = Path(proven["library"])
         return library if _fingerprint(library) == proven else None
-    except (OSError, ValueError, LookupError, TypeError):
+    except (OSError, ValueError, LookupError, TypeError, RuntimeError):
         return None
 
 
 def _remember(named: str | None, library: Path) -> None:
-    file = _cache_file()
-    try:
-        known = dict(json.loads(file.read_text()))
-    except (OSError, ValueError, TypeError):
-        known = {}
-    # Under its own path too: this process and its children find it named in their environment from now on.
-    known |= dict.fromkeys([named or "", str(library)], _fingerprint(library))
-    try:
+    """Keep the proof; a home that is missing or read-only costs a probe each time and no more."""
+    with contextlib.suppress(OSError, RuntimeError):
+        file = _cache_file()
+        try:
+            known = dict(json.loads(file.read_text()))
+        except (OSError, ValueError, TypeError):
+            known = {}
+        # Under its own path too: this process and its children find it named in their environment from now on.
+        known |= dict.fromkeys([named or "", str(library)], _fingerprint(library))
         file.parent.mkdir(parents=True, exist_ok=True)
         beside = file.with_suffix(f".{os.getpid()}")
         beside.write_text(json.dumps(known, indent=1))
         beside.replace(file)
-    except OSError:
-        pass  # a home that cannot be written costs the probe's fraction of a second each time, no more
 
 
 if __name__ == "__main__":

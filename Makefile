@@ -1,0 +1,67 @@
+# make setup   makes .venv with exactly the versions of constraints.txt, and finds or installs what the system must have
+# make check   sets up, then style, types and import directions
+# make test    sets up, checks and runs the tests
+#
+# Needs git, make and Python 3.11 to 3.13. PYTHON=python3.12 names one; an existing .venv keeps the one it was made with.
+
+SHELL := /bin/bash
+.SHELLFLAGS := -euo pipefail -c
+.ONESHELL:
+
+BIN := .venv/bin
+PYTHONS := $(or $(PYTHON),python3.13 python3.12 python3.11 python3)
+INSTALLED := .venv/installed-$(shell cat pyproject.toml constraints.txt | sha256sum | cut -c1-16)
+IN_RANGE := import sys; sys.exit(not (3, 11) <= sys.version_info[:2] <= (3, 13))
+PIP := $(BIN)/python -m pip --disable-pip-version-check install --constraint constraints.txt
+
+# $(call packages,NAMES): root on Debian or Ubuntu gets them; false for anyone else
+packages = { [ "$$(id -u)" = 0 ] && command -v apt-get >/dev/null && apt-get update -q \
+	&& DEBIAN_FRONTEND=noninteractive apt-get install -y -q --no-install-recommends $(1); }
+
+.PHONY: setup check test
+
+setup: $(INSTALLED)
+	@$(BIN)/python -m registration.render.llvm --install
+
+check: setup
+	$(BIN)/ruff check .
+	$(BIN)/mypy
+	$(BIN)/lint-imports
+
+test: check
+	$(BIN)/python -m pytest
+
+$(INSTALLED): .venv/bin/python
+	@rm -f .venv/installed-*
+	$(PIP) pip setuptools
+	$(PIP) --only-binary=:all: --no-build-isolation --editable '.[dev,mesh]'
+	lacking() { $(BIN)/python -c 'import pymeshlab' 2>&1 | grep -oE 'lib[^ (:]+: cannot open shared object|.*Error: .*' | sort -u || true; }
+	[ -z "$$(lacking)" ] || $(call packages,libgl1 libopengl0) || true
+	if [ -n "$$(lacking)" ]; then
+		echo "PyMeshLab, which only cleaning scans needs, cannot start:"
+		lacking
+		echo "To have it: sudo apt-get install -y libgl1 libopengl0"
+	fi
+	touch $@
+
+.venv/bin/python:
+	@chosen= bare=
+	for python in $(PYTHONS); do
+		"$$python" -c '$(IN_RANGE)' 2>/dev/null || continue
+		bare=$${bare:-$$python}
+		"$$python" -c 'import ensurepip' 2>/dev/null || continue
+		chosen=$$python; break
+	done
+	if [ -z "$$bare" ]; then
+		echo "No Python 3.11, 3.12 or 3.13 here (looked for: $(PYTHONS)). Install one, or name it: make PYTHON=..." >&2
+		exit 1
+	fi
+	if [ -z "$$chosen" ]; then
+		package=python$$("$$bare" -c 'import sys; print("%d.%d" % sys.version_info[:2])')-venv
+		$(call packages,$$package) || {
+			echo "$$bare lacks its venv module. On Debian and Ubuntu: sudo apt-get install -y $$package" >&2
+			exit 1
+		}
+		chosen=$$bare
+	fi
+	"$$chosen" -m venv --clear .venv
