@@ -75,7 +75,7 @@ def evaluate(
     neutral: NeutralFolder = None,
     neutral_capture: Annotated[Path | None, arg(metavar="CAPTURE")] = None,
 ) -> int:
-    """Compare a registration with its capture's scan and ground truth; print the figures and store them beside it.
+    """Compare a registration with its capture's scan and ground truth; print the figures and store them with it.
 
     Args:
         registration: The registration folder.
@@ -83,9 +83,9 @@ def evaluate(
         neutral: The same subject's neutral registration: adds the drift of the surface against it.
         neutral_capture: The capture of that neutral registration.
     """
-    from registration.evaluate import evaluate_folder
+    from registration.evaluate.evaluation import evaluate_folder
 
-    print(evaluate_folder(registration, capture, neutral, neutral_capture))
+    evaluate_folder(registration, capture, neutral, neutral_capture)
     return 0
 
 
@@ -113,7 +113,7 @@ def describe_model(
     """
     from registration.model.info import describe
 
-    print(describe(file, picture=out))
+    describe(file, picture=out)
     return 0
 
 

@@ -6,6 +6,7 @@ import pytest
 
 from workflows.cli import main
 
+TINY_MODEL = Path(__file__).parents[1] / "fixtures" / "tiny_gnm.npz"
 HEAVY = {"torch", "mitsuba", "drjit", "numpy", "scipy", "cv2", "pycolmap", "kornia", "trimesh", "matplotlib"}
 
 
@@ -49,3 +50,29 @@ def test_input_error_is_told_without_a_traceback(pair: str, tmp_path: Path, caps
     assert "SCHEME=FILE" in error and pair in error and "fix:" in error
     assert "Traceback" not in error
     assert not out.exists()
+
+
+def test_model_info_tells_and_draws(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    picture = tmp_path / "model.png"
+    assert main(["model", "info", str(TINY_MODEL), "--out", str(picture)]) == 0
+    assert "vertices" in capsys.readouterr().out
+    assert picture.read_bytes().startswith(b"\x89PNG")
+
+
+@pytest.mark.parametrize(
+    "command",
+    [
+        "capture check {missing} --out {out}",
+        "model info {missing} --out {out}",
+        "evaluate {missing} --capture {missing}",
+    ],
+)
+def test_missing_input_is_told_and_nothing_is_written(
+    command: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    missing, out = tmp_path / "missing", tmp_path / "out.png"
+    arguments = command.format(missing=missing, out=out).split()
+    assert main(arguments) == 2
+    error = capsys.readouterr().err
+    assert str(missing) in error and "fix:" in error
+    assert list(tmp_path.iterdir()) == []
