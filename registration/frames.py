@@ -37,7 +37,9 @@ def matrix_to_axis_angle(rotation: Float[np.ndarray, "3 3"]) -> Float[np.ndarray
     return Rotation.from_matrix(np.asarray(rotation, np.float64)).as_rotvec()
 
 
-def transform_points(transform: Float[np.ndarray, "4 4"], points: Float[np.ndarray, "... 3"]) -> Float[np.ndarray, "... 3"]:
+def transform_points(
+    transform: Float[np.ndarray, "4 4"], points: Float[np.ndarray, "... 3"]
+) -> Float[np.ndarray, "... 3"]:
     """Apply a rigid or affine 4x4 transform to points."""
     return points @ transform[:3, :3].T + transform[:3, 3]
 
@@ -52,10 +54,14 @@ def opencv_intrinsics(intrinsics: Float[np.ndarray, "3 3"]) -> Float[np.ndarray,
 def srgb_to_linear(value: np.ndarray) -> np.ndarray:
     """sRGB in [0, 1] to linear light (IEC 61966-2-1)."""
     value = np.asarray(value)
-    return np.where(value <= 0.04045, value / 12.92, ((np.maximum(value, 0.04045) + 0.055) / 1.055) ** 2.4).astype(value.dtype)
+    return np.where(value <= 0.04045, value / 12.92, ((np.maximum(value, 0.04045) + 0.055) / 1.055) ** 2.4).astype(
+        value.dtype
+    )
 
 
 def linear_to_srgb(value: np.ndarray) -> np.ndarray:
     """Linear light to sRGB in [0, 1]; clips to [0, 1] first."""
     value = np.clip(value, 0.0, 1.0)
-    return np.where(value <= 0.0031308, value * 12.92, 1.055 * np.maximum(value, 1e-9) ** (1 / 2.4) - 0.055).astype(value.dtype)
+    return np.where(value <= 0.0031308, value * 12.92, 1.055 * np.maximum(value, 1e-9) ** (1 / 2.4) - 0.055).astype(
+        value.dtype
+    )
