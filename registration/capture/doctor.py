@@ -11,6 +11,7 @@ from jaxtyping import Float
 from rich.box import SIMPLE
 from rich.console import Console
 from rich.table import Table
+from rich.text import Text
 from scipy.spatial import cKDTree
 
 from registration.capture import headers, landmarks3d, native, pixels
@@ -209,13 +210,13 @@ class Report:
         heads = ("view", "size px", "lens", "mask %", "normals", "labels", "landmarks", "residual px", "outliers")
         table = Table(*heads, box=SIMPLE)
         for view in self.views:
-            table.add_row(*view.row)
-        console = Console(file=io.StringIO(), width=120, color_system=None, legacy_windows=False)
+            table.add_row(*map(Text, view.row))  # names may hold brackets, rich's markup
+        text = io.StringIO()
+        console = Console(file=text, width=200, color_system=None, legacy_windows=False)
         console.print(table)
         for line in [*self._facts(), *(f"warning: {warning}" for warning in self.warnings)]:
             console.print(line, soft_wrap=True, markup=False, highlight=False)
-        assert isinstance(console.file, io.StringIO)
-        return console.file.getvalue().rstrip()
+        return text.getvalue().rstrip()
 
     def _facts(self) -> list[str]:
         capture = self.capture
