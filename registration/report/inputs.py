@@ -1,0 +1,97 @@
+"""What a report shows. Plain NumPy, so that the page needs neither the renderer nor a GPU."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from registration.frames import axis_angle_to_matrix
+from registration.types import Registration, Rendered, Targets
+
+_UNLISTED = 0.92  # linear; shown where the targets hold no pixel
+
+
+@dataclass(frozen=True, kw_only=True)
+class ReportView:
+    """One view: what the capture shows and what the registration renders, on one pixel grid."""
+
+    name: str
+    target_rgb: Float[np.ndarray, "H W 3"]  # linear
+    rendered_rgb: Float[np.ndarray, "H W 3"]  # linear
+    compared: Bool[np.ndarray, "H W"]  # where colours were compared
+    target_mask: Float[np.ndarray, "H W"] | None = None  # coverage of the subject
+    rendered_mask: Float[np.ndarray, "H W"]
+    target_normals: Float[np.ndarray, "H W 3"] | None = None  # world, unit; 0 where there is none
+    rendered_normals: Float[np.ndarray, "H W 3"]
+    target_classes: Int[np.ndarray, "H W"] | None = None  # index into `class_names`; -1 where not compared
+    rendered_classes: Int[np.ndarray, "H W"]  # -1 on a miss
+
+
+@dataclass(frozen=True, kw_only=True)
+class HeatMap:
+    """Distances to draw on a surface."""
+
+    vertices: Float[np.ndarray, "V 3"]  # m, capture world
+    triangles: Int[np.ndarray, "F 3"]
+    distance_mm: Float[np.ndarray, "V"]  # NaN where nothing was measured
+    T_head_world: Float[np.ndarray, "4 4"]  # turns the capture world to the model frame: +Y up, +Z out of the face
+
+
+@dataclass(frozen=True, kw_only=True)
+class ReportInputs:
+    """Everything on the page."""
+
+    registration: Registration
+    subject: str
+    expression: str
+    views: tuple[ReportView, ...] = ()
+    class_names: tuple[str, ...] = ()
+    heat_map: HeatMap | None = None
+    versions: Mapping[str, str] = field(default_factory=dict)
+
+
+def heat_map(registration: Registration, distance_mm: Float[np.ndarray, "V"]) -> HeatMap:
+    """Distances of the registered vertices (NaN where not measured), upright as the root joint turns the head."""
+    T_head_world = np.eye(4)
+    root = torch.from_numpy(registration.rotations[0].astype(np.float64))
+    T_head_world[:3, :3] = axis_angle_to_matrix(root).numpy().T
+    return HeatMap(
+        vertices=registration.vertices,
+        triangles=registration.triangles,
+        distance_mm=distance_mm,
+        T_head_world=T_head_world,
+    )
+
+
+def report_views(targets: Targets, rendered: Rendered) -> tuple[ReportView, ...]:
+    """One `ReportView` for each view of a batch of targets and its rendering at the same pixels."""
+
+    def images(values: Tensor, background: float = 0.0) -> np.ndarray:
+        flat = values.detach().float().reshape(len(values), -1)
+        return targets.pixels.image(flat, background).cpu().numpy()
+
+    target_rgb, compared = images(targets.rgb, _UNLISTED), images(targets.rgb_weight)[..., 0] > 0
+    normals, classes = images(targets.normals), images(targets.classes)
+    normals *= images(targets.normal_weight) > 0
+    classed = (images(targets.class_weight)[..., 0] > 0) & (classes.max(-1) > 0.5)
+    mask, mask_weight = images(targets.mask)[..., 0], images(targets.mask_weight)[..., 0]
+    drawn_mask, drawn_classes = images(rendered.mask)[..., 0], images(rendered.classes).argmax(-1)
+    drawn_rgb, drawn_normals = images(rendered.rgb), images(rendered.normals)
+    return tuple(
+        ReportView(
+            name=name,
+            target_rgb=target_rgb[n],
+            rendered_rgb=drawn_rgb[n],
+            compared=compared[n],
+            target_mask=mask[n] if mask_weight[n].any() else None,
+            rendered_mask=drawn_mask[n],
+            target_normals=normals[n] if normals[n].any() else None,
+            rendered_normals=drawn_normals[n],
+            target_classes=np.where(classed[n], classes[n].argmax(-1), -1) if classed[n].any() else None,
+            rendered_classes=np.where(drawn_mask[n] > 0.5, drawn_classes[n], -1),
+        )
+        for n, name in enumerate(targets.names)
+    )
