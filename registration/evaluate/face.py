@@ -45,7 +45,7 @@ def face_ball(capture: Capture, registration: Registration) -> FaceBall:
         where=f"{capture.root} and its registration",
         expected=f'landmarks {NOSE_BRIDGE}, {NOSE_BASE}, {RIGHT_EYE}, {LEFT_EYE} of scheme "{SCHEME}" in two views',
         got="too few, and none stored with the registration",
-        fix=f'add landmarks, or register with a model that has head_sparse_{SCHEME}.txt beside it',
+        fix=f"add landmarks, or register with a model that has head_sparse_{SCHEME}.txt beside it",
     )
 
 

@@ -88,9 +88,7 @@ class _SizeClass:
             open_rows = open_rows[reached - self.radius < best.distance[open_rows]]
             count *= 4
 
-    def search(
-        self, points: np.ndarray, rows: np.ndarray, corners: np.ndarray, best: _Best, count: int
-    ) -> np.ndarray:
+    def search(self, points: np.ndarray, rows: np.ndarray, corners: np.ndarray, best: _Best, count: int) -> np.ndarray:
         """Offer each point its `count` nearest centroids' triangles; how far away the last centroid was."""
         count = min(count, len(self.members))
         reached = np.empty(len(rows))

@@ -37,9 +37,7 @@ def loss_curves(history: Mapping[str, Mapping[str, Sequence[float]]]) -> str:
         for panel in panels[len(stages) :]:
             panel.set_visible(False)
         handles = [Line2D([], [], color=colours[term], lw=2.4) for term in names]
-        figure.legend(
-            handles, names, loc="outside lower left", ncols=min(len(names), 8), fontsize=9, frameon=False
-        )
+        figure.legend(handles, names, loc="outside lower left", ncols=min(len(names), 8), fontsize=9, frameon=False)
         buffer = io.StringIO()
         figure.savefig(buffer, format="svg", transparent=True, metadata={"Date": None, "Creator": None})
     drawing = buffer.getvalue()
