@@ -8,7 +8,7 @@ from typing import Any, Literal
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 Status = Literal["converged", "stopped", "failed"]
@@ -87,50 +87,94 @@ class ViewPixels:
 
 
 @dataclass(frozen=True, kw_only=True)
+class Pixels:
+    """The P pixels of some views that take part in a step: a list, and the way back from an image to it.
+
+    All cameras have one image size and no distortion. Arrays of pixels are ordered by view.
+    """
+
+    cameras: tuple[Camera, ...]
+    view: Int[Tensor, "P"]  # int32, as the next two
+    x: Int[Tensor, "P"]
+    y: Int[Tensor, "P"]
+    index: Int[Tensor, "N H W"]  # place in the list, or -1
+
+    @classmethod
+    def of(cls, cameras: Sequence[Camera], chosen: Bool[Tensor, "N H W"]) -> "Pixels":
+        """The list of the chosen pixels."""
+        view, y, x = (axis.to(torch.int32) for axis in chosen.nonzero(as_tuple=True))
+        index = torch.full(chosen.shape, -1, dtype=torch.int32, device=chosen.device)
+        index[chosen] = torch.arange(len(view), dtype=torch.int32, device=chosen.device)
+        return cls(cameras=tuple(cameras), view=view, x=x, y=y, index=index)
+
+    @classmethod
+    def all_of(cls, cameras: Sequence[Camera], device: torch.device | str = "cpu") -> "Pixels":
+        """Every pixel of every view."""
+        shape = (len(cameras), cameras[0].height_px, cameras[0].width_px)
+        return cls.of(cameras, torch.ones(shape, dtype=torch.bool, device=device))
+
+    def image(self, values: Float[Tensor, "P D"], background: float = 0.0) -> Float[Tensor, "N H W D"]:
+        """Values of listed pixels laid out as images; differentiable."""
+        image = values.new_full((*self.index.shape, values.shape[-1]), background)
+        return image.index_put((self.view.long(), self.y.long(), self.x.long()), values)
+
+
+@dataclass(frozen=True, kw_only=True)
 class Targets:
-    """What the losses compare with, at one pyramid level: every view cut to one common window size.
+    """What the losses compare with, at one pyramid level: the pixels in and around the head.
 
     Levels are kept in float16; `select` gives the float32 batch of a step. A weight of 0 means: not compared.
     """
 
     names: tuple[str, ...]  # of the views
-    cameras: tuple[Camera, ...]  # of the windows
     class_names: tuple[str, ...]  # the K classes that model and capture share
-    rgb: Float[Tensor, "N H W 3"]  # linear
-    rgb_weight: Float[Tensor, "N H W"]
-    normals: Float[Tensor, "N H W 3"]  # world frame, unit or 0
-    normal_weight: Float[Tensor, "N H W"]
-    mask: Float[Tensor, "N H W"]  # coverage of the subject
-    mask_weight: Float[Tensor, "N H W"]
-    classes: Float[Tensor, "N H W K"]
-    class_weight: Float[Tensor, "N H W"]
-    landmarks: Mapping[str, Float[Tensor, "N L 3"]]  # scheme -> x_px y_px confidence, in the windows
+    pixels: Pixels
+    rgb: Float[Tensor, "P 3"]  # linear
+    rgb_weight: Float[Tensor, "P"]
+    normals: Float[Tensor, "P 3"]  # world frame, unit or 0
+    normal_weight: Float[Tensor, "P"]
+    mask: Float[Tensor, "P"]  # coverage of the subject
+    mask_weight: Float[Tensor, "P"]
+    classes: Float[Tensor, "P K"]
+    class_weight: Float[Tensor, "P"]
+    landmarks: Mapping[str, Float[Tensor, "N L 3"]]  # scheme -> x_px y_px confidence
     px_per_head: float  # the subject's height in pixels, median over views
 
     def select(self, views: Sequence[int], device: torch.device) -> "Targets":
         """The batch of some views, float32, on a device."""
-        index = list(views)
+        views = list(views)
+        first = torch.searchsorted(self.pixels.view, torch.arange(len(self.names) + 1, dtype=torch.int32)).tolist()
 
-        def take(value: Tensor) -> Tensor:
-            return value[index].to(device, torch.float32)
+        def take(values: Tensor) -> Tensor:
+            return torch.cat([values[first[v] : first[v + 1]] for v in views]).to(device)
 
-        return replace(
-            self,
-            names=tuple(self.names[i] for i in index),
-            cameras=tuple(self.cameras[i] for i in index),
-            landmarks={scheme: take(points) for scheme, points in self.landmarks.items()},
-            **{f.name: take(getattr(self, f.name)) for f in fields(self) if isinstance(getattr(self, f.name), Tensor)},
+        sizes = torch.tensor([first[v + 1] - first[v] for v in views], dtype=torch.int32)
+        shift = (sizes.cumsum(0) - sizes - torch.tensor([first[v] for v in views])).to(torch.int32)[:, None, None]
+        index = self.pixels.index[views]
+        pixels = Pixels(
+            cameras=tuple(self.pixels.cameras[v] for v in views),
+            view=torch.repeat_interleave(torch.arange(len(views), dtype=torch.int32), sizes).to(device),
+            x=take(self.pixels.x),
+            y=take(self.pixels.y),
+            index=torch.where(index < 0, index, index + shift).to(device),
         )
+        values = {
+            f.name: take(getattr(self, f.name)).to(torch.float32)
+            for f in fields(self)
+            if isinstance(getattr(self, f.name), Tensor)
+        }
+        landmarks = {scheme: points[views].to(device) for scheme, points in self.landmarks.items()}
+        return replace(self, names=tuple(self.names[v] for v in views), pixels=pixels, landmarks=landmarks, **values)
 
 
 @dataclass(frozen=True, kw_only=True)
 class Rendered:
-    """What the renderer draws for the views of one step; nothing is shaded."""
+    """What the renderer draws at some pixels; nothing is shaded."""
 
-    rgb: Float[Tensor, "N H W 3"]  # the texture's colour, linear
-    normals: Float[Tensor, "N H W 3"]  # world frame, unit; 0 on a miss
-    classes: Float[Tensor, "N H W K"]  # soft share of each class; 0 on a miss
-    mask: Float[Tensor, "N H W"]  # 1 on a hit
+    rgb: Float[Tensor, "P 3"]  # the texture's colour, linear
+    normals: Float[Tensor, "P 3"]  # world frame, unit; 0 on a miss
+    classes: Float[Tensor, "P K"]  # soft share of each class; 0 on a miss
+    mask: Float[Tensor, "P"]  # 1 on a hit
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -1,7 +1,7 @@
 """What rendered images are compared by. Every term is a mean over the subject's pixels of the views of a step."""
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from kornia.metrics import ssim
 from torch import Tensor
 
@@ -22,7 +22,7 @@ def encoded(linear: Tensor) -> Tensor:
     return linear.clamp_min(_ENCODING_FLOOR).sqrt()
 
 
-def agreement(rendered: Rendered, targets: Targets, surfaces: list[int]) -> Float[Tensor, "N H W"]:
+def agreement(rendered: Rendered, targets: Targets, surfaces: list[int]) -> Bool[Tensor, "P"]:
     """1 where rendered and target pixel lie on the same kind of surface, else 0.
 
     `surfaces` are the classes that are surfaces of their own (eyes, mouth interior). Without this test lids creep over
@@ -39,15 +39,13 @@ def rgb_l1(rendered: Rendered, targets: Targets, agree: Tensor) -> Tensor:
 
 
 def rgb_ssim(rendered: Rendered, targets: Targets, agree: Tensor) -> Tensor:
-    """1 - SSIM on perceptually encoded colour (window 11), where the whole window lies on the subject."""
-    weight = targets.rgb_weight * agree
-    inner = -torch.nn.functional.max_pool2d(-(weight > 0).float()[:, None], 11, 1, 5)[:, 0]
-    if not inner.any():
-        return rendered.rgb.sum() * 0
-    # What lies outside must not enter the windows' statistics: both images show the target there.
-    shown = torch.where(agree[..., None], encoded(rendered.rgb), encoded(targets.rgb))
-    similarity = ssim(shown.permute(0, 3, 1, 2), encoded(targets.rgb).permute(0, 3, 1, 2), 11).mean(1)
-    return ((1 - similarity) * inner * weight).sum() / subject_pixels(targets)
+    """1 - SSIM on perceptually encoded colour, window 11, sigma 1.5 px."""
+    # What is not compared must not enter the windows' statistics: there both images show the target.
+    shown = torch.where(agree[:, None], encoded(rendered.rgb), encoded(targets.rgb))
+    pair = (targets.pixels.image(c).permute(0, 3, 1, 2) for c in (shown, encoded(targets.rgb)))
+    dissimilarity = 1 - ssim(*pair, 11).mean(1)
+    weight = targets.pixels.image((targets.rgb_weight * agree)[:, None])[..., 0]
+    return (dissimilarity * weight).sum() / subject_pixels(targets)
 
 
 def normals(rendered: Rendered, targets: Targets, agree: Tensor, truncation: float) -> Tensor:

@@ -1,4 +1,4 @@
-"""The unshaded differentiable renderer: one wavefront of Dr.Jit over the pixels of all views of a step.
+"""The unshaded differentiable renderer: one wavefront of Dr.Jit over chosen pixels of all views of a step.
 
 Forward casts one ray through each pixel centre. The adjoint has two parts: the interior, recomputed on the hits with
 attached vertices (nothing is traced again), and the silhouettes (`silhouette.py`). Nothing else moves an image:
@@ -6,8 +6,6 @@ there is no shading, no film and no filter; a pixel is a box.
 """
 
 from __future__ import annotations  # mi.Float exists only once a variant is chosen
-
-from collections.abc import Sequence
 
 import drjit as dr
 import mitsuba as mi
@@ -18,10 +16,10 @@ from torch import Tensor
 
 from registration.geometry.topology import edges, vertex_normals
 from registration.render import silhouette
-from registration.render.cameras import CameraBatch, pack
+from registration.render.cameras import PixelList, upload
 from registration.render.scene import TriangleScene
 from registration.render.shading import CLASSES, MASK, NORMAL, RGB, Surface, texel_footprint
-from registration.types import Camera, Rendered
+from registration.types import Pixels, Rendered
 
 _MISS = 0xFFFFFFFF
 _CENTRE = (0.5, 0.5)
@@ -65,15 +63,15 @@ class Renderer:
         dr.eval(self._faces, self._corner_uvs, self._classes)
 
     def __call__(
-        self, vertices: Float[Tensor, "V 3"], texture: Float[Tensor, "R R 3"] | None, cameras: Sequence[Camera]
+        self, vertices: Float[Tensor, "V 3"], texture: Float[Tensor, "R R 3"] | None, pixels: Pixels
     ) -> Rendered:
-        """Draw all views; differentiable in `vertices` (world, metres) and `texture` (linear).
+        """Draw pixels; differentiable in `vertices` (world, metres) and `texture` (linear).
 
-        Without a texture the RGB channels are zero and cost nothing. Cameras have one image size, no distortion.
+        Without a texture the RGB channels are zero and cost nothing.
         """
         self._triangles = self._triangles.to(vertices.device)
         normals = vertex_normals(vertices, self._triangles)
-        image = _Draw.apply(vertices, normals, texture, self, pack(cameras))
+        image = _Draw.apply(vertices, normals, texture, self, upload(pixels))
         return Rendered(
             rgb=image[..., RGB], normals=image[..., NORMAL], mask=image[..., MASK], classes=image[..., CLASSES:]
         )
@@ -81,12 +79,12 @@ class Renderer:
     def unwrap(
         self,
         vertices: Float[Tensor, "V 3"],
-        values: Float[Tensor, "N H W D"],
-        weights: Float[Tensor, "N H W"],
-        cameras: Sequence[Camera],
+        values: Float[Tensor, "P D"],
+        weights: Float[Tensor, "P"],
+        pixels: Pixels,
         texture_size: int,
     ) -> tuple[Float[Tensor, "R R D"], Float[Tensor, "R R"]]:
-        """Carry images back to the texture: the transpose of the bilinear look-up.
+        """Carry pixels back to the texture: the transpose of the bilinear look-up.
 
         Returns the weighted sum of `values` that fell on each texel, and the sum of the weights. Not differentiable.
         """
@@ -94,7 +92,7 @@ class Renderer:
             self._triangles = self._triangles.to(vertices.device)
             surface = self._surface(vertices, vertex_normals(vertices, self._triangles), None, texture_size)
             self._scene.move(vertices)
-            return self._splat(surface, pack(cameras), values, weights)
+            return self._splat(surface, upload(pixels), values, weights)
 
     def _surface(self, positions: Tensor, normals: Tensor, texture: Tensor | None, texture_size: int = 0) -> Surface:
         return Surface(
@@ -108,17 +106,13 @@ class Renderer:
             texture_size=texture_size if texture is None else texture.shape[0],
         )
 
-    def _trace(self, cameras: CameraBatch, offset: tuple[float, float]):
-        count = cameras.count * cameras.height_px * cameras.width_px
-        origin, direction = _pixel_rays(cameras, dr.arange(mi.UInt32, count), offset)
-        return self._scene.cast(origin, direction, mi.Bool(True), coherent=True)
-
-    def _forward(self, surface: Surface, cameras: CameraBatch) -> tuple[mi.Float, list[mi.UInt32]]:
-        """The image, (N H W C) flat, and for each ray of a pixel the face it meets, or _MISS."""
+    def _forward(self, surface: Surface, pixels: PixelList) -> tuple[mi.Float, list[mi.UInt32]]:
+        """The channels of every pixel, (P C) flat, and for each ray of a pixel the face it meets, or _MISS."""
         image, seen = mi.Float(0), []
         with dr.suspend_grad():
             for offset in self._pixel_offsets:
-                hit = self._trace(cameras, offset)
+                origin, direction = pixels.rays(offset)
+                hit = self._scene.cast(origin, direction, mi.Bool(True), coherent=True)
                 is_hit = hit.is_valid()
                 face = dr.select(is_hit, hit.prim_index, 0)
                 channels = surface.shade(face, hit.prim_uv.x, hit.prim_uv.y, is_hit)
@@ -129,19 +123,14 @@ class Renderer:
         return image, seen
 
     def _interior(
-        self,
-        surface: Surface,
-        cameras: CameraBatch,
-        offset: tuple[float, float],
-        seen: mi.UInt32,
-        adjoint: mi.Float,
+        self, surface: Surface, pixels: PixelList, offset: tuple[float, float], seen: mi.UInt32, adjoint: mi.Float
     ) -> None:
         """Add the part of the gradient that needs no visibility change, over the rays that hit."""
         pixel = dr.compress(seen != _MISS)
         if dr.width(pixel) == 0:
             return
         face = dr.gather(mi.UInt32, seen, pixel)
-        origin, direction = _pixel_rays(cameras, pixel, offset)
+        origin, direction = pixels.rays(offset, pixel)
         b1, b2 = surface.barycentrics(face, origin, direction)
         channels = surface.shade(face, b1, b2, mi.Bool(True))
         g = dr.gather(mi.ArrayXf, adjoint, pixel, shape=(surface.channel_count, dr.width(pixel)))
@@ -149,10 +138,11 @@ class Renderer:
         value = sum((g[k] * channels[k] for k in range(first, len(channels)) if k != MASK), mi.Float(0))
         dr.backward(value * (1 / len(self._pixel_offsets)))
 
-    def _splat(self, surface: Surface, cameras: CameraBatch, values: Tensor, weights: Tensor):
+    def _splat(self, surface: Surface, pixels: PixelList, values: Tensor, weights: Tensor):
         size, depth = surface.texture_size, values.shape[-1]
         with dr.suspend_grad():
-            hit = self._trace(cameras, _CENTRE)
+            origin, direction = pixels.rays(_CENTRE)
+            hit = self._scene.cast(origin, direction, mi.Bool(True), coherent=True)
             active = hit.is_valid()
             face = dr.select(active, hit.prim_index, 0)
             b = [1 - hit.prim_uv.x - hit.prim_uv.y, hit.prim_uv.x, hit.prim_uv.y]
@@ -178,45 +168,48 @@ class _Draw(torch.autograd.Function):
     """The bridge: torch tensors in and out, Dr.Jit between. Memory is shared, so every hand-over waits."""
 
     @staticmethod
-    def forward(ctx, positions, normals, texture, renderer: Renderer, cameras: CameraBatch):
+    def forward(ctx, positions, normals, texture, renderer: Renderer, pixels: PixelList):
         renderer._scene.move(positions)
         surface = renderer._surface(positions, normals, texture)
-        image, ctx.seen = renderer._forward(surface, cameras)
-        ctx.renderer, ctx.cameras = renderer, cameras
+        image, ctx.seen = renderer._forward(surface, pixels)
+        ctx.renderer, ctx.pixels = renderer, pixels
         ctx.save_for_backward(positions, normals, *(() if texture is None else (texture,)))
-        return image.torch().view(cameras.count, cameras.height_px, cameras.width_px, surface.channel_count)
+        return image.torch().view(pixels.count, surface.channel_count)
 
     @staticmethod
     def backward(ctx, *grad_outputs):
         positions, normals, *rest = ctx.saved_tensors
+        texture = rest[0] if rest else None
         renderer: Renderer = ctx.renderer
         renderer._scene.move(positions)
-        surface = renderer._surface(positions, normals, rest[0] if rest else None)
         adjoint = _upload(grad_outputs[0])
-        attached = [surface.positions, surface.normals] + ([surface.texture] if rest else [])
-        dr.enable_grad(*attached)
+        surface, still = (renderer._surface(positions, normals, texture) for _ in range(2))
+        attached = {0: surface.positions, 1: surface.normals, 2: surface.texture}
+        wanted = [k for k in attached if ctx.needs_input_grad[k]]
+        dr.enable_grad(*(attached[k] for k in wanted))
         for offset, seen in zip(renderer._pixel_offsets, ctx.seen, strict=True):
-            renderer._interior(surface, ctx.cameras, offset, seen, adjoint)
-        moving = mi.Float(dr.detach(surface.positions))
-        dr.enable_grad(moving)
-        renderer._seed += 1
-        silhouette.backward(
-            renderer._scene,
-            renderer._surface(positions, normals, rest[0] if rest else None),
-            moving,
-            renderer._edges,
-            ctx.cameras,
-            adjoint,
-            samples_per_px=renderer._edge_samples,
-            seed=renderer._seed,
-        )
-        gradients = [dr.grad(a) for a in attached]
-        gradients[0] = gradients[0] + dr.grad(moving)
+            renderer._interior(surface, ctx.pixels, offset, seen, adjoint)
+        gradients = {k: dr.grad(attached[k]) for k in wanted}
+        if 0 in wanted:
+            moving = mi.Float(still.positions)
+            dr.enable_grad(moving)
+            renderer._seed += 1
+            silhouette.backward(
+                renderer._scene,
+                still,
+                moving,
+                renderer._edges,
+                ctx.pixels,
+                adjoint,
+                samples_per_px=renderer._edge_samples,
+                seed=renderer._seed,
+            )
+            gradients[0] = gradients[0] + dr.grad(moving)
         dr.eval(gradients)
         dr.sync_thread()
-        shapes = [positions.shape, normals.shape] + [t.shape for t in rest]
-        out = [g.torch().reshape(shape).clone() for g, shape in zip(gradients, shapes, strict=True)]
-        return out[0], out[1], out[2] if rest else None, None, None
+        shapes = {0: positions.shape, 1: normals.shape, 2: texture.shape if texture is not None else None}
+        out = [gradients[k].torch().reshape(shapes[k]).clone() if k in gradients else None for k in range(3)]
+        return out[0], out[1], out[2], None, None
 
 
 def _upload(tensor: Tensor) -> mi.Float:
@@ -229,14 +222,3 @@ def _pixel_offsets(count: int) -> list[tuple[float, float]]:
     if count == 1:
         return [_CENTRE]
     return [((i + 0.5) / count, (i * 0.6180339887498949 + 0.25) % 1) for i in range(count)]
-
-
-def _pixel_rays(cameras: CameraBatch, pixel: mi.UInt32, offset: tuple[float, float]) -> tuple[mi.Point3f, mi.Vector3f]:
-    """Rays through pixels, given as flat indices into (N H W), at an offset from the pixel's corner."""
-    height, width = dr.opaque(mi.UInt32, cameras.height_px), dr.opaque(mi.UInt32, cameras.width_px)
-    row = pixel // width
-    view = row // height
-    camera = cameras.gather(view)
-    x, y = (dr.opaque(mi.Float, value) for value in offset)
-    x, y = x + mi.Float(pixel - row * width), y + mi.Float(row - view * height)
-    return camera.centre, camera.direction(x, y)

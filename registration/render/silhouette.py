@@ -17,7 +17,7 @@ import drjit as dr
 import mitsuba as mi
 
 from registration.geometry.topology import Edges
-from registration.render.cameras import CameraBatch, CameraLanes
+from registration.render.cameras import CameraLanes, PixelList
 from registration.render.scene import TriangleScene
 from registration.render.shading import MASK, Surface
 
@@ -62,18 +62,18 @@ class _Silhouettes:
     total_px: mi.Float
 
 
-def _find(surface: Surface, edges: EdgeArrays, cameras: CameraBatch) -> _Silhouettes | None:
+def _find(surface: Surface, edges: EdgeArrays, pixels: PixelList) -> _Silhouettes | None:
     face_count = dr.width(surface.faces) // 3
     faces, edge_count = dr.opaque(mi.UInt32, face_count), dr.opaque(mi.UInt32, edges.count)
 
-    lane = dr.arange(mi.UInt32, cameras.count * face_count)
+    lane = dr.arange(mi.UInt32, pixels.camera_count * face_count)
     view = lane // faces
     corners = surface.corners(lane - view * faces, True)
     a, b, c = (surface.position(corners[k]) for k in range(3))
-    facing = dr.dot(dr.cross(b - a, c - a), cameras.centre(view) - a) > 0
+    facing = dr.dot(dr.cross(b - a, c - a), pixels.centre(view) - a) > 0
     dr.eval(facing)
 
-    lane = dr.arange(mi.UInt32, cameras.count * edges.count)
+    lane = dr.arange(mi.UInt32, pixels.camera_count * edges.count)
     view = lane // edge_count
     edge = lane - view * edge_count
     pair = dr.gather(mi.Point2u, edges.faces, edge)
@@ -87,7 +87,7 @@ def _find(surface: Surface, edges: EdgeArrays, cameras: CameraBatch) -> _Silhoue
 
     view = ids // edge_count
     ends = dr.gather(mi.Point2u, edges.vertices, ids - view * edge_count)
-    camera = cameras.gather(view)
+    camera = pixels.camera(view)
     xa, za = camera.project(surface.position(ends.x))
     xb, zb = camera.project(surface.position(ends.y))
     length = dr.cumsum(dr.select((za > 0) & (zb > 0), dr.norm(xb - xa), 0))
@@ -130,7 +130,7 @@ def backward(
     surface: Surface,
     moving: mi.Float,
     edges: EdgeArrays,
-    cameras: CameraBatch,
+    pixels: PixelList,
     adjoint: mi.Float,
     *,
     samples_per_px: float,
@@ -138,10 +138,10 @@ def backward(
 ) -> None:
     """Add the silhouettes' part of d(adjoint . image)/d(positions) to the gradient of `moving`.
 
-    `surface` is detached, `moving` is the same positions with gradients enabled; `adjoint` is (N H W C) flat.
+    `surface` is detached, `moving` is the same positions with gradients enabled; `adjoint` is (P C) flat.
     """
     with dr.suspend_grad():
-        found = _find(surface, edges, cameras)
+        found = _find(surface, edges, pixels)
         if found is None:
             return
         samples = int(samples_per_px * float(dr.slice(found.total_px, 0)))
@@ -152,16 +152,14 @@ def backward(
         view = view_edge // edge_count
         edge = view_edge - view * edge_count
         ends = dr.gather(mi.Point2u, edges.vertices, edge)
-        camera = cameras.gather(view)
+        camera = pixels.camera(view)
         xa, za = camera.project(surface.position(ends.x))
         xb, zb = camera.project(surface.position(ends.y))
         normal = _outward(surface, camera, dr.gather(mi.UInt32, edges.faces, 2 * edge + side), xa, xb)
 
         x = dr.lerp(xa, xb, s)
         depth = dr.rcp((1 - s) / za + s / zb)
-        height, width = dr.opaque(mi.UInt32, cameras.height_px), dr.opaque(mi.UInt32, cameras.width_px)
-        inside = (x.x >= 0) & (x.y >= 0) & (x.x < mi.Float(width)) & (x.y < mi.Float(height)) & (za > 0) & (zb > 0)
-        pixel = (view * height + mi.UInt32(dr.select(inside, x.y, 0))) * width + mi.UInt32(dr.select(inside, x.x, 0))
+        pixel, inside = pixels.at(view, x, (za > 0) & (zb > 0))
         channels = surface.channel_count
         g = dr.gather(mi.ArrayXf, adjoint, pixel, inside, shape=(channels, samples))
 

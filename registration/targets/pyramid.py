@@ -13,7 +13,7 @@ from jaxtyping import Float
 
 from registration.capture.pixels import read_labels, read_mask, read_view, undistort_landmarks
 from registration.targets.classes import BACKGROUND, ClassMap
-from registration.types import Camera, Capture, Targets, View, ViewPixels
+from registration.types import Camera, Capture, Pixels, Targets, View, ViewPixels
 
 _MARGIN = 0.08  # of the head's height: how far around the head pixels are kept and silhouettes pull
 _PURE = 0.99  # coverage from which a pixel counts as wholly inside the subject
@@ -184,21 +184,25 @@ def _halved(window: _Window) -> _Window:
 
 def _targets(windows: list[_Window], mapping: ClassMap) -> Targets:
     weighed = [_weigh(w) for w in windows]
+    taking_part = np.stack([np.any([w[name] > 0 for name in w if name.endswith("weight")], axis=0) for w in weighed])
+    pixels = Pixels.of([w.camera for w in windows], torch.as_tensor(taking_part))
 
-    def stack(values: list[np.ndarray]) -> torch.Tensor:
-        return torch.as_tensor(np.stack(values).astype(np.float16))
+    def listed(values: list[np.ndarray]) -> torch.Tensor:
+        return torch.as_tensor(
+            np.concatenate([v[t] for v, t in zip(values, taking_part, strict=True)]).astype(np.float16)
+        )
 
     schemes = sorted({scheme for w in windows for scheme in w.landmarks})
     return Targets(
         names=tuple(w.name for w in windows),
-        cameras=tuple(w.camera for w in windows),
         class_names=mapping.names,
-        rgb=stack([w.rgb for w in windows]),
-        mask=stack([w.mask for w in windows]),
-        classes=stack([w.classes for w in windows]),
+        pixels=pixels,
+        rgb=listed([w.rgb for w in windows]),
+        mask=listed([w.mask for w in windows]),
+        classes=listed([w.classes for w in windows]),
         landmarks={scheme: _stack_landmarks(windows, scheme) for scheme in schemes},
         px_per_head=float(np.median([w.head_px for w in windows])),
-        **{name: stack([w[name] for w in weighed]) for name in weighed[0]},
+        **{name: listed([w[name] for w in weighed]) for name in weighed[0]},
     )
 
 

@@ -13,7 +13,7 @@ import numpy as np
 import torch
 
 from registration.render.renderer import Renderer
-from registration.types import Camera, Rendered
+from registration.types import Camera, Pixels, Rendered
 
 PIXEL_SAMPLES = 64
 STANDARD_ERROR = 0.005
@@ -36,6 +36,10 @@ class Scene:
     classes: np.ndarray  # (V, K)
     cameras: Sequence[Camera]
 
+    @property
+    def pixels(self) -> Pixels:
+        return Pixels.all_of(self.cameras)
+
 
 @dataclass(frozen=True, kw_only=True)
 class Cell:
@@ -56,7 +60,9 @@ class Cell:
         )
 
 
-def look_at(target: np.ndarray, azimuth: float, elevation: float, distance_m: float, size_px: int, fill: float) -> Camera:
+def look_at(
+    target: np.ndarray, azimuth: float, elevation: float, distance_m: float, size_px: int, fill: float
+) -> Camera:
     """A camera around a target (m); `fill` is the height (m) that the image spans at the target's distance."""
     out = np.array([np.sin(azimuth) * np.cos(elevation), np.sin(elevation), np.cos(azimuth) * np.cos(elevation)])
     z = -out
@@ -102,7 +108,7 @@ def motion_cells(scene: Scene, texture_size: int = 256) -> list[Cell]:
     renderer = _renderer(scene)
     base = torch.tensor(scene.vertices, dtype=torch.float32)
     attached = base.clone().requires_grad_()
-    still = renderer(attached, texture, scene.cameras)
+    still = renderer(attached, texture, scene.pixels)
     pixel_m = _pixel_size(scene)
     cells = []
     for motion, field in motions(scene).items():
@@ -111,7 +117,7 @@ def motion_cells(scene: Scene, texture_size: int = 256) -> list[Cell]:
         def change(step_px: float, direction=direction) -> Rendered:
             step = step_px * pixel_m * direction
             with torch.no_grad():
-                ahead, behind = (renderer(base + s * step, texture, scene.cameras) for s in (1, -1))
+                ahead, behind = (renderer(base + s * step, texture, scene.pixels) for s in (1, -1))
             return Rendered(**{k: getattr(ahead, k) - getattr(behind, k) for k in vars(ahead)})
 
         wide, near = change(1.0), change(NEAR_PX)
@@ -145,13 +151,17 @@ def texel_cell(scene: Scene, texture_size: int = 256) -> Cell:
     base = torch.tensor(scene.vertices, dtype=torch.float32)
     renderer = _renderer(scene)
     with torch.no_grad():
-        images = [renderer(base, texture + s * change, scene.cameras).rgb for s in (0.5, -0.5)]
+        images = [renderer(base, texture + s * change, scene.pixels).rgb for s in (0.5, -0.5)]
     adjoint = images[0] - images[1]
     attached = texture.clone().requires_grad_()
-    (renderer(base, attached, scene.cameras).rgb * adjoint).sum().backward()
+    (renderer(base, attached, scene.pixels).rgb * adjoint).sum().backward()
     gradient = (attached.grad.double() * change.double()).sum().item()
     return Cell(
-        motion="texels", channel="rgb", difference=adjoint.double().square().sum().item(), gradient=gradient, standard_error=0.0
+        motion="texels",
+        channel="rgb",
+        difference=adjoint.double().square().sum().item(),
+        gradient=gradient,
+        standard_error=0.0,
     )
 
 

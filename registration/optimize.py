@@ -1,0 +1,103 @@
+"""The one optimisation loop. It is handed blocks of unknowns and an objective, and knows none by name."""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+import torch
+from torch import Tensor
+
+History = dict[str, list[float]]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Rate:
+    """A learning rate: `start`, held for a share of the steps, then falling geometrically to `end`."""
+
+    start: float
+    end: float
+    hold: float = 0.0
+
+    def at(self, progress: float) -> float:
+        """The rate when a share `progress` of the steps is done."""
+        fall = max(0.0, progress - self.hold) / max(1e-9, 1.0 - self.hold)
+        return self.start * (self.end / self.start) ** fall
+
+
+class Block(Protocol):
+    """Unknowns that are updated by one rule. Their gradients are cleared and filled by the loop."""
+
+    tensors: Sequence[Tensor]
+
+    def step(self, progress: float) -> None: ...
+
+
+class AdamBlock:
+    """Adam, for unknowns of comparable scale."""
+
+    def __init__(self, tensors: Sequence[Tensor], rate: Rate, betas: tuple[float, float] = (0.8, 0.95)):
+        self.tensors = tensors
+        self._rate = rate
+        self._optimizer = torch.optim.Adam(tensors, lr=rate.start, betas=betas)
+
+    def step(self, progress: float) -> None:
+        for group in self._optimizer.param_groups:
+            group["lr"] = self._rate.at(progress)
+        self._optimizer.step()
+
+
+class AdamUniformBlock:
+    """Adam with one step size for all vertices (Nicolet 2021), so that a field's direction is kept.
+
+    The paper divides by the largest second moment; here by a high quantile, since one wild vertex would rule it.
+    """
+
+    QUANTILE = 0.998
+
+    def __init__(self, latent: Tensor, rate: Rate, betas: tuple[float, float] = (0.9, 0.99)):
+        self.tensors = (latent,)
+        self._rate = rate
+        self._betas = betas
+        self._first = torch.zeros_like(latent)
+        self._second = torch.zeros((), device=latent.device)
+        self._steps = 0
+
+    @torch.no_grad()
+    def step(self, progress: float) -> None:
+        (latent,) = self.tensors
+        assert latent.grad is not None
+        self._steps += 1
+        b1, b2 = self._betas
+        self._first.lerp_(latent.grad, 1 - b1)
+        self._second.lerp_(latent.grad.square().sum(-1).quantile(self.QUANTILE), 1 - b2)
+        scale = (self._second / (1 - b2**self._steps)).sqrt() + 1e-12
+        latent -= self._rate.at(progress) / (1 - b1**self._steps) / scale * self._first
+
+
+def minimise(
+    blocks: Sequence[Block],
+    objective: Callable[[int], Mapping[str, Tensor]],
+    steps: int,
+    after_step: Callable[[int], None] = lambda step: None,
+) -> tuple[History, str | None]:
+    """Take `steps` steps on the sum of the objective's weighted terms.
+
+    Returns the value of every term at every step, and None or why it had to stop: a term that is not finite. The
+    unknowns are then those before that step.
+    """
+    history: History = {}
+    for step in range(steps):
+        terms = objective(step)
+        for name, value in terms.items():
+            history.setdefault(name, []).append(value.item())
+        broken = [name for name, values in history.items() if not torch.isfinite(torch.tensor(values[-1]))]
+        if broken:
+            return history, f"{', '.join(broken)} not finite at step {step}"
+        for block in blocks:
+            for tensor in block.tensors:
+                tensor.grad = None
+        torch.stack(list(terms.values())).sum().backward()
+        for block in blocks:
+            block.step(step / max(1, steps - 1))
+        after_step(step)
+    return history, None
