@@ -60,7 +60,8 @@ details + details { margin-top: 10px; } summary { cursor: pointer; font-weight: 
 .view summary { color: var(--accent); font-size: 13.5px; font-weight: 400; }
 .panel svg { width: 100%; height: auto; display: block; }
 footer { color: var(--soft); font-size: 13px; padding: 44px 0 40px; }
-dialog { border: 0; outline: none; border-radius: 12px; padding: 12px; background: #fff; max-width: 96vw; max-height: 96vh; }
+dialog { border: 0; outline: none; border-radius: 12px; padding: 12px; background: #fff;
+  max-width: 96vw; max-height: 96vh; }
 dialog img { max-width: calc(96vw - 24px); max-height: calc(90vh - 24px); min-height: 62vh; display: block; }
 dialog p { margin: 8px 2px 0; color: var(--soft); font-size: 13.5px; }
 dialog::backdrop { background: rgba(20, 22, 26, .72); }
