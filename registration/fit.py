@@ -17,7 +17,7 @@ from registration.model.landmarks import LandmarkScheme
 from registration.model.regions import vertex_classes
 from registration.optimize import AdamBlock, AdamUniformBlock, Block, History, minimise
 from registration.render.renderer import Renderer
-from registration.stages import Recipe, Stage
+from registration.stages import Recipe, Stage, rigid
 from registration.start import Candidate, assess
 from registration.targets.classes import ClassMap
 from registration.types import Rendered, Targets
@@ -57,6 +57,7 @@ class Fit:
     ):
         self.data, self.model, self.pyramid, self.recipe = data, model, pyramid, recipe
         self.device = model.template.device
+        self.corner_uvs = corner_uvs
         self.renderer = Renderer(data.triangles, corner_uvs, vertex_classes(data)[1] @ mapping.from_model, seed=seed)
         self.schemes = {name: scheme for name, scheme in schemes.items() if name in pyramid[0].landmarks}
         self.landmark_use = {name: np.ones(len(scheme.indices), bool) for name, scheme in self.schemes.items()}
@@ -91,7 +92,7 @@ class Fit:
         with torch.no_grad():
             return self.unknowns.vertices(self.unknowns.skin_offsets())
 
-    def run(self, stages: tuple[Stage, ...], outcome: Outcome, on_step: Callable[[Stage, int, float], None]) -> None:
+    def run(self, stages: tuple[Stage, ...], outcome: Outcome, on_step: Callable[[Stage, int], None]) -> None:
         """Run stages until one fails; fills `outcome`."""
         import time
 
@@ -130,7 +131,7 @@ class Fit:
         def after(step: int) -> None:
             if step == watch_from - 1 or (step == 0 and watch_from == 0):
                 before.append(self.vertices())
-            on_step(stage, step, 0.0)
+            on_step(stage, step)
 
         history, failure = minimise(blocks, lambda step: self._terms(stage, step), stage.steps, after)
         if before:
@@ -278,3 +279,18 @@ class Fit:
         batch = self.pyramid[-1].select(range(len(self.gains)), self.device)
         with torch.no_grad():
             return assess(start, self.renderer(self.vertices(), None, batch.pixels), batch)
+
+    def refine(self, start: Start) -> Start:
+        """The start moved as a rigid body, and scaled if the recipe may, by images alone."""
+        self.begin(start)
+        self._run_stage(rigid(len(self.pyramid) - 1), Outcome(), lambda stage, step: None)
+        rotation, unknowns = self.unknowns.rotation().detach().cpu().numpy(), self.unknowns
+        position, scale = unknowns["position"].detach().cpu().numpy(), float(unknowns["scale"].detach().exp())
+        return replace(start, rotation=rotation, position=position, scale=scale)
+
+    def picture(self, views: list[int]) -> tuple[Targets, Rendered]:
+        """Some views at the finest level, and what the fit shows there, exposed as their cameras would."""
+        batch = self.pyramid[0].select(views, self.device)
+        with torch.no_grad():
+            rendered = self.renderer(self.vertices(), self.texture, batch.pixels)
+            return batch, self._expose(rendered, batch, views)

@@ -64,6 +64,13 @@ def content_id(arrays: Mapping[str, np.ndarray], texture: np.ndarray) -> str:
     return digest.hexdigest()
 
 
+def content_of(*arrays: np.ndarray) -> str:
+    """sha256 over the types, shapes and values of some arrays, in order."""
+    digest = hashlib.sha256()
+    _feed(digest, list(arrays))
+    return digest.hexdigest()
+
+
 def plain(value: Any) -> Any:
     """Any configuration as JSON values: dataclasses become objects with their type's name, non-finite numbers null."""
     if is_dataclass(value) and not isinstance(value, type):

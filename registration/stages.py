@@ -3,7 +3,8 @@
 A recipe is a function that returns its stages; the resolved values are saved with every result.
 """
 
-from dataclasses import dataclass, field
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 
 from registration.optimize import Rate
 
@@ -56,7 +57,6 @@ class Recipe:
     levels: int = 3
     texture_px: int = 1024
     scale: bool = True  # free the overall size: a basis rebuilt from scale-free data holds none
-    tags: dict[str, str] = field(default_factory=dict)
 
 
 _POSE = (("root", 5e-3), ("joints", 5e-3), ("position", 1e-3), ("eyes", 1e-3))
@@ -96,3 +96,31 @@ def draft(*, scale: bool = True) -> Recipe:
         _offsets("offsets 3 mm", 40, 0, 3, 2e-4, 2e-5, ssim=0.0),
     )
     return Recipe(name="draft", stages=stages, scale=scale)
+
+
+def studio(*, scale: bool = True) -> Recipe:
+    """The full quality: all views at every step, longer, up to the images' own resolution."""
+    base = draft(scale=scale)
+    longer = {"model": 150, "offsets 20 mm": 50, "offsets 8 mm": 80, "offsets 4 mm": 60, "offsets 3 mm": 90}
+    stages = tuple(replace(stage, steps=longer[stage.name], views_per_step=12) for stage in base.stages)
+    return replace(base, name="studio", stages=stages, finest_head_px=1024, texture_px=2048)
+
+
+def rigid(level: int) -> Stage:
+    """Pose and size alone, to judge a start."""
+    rates = (("root", 2e-2), ("position", 3e-3), ("scale", 1e-2))
+    free = tuple((name, Rate(start=rate, end=rate * 0.2)) for name, rate in rates)
+    return Stage(name="rigid", steps=30, level=level, free=free, weights=Weights(mask=1.0, landmarks=0.0))
+
+
+def expression_of(recipe: Recipe) -> Recipe:
+    """The same recipe for an expression that starts from its subject's neutral: identity and size stay."""
+    kept = ("identity", "scale")
+    stages = tuple(
+        replace(stage, free=tuple((name, rate) for name, rate in stage.free if name not in kept))
+        for stage in recipe.stages
+    )
+    return replace(recipe, stages=stages)
+
+
+RECIPES: dict[str, Callable[[], Recipe]] = {"draft": draft, "studio": studio}

@@ -11,58 +11,81 @@ from scipy.spatial.transform import Rotation
 from registration.errors import InputError
 from registration.model.gnm_npz import GNMData
 from registration.model.landmarks import LandmarkScheme
-from registration.types import Rendered, Targets
+from registration.types import Camera, Rendered, Targets
 from registration.unknowns import Start, pivot
 
 _LANDMARK_SIGMA_M = 1.5e-3  # of a triangulated landmark against the same point of the model
 _EXPRESSION_SHARE = 0.5  # standard deviation granted to expressions against identity, at the start
 _OUTLIER_M = 8e-3
 _ROUNDS = 15
+_TRIMMING_ROUNDS = (2, 5, 8)  # after which outliers are found anew
+_LEAST_LANDMARKS = 6
 LEAST_OVERLAP = 0.7
 _YAWS, _PITCHES = np.radians(np.arange(0, 360, 45)), np.radians([-25.0, 0.0, 25.0])
 _REFINED = 5  # of the starts that are refined
 
 
 def from_landmarks(
-    data: GNMData, scheme: LandmarkScheme, points: Float[np.ndarray, "L 3"], *, free_scale: bool
+    data: GNMData,
+    scheme: LandmarkScheme,
+    points: Float[np.ndarray, "L 3"],
+    *,
+    free_scale: bool,
+    neutral: Start | None = None,
 ) -> Start:
-    """A similarity and a first identity and expression from triangulated landmarks (world, metres; NaN = unseen).
+    """A similarity and first coefficients from triangulated landmarks (world, metres; NaN = unseen).
 
     Alternates the rigid motion (Umeyama 1991) with the coefficients' ridge solution. Landmarks that disagree with the
     model by more than 8 mm after the first rounds are left out and named: schemes differ along the jaw.
+    From a `neutral`, its identity, offsets and scale are kept and only pose and expression are sought.
+
+    Raises:
+        InputError: fewer than six landmarks were triangulated.
     """
     template = scheme.points(data.template_vertex_positions.astype(np.float64))
-    basis = np.concatenate(
-        [
-            scheme.points(data.vertex_identity_basis.astype(np.float64)),
-            scheme.points(data.expression_basis.astype(np.float64)) * _EXPRESSION_SHARE,
-        ]
-    )
+    identity_basis = scheme.points(data.vertex_identity_basis.astype(np.float64))
+    basis = scheme.points(data.expression_basis.astype(np.float64)) * _EXPRESSION_SHARE
+    if neutral is None:
+        basis = np.concatenate([identity_basis, basis])
+    else:
+        assert neutral.identity is not None and neutral.offsets is not None
+        template = template + np.tensordot(neutral.identity.astype(np.float64), identity_basis, 1)
+        template = neutral.scale * (template + scheme.points(neutral.offsets.astype(np.float64)))
+        basis = neutral.scale * basis
     used = np.isfinite(points).all(1)
     seen = used.copy()
+    if seen.sum() < _LEAST_LANDMARKS:
+        raise InputError(
+            "Too few landmarks",
+            where=f"scheme {scheme.name}",
+            expected=f"{_LEAST_LANDMARKS} that at least two views agree on",
+            got=f"{seen.sum()}",
+            fix="check the landmarks' pixels and confidences, or remove the files to start from the masks",
+        )
     coefficients = np.zeros(len(basis))
-    scale, rotation, shift = 1.0, np.eye(3), np.zeros(3)
     for round_ in range(_ROUNDS):
         model = template + np.tensordot(coefficients, basis, 1)
-        scale, rotation, shift = similarity(model[used], points[used], free_scale=free_scale)
+        scale, rotation, shift = similarity(model[used], points[used], free_scale=free_scale and neutral is None)
         wanted = (points - shift) @ rotation / scale - template
         matrix = basis[:, used].reshape(len(basis), -1).T / _LANDMARK_SIGMA_M
         right = wanted[used].ravel() / _LANDMARK_SIGMA_M
         coefficients = matrix.T @ np.linalg.solve(matrix @ matrix.T + np.eye(len(right)), right)
-        if round_ in (2, 5, 8):
+        if round_ in _TRIMMING_ROUNDS:
             fitted = scale * (template + np.tensordot(coefficients, basis, 1)) @ rotation.T + shift
             distance = np.linalg.norm(fitted - points, axis=1)
             keep = seen & (distance < max(_OUTLIER_M, 3 * np.median(distance[seen])))
-            used = keep if keep.sum() >= 6 else used
-    split = len(data.vertex_identity_basis)
+            used = keep if keep.sum() >= _LEAST_LANDMARKS else used
+    split = len(basis) - len(data.expression_basis)
     dropped = np.flatnonzero(seen & ~used)
     note = f"landmarks {_ranges(dropped)} of scheme {scheme.name} lie elsewhere than the model's: left out"
+    total = scale if neutral is None else neutral.scale
     return Start(
         rotation=rotation,
-        position=scale * rotation @ pivot(data) + shift,
-        scale=scale,
-        identity=coefficients[:split],
+        position=total * rotation @ pivot(data) + shift,
+        scale=total,
+        identity=coefficients[:split] if neutral is None else neutral.identity,
         expression=coefficients[split:] * _EXPRESSION_SHARE,
+        offsets=None if neutral is None else neutral.offsets,
         landmarks_used=used,
         notes=(note,) if len(dropped) else (),
     )
@@ -178,9 +201,9 @@ def assess(start: Start, rendered: Rendered, targets: Targets) -> Candidate:
     return Candidate(start=start, overlap=overlap, score=overlap + agree.item() + (met / other.clamp_min(1)).item())
 
 
-def spread_views(targets_cameras: Sequence, count: int) -> list[int]:
+def spread_views(cameras: Sequence[Camera], count: int) -> list[int]:
     """`count` views that look from as different places as possible, the first one included; in order."""
-    centres = np.stack([camera.centre for camera in targets_cameras])
+    centres = np.stack([camera.centre for camera in cameras])
     chosen = [0]
     while len(chosen) < min(count, len(centres)):
         distance = np.linalg.norm(centres[:, None] - centres[chosen][None], axis=-1).min(1)

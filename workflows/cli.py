@@ -49,21 +49,24 @@ def register(
         landmarks: The model's vertices of a landmark scheme, instead of the file beside the model.
     """
     landmark_files = _landmark_files(landmarks)
+    from registration.progress import shown
     from registration.register import register
 
-    result = register(
-        capture,
-        model_path=model,
-        out=out,
-        recipe=recipe,
-        views=views,
-        seed=seed,
-        neutral=neutral,
-        deterministic=deterministic,
-        force=force,
-        variant=variant,
-        landmark_files=landmark_files,
-    )
+    with shown() as progress:
+        result = register(
+            capture,
+            model_path=model,
+            out=out,
+            recipe=recipe,
+            views=views,
+            seed=seed,
+            neutral=neutral,
+            deterministic=deterministic,
+            force=force,
+            variant=variant,
+            landmark_files=landmark_files,
+            progress=progress,
+        )
     print(f"{result.status}: {result.reason}\n{out}")
     return 1 if result.status == "failed" else 0
 

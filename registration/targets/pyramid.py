@@ -46,7 +46,7 @@ def build_pyramid(
     *,
     finest_head_px: int,
     levels: int,
-    progress: Callable[[str], None] = lambda _: None,
+    progress: Callable[[int], None] = lambda done: None,
 ) -> tuple[Targets, ...]:
     """Targets from fine to coarse; each level halves the one before.
 
@@ -62,8 +62,8 @@ def build_pyramid(
     """
     downsample = max(1, int(_subject_height(capture) / finest_head_px))
     windows = []
-    for view in capture.views:
-        progress(f"reading {view.name}")
+    for done, view in enumerate(capture.views):
+        progress(done)
         windows.append(_window(view, capture, mapping, min(downsample, view.camera.width_px, view.camera.height_px)))
     block = 2 ** (levels - 1)
     height, width = (

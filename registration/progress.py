@@ -1,0 +1,72 @@
+"""Progress of long work: a bar in a terminal, plain lines in a log."""
+
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Protocol
+
+_LINE_EVERY_S = 15.0
+
+
+class Progress(Protocol):
+    """What long work reports to."""
+
+    def note(self, text: str) -> None:
+        """Something a person should know."""
+
+    def at(self, done: int, total: int, what: str) -> None:
+        """`done` of `total` steps; `what` is going on."""
+
+
+class _Bar:
+    def __init__(self, bar) -> None:  # type: ignore[no-untyped-def]
+        self._bar = bar
+        self._task = bar.add_task("", total=None)
+
+    def note(self, text: str) -> None:
+        self._bar.console.print(text)
+
+    def at(self, done: int, total: int, what: str) -> None:
+        self._bar.update(self._task, completed=done, total=total, description=what)
+
+
+class _Lines:
+    def __init__(self) -> None:
+        self._begun = self._last = time.monotonic()
+        self._what = ""
+
+    def note(self, text: str) -> None:
+        print(text, file=sys.stderr, flush=True)
+
+    def at(self, done: int, total: int, what: str) -> None:
+        now = time.monotonic()
+        if what == self._what and now - self._last < _LINE_EVERY_S:
+            return
+        self._what, self._last = what, now
+        self.note(f"[{now - self._begun:6.1f} s] {what}: {done}/{total}")
+
+
+class Silent:
+    """For callers that want none."""
+
+    def note(self, text: str) -> None:
+        pass
+
+    def at(self, done: int, total: int, what: str) -> None:
+        pass
+
+
+@contextmanager
+def shown() -> Iterator[Progress]:
+    """A bar on stderr if that is a terminal, else lines."""
+    if not sys.stderr.isatty():
+        yield _Lines()
+        return
+    from rich.console import Console
+    from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeElapsedColumn
+    from rich.progress import Progress as RichProgress
+
+    columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn()
+    with RichProgress(*columns, console=Console(stderr=True)) as bar:
+        yield _Bar(bar)

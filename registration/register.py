@@ -1,0 +1,337 @@
+"""The public entry: one capture in, one registration out."""
+
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float
+
+from registration import hashes
+from registration.artifacts import check_out, find_same, load_registration, save_registration
+from registration.capture.doctor import validate
+from registration.capture.landmarks3d import triangulate
+from registration.capture.native import read
+from registration.errors import InputError
+from registration.evaluate.evaluation import Evaluation, evaluate
+from registration.fit import Fit, Outcome
+from registration.geometry.raster import visible
+from registration.geometry.topology import vertex_normals
+from registration.losses.landmark import residuals
+from registration.model import gnm_npz
+from registration.model.atlas import texture_atlas
+from registration.model.gnm import GNM
+from registration.model.landmarks import LandmarkScheme, read_scheme, schemes_beside
+from registration.progress import Progress, Silent
+from registration.render import backend
+from registration.report.inputs import ReportInputs, heat_map, report_views
+from registration.report.page import write_report
+from registration.stages import RECIPES, Recipe, Stage, expression_of
+from registration.start import from_landmarks, from_masks, spread_views
+from registration.targets.classes import class_map
+from registration.targets.pyramid import build_pyramid
+from registration.types import Capture, Parameters, Registration, Status
+from registration.unknowns import Start, start_of
+
+SETTLED_MM = 0.05  # 95th percentile of vertex motion over the last tenth of the last stage
+LANDMARK_PX = 3.0  # median residual at 512 px of head height
+_REPORT_VIEWS = 8
+
+
+@dataclass(frozen=True, kw_only=True)
+class Inputs:
+    """All that a registration is made from, read and checked."""
+
+    capture: Capture
+    data: gnm_npz.GNMData
+    schemes: Mapping[str, LandmarkScheme]
+    recipe: Recipe
+    neutral: Registration | None
+    digests: Mapping[str, str]  # of the input files
+    config: Mapping[str, Any]  # resolved; decides the result together with the digests
+
+
+def register(
+    capture_path: Path,
+    *,
+    model_path: Path,
+    out: Path,
+    recipe: str = "draft",
+    views: int | None = None,
+    seed: int = 0,
+    neutral: Path | None = None,
+    deterministic: bool = False,
+    force: bool = False,
+    variant: backend.Variant = "llvm",
+    landmark_files: Mapping[str, Path] | None = None,
+    progress: Progress | None = None,
+) -> Registration:
+    """Register one capture and write the registration folder `out`.
+
+    Args:
+        capture_path: a native capture folder.
+        model_path: an official GNM NPZ file; landmark schemes lie beside it.
+        out: replaced if we wrote it before; returned at once if it was made from the same inputs.
+        recipe: "draft" or "studio".
+        views: use only so many views, spread around the head.
+        seed: of view subsets and silhouette samples.
+        neutral: folder of the subject's neutral registration: its identity, offsets and texture are the start, and
+            its identity stays.
+        deterministic: every array equal from run to run, for about twice the time.
+        force: compute even if `out` already holds this result.
+        variant: "llvm" (CPU) or "cuda".
+        landmark_files: scheme name -> file, instead of those beside the model.
+        progress: where to report to.
+
+    Returns:
+        The registration as written; its status says whether it converged.
+
+    Raises:
+        InputError: something cannot be used; nothing is computed or written.
+    """
+    progress = progress or Silent()
+    check_out(out)
+    inputs = _read_inputs(
+        capture_path, model_path, recipe, views, seed, neutral, deterministic, variant, landmark_files
+    )
+    digest = hashes.input_hash(inputs.digests, inputs.config)
+    if not force and (same := find_same(out, digest)) is not None:
+        progress.note(f"{out} already holds the registration of these inputs")
+        return same
+    device = backend.activate(variant, deterministic=deterministic)
+    torch.manual_seed(seed)
+    fit, start, outcome = _fit(inputs, seed, device, progress)
+    registration = _collect(inputs, fit, start, outcome)
+    registration, page = _judge(inputs, fit, registration, progress)
+    save_registration(registration, out, page)
+    return registration
+
+
+def _read_inputs(
+    capture_path, model_path, recipe_name, views, seed, neutral_path, deterministic, variant, landmark_files
+) -> Inputs:
+    if recipe_name not in RECIPES:
+        raise InputError(
+            "There is no such recipe",
+            where="recipe",
+            expected=" or ".join(RECIPES),
+            got=recipe_name,
+            fix="choose one of them",
+        )
+    capture = read(Path(capture_path))
+    validate(capture)
+    if views is not None:
+        if not 2 <= views:
+            raise InputError(
+                "Too few views", where="views", expected="at least 2", got=views, fix="use at least two views"
+            )
+        chosen = spread_views([view.camera for view in capture.views], views)
+        capture = replace(capture, views=tuple(capture.views[i] for i in chosen))
+    data = gnm_npz.read(Path(model_path))
+    count = len(data.template_vertex_positions)
+    schemes = dict(schemes_beside(Path(model_path), count))
+    schemes |= {name: read_scheme(Path(file), count, name) for name, file in (landmark_files or {}).items()}
+    neutral = None
+    recipe = RECIPES[recipe_name]()
+    if neutral_path is not None:
+        neutral = load_registration(Path(neutral_path))
+        _check_topology(neutral, data, Path(neutral_path), Path(model_path))
+        recipe = expression_of(recipe)
+    digests = {"capture": hashes.hash_capture(capture), "model": gnm_npz.content_hash(data)}
+    digests |= {f"landmarks {name}": hashes.content_of(s.indices, s.weights) for name, s in schemes.items()}
+    if neutral is not None:
+        digests["neutral"] = hashes.content_of(neutral.identity, neutral.offsets, neutral.vertices, neutral.texture)
+    config = {
+        "recipe": hashes.plain(recipe),
+        "views": [view.name for view in capture.views],
+        "seed": seed,
+        "deterministic": deterministic,
+        "variant": variant,
+    }
+    return Inputs(
+        capture=capture, data=data, schemes=schemes, recipe=recipe, neutral=neutral, digests=digests, config=config
+    )
+
+
+def _check_topology(neutral: Registration, data: gnm_npz.GNMData, neutral_path: Path, model_path: Path) -> None:
+    same = gnm_npz.topology_hash(neutral.triangles) == gnm_npz.topology_hash(data.triangles)
+    sizes = (len(neutral.identity), len(neutral.expression), len(neutral.vertices))
+    expected = (len(data.vertex_identity_basis), len(data.expression_basis), len(data.template_vertex_positions))
+    if not same or sizes != expected:
+        raise InputError(
+            "The neutral was registered with another model",
+            where=neutral_path,
+            expected=f"identity, expression, vertices {expected} and the triangles of {model_path}",
+            got=f"{sizes}, {'the same' if same else 'other'} triangles",
+            fix="register the neutral with this model first",
+        )
+
+
+def _fit(inputs: Inputs, seed: int, device: torch.device, progress: Progress) -> tuple[Fit, Start, Outcome]:
+    """Read the targets, find the start, run the stages."""
+    begun = time.perf_counter()
+    mapping = class_map(inputs.capture.classes)
+    recipe, count = inputs.recipe, len(inputs.capture.views)
+
+    def reading(done: int) -> None:
+        progress.at(done, count, "reading views")
+
+    pyramid = build_pyramid(
+        inputs.capture, mapping, finest_head_px=recipe.finest_head_px, levels=recipe.levels, progress=reading
+    )
+    outcome = Outcome()
+    outcome.seconds["targets"] = time.perf_counter() - begun
+    begun = time.perf_counter()
+    corner_uvs = texture_atlas(inputs.data)
+    model = GNM(inputs.data, device=device)
+    fit = Fit(inputs.data, model, pyramid, mapping, inputs.schemes, corner_uvs, recipe, seed)
+    start = _start(inputs, fit, progress)
+    for note in start.notes:
+        progress.note(note)
+    fit.begin(start, None if inputs.neutral is None else inputs.neutral.texture)
+    outcome.seconds["start"] = time.perf_counter() - begun
+    total, done = sum(stage.steps for stage in recipe.stages), 0
+
+    def on_step(stage: Stage, step: int) -> None:
+        nonlocal done
+        done += 1
+        progress.at(done, total, stage.name)
+
+    fit.run(recipe.stages, outcome, on_step)
+    return fit, start, outcome
+
+
+def _start(inputs: Inputs, fit: Fit, progress: Progress) -> Start:
+    """From landmarks if the model knows a scheme of the capture's, from the neutral's pose, or from the masks."""
+    neutral = None
+    if inputs.neutral is not None:
+        neutral = start_of(_parameters(inputs.neutral), inputs.neutral.offsets, fit.model, inputs.data)
+    known = {view_scheme for view in inputs.capture.views for view_scheme in view.landmarks}
+    skipped = sorted(known - set(inputs.schemes))
+    if skipped:
+        progress.note(f"landmark schemes that the model does not know, skipped: {', '.join(skipped)}")
+    solved = {name: triangulate(inputs.capture, name)[0] for name in sorted(known & set(inputs.schemes))}
+    for name, points in solved.items():
+        expected = len(inputs.schemes[name].indices)
+        if len(points) != expected:
+            raise InputError(
+                "Landmarks of another length than the model's scheme",
+                where=f"scheme {name}",
+                expected=f"{expected} landmarks",
+                got=len(points),
+                fix=f"name the scheme otherwise, or give the model's with --landmarks {name}=FILE",
+            )
+    if solved:
+        best = max(solved, key=lambda name: int(np.isfinite(solved[name]).all(1).sum()))
+        start = from_landmarks(
+            inputs.data, inputs.schemes[best], solved[best], free_scale=inputs.recipe.scale, neutral=neutral
+        )
+        fit.landmark_use[best] = start.landmarks_used
+        return start
+    if neutral is not None and fit.assess(neutral).overlap >= 0.7:
+        return replace(neutral, notes=("no landmarks: starting from the neutral's pose",))
+    progress.note("no landmarks that the model knows: searching the head's pose in the masks")
+    return from_masks(inputs.data, fit.pyramid[-1], fit.assess, fit.refine)
+
+
+def _parameters(registration: Registration) -> Parameters:
+    names = ("identity", "expression", "rotations", "translation", "scale")
+    return Parameters(**{name: torch.as_tensor(np.asarray(getattr(registration, name))) for name in names})
+
+
+def _collect(inputs: Inputs, fit: Fit, start: Start, outcome: Outcome) -> Registration:
+    """The result as arrays, with its status."""
+    parameters, offsets = fit.unknowns.parameters()
+    vertices = fit.vertices().cpu().numpy()
+    landmark_px = {name: _landmark_residual(fit, name, vertices) for name in fit.schemes}
+    status, reason = _status(outcome, landmark_px)
+
+    def array(value: torch.Tensor) -> np.ndarray:
+        return value.detach().cpu().numpy().astype(np.float32)
+
+    return Registration(
+        status=status,
+        reason=reason,
+        identity=array(parameters.identity),
+        expression=array(parameters.expression),
+        rotations=array(parameters.rotations),
+        translation=array(parameters.translation),
+        scale=array(parameters.scale),
+        offsets=array(offsets),
+        vertices=vertices,
+        triangles=inputs.data.triangles,
+        confidence=_confidence(vertices, inputs),
+        texture=array(fit.texture),
+        corner_uvs=fit.corner_uvs,
+        landmarks={name: scheme.points(vertices) for name, scheme in inputs.schemes.items()},
+        seconds=outcome.seconds,
+        history=outcome.history,
+        figures={
+            "motion_mm": outcome.motion_mm,
+            "landmark_residual_px": landmark_px,
+            "camera_gains": fit.gains[..., 0].exp().cpu().numpy().round(4).tolist(),
+            "notes": list(start.notes),
+        },
+        config=inputs.config,
+        inputs=inputs.digests,
+    )
+
+
+def _landmark_residual(fit: Fit, scheme: str, vertices: Float[np.ndarray, "V 3"]) -> float:
+    """Median over views and landmarks that were used, px at 512 px of head height."""
+    finest = fit.pyramid[0]
+    points = fit.schemes[scheme].points(torch.as_tensor(vertices))
+    distance, counts = residuals(finest.pixels.cameras, points, finest.landmarks[scheme], finest.px_per_head)
+    used = (counts > 0) & torch.as_tensor(fit.landmark_use[scheme])
+    return float(distance[used].median()) if used.any() else float("nan")
+
+
+def _status(outcome: Outcome, landmark_px: Mapping[str, float]) -> tuple[Status, str]:
+    if outcome.failure:
+        return "failed", outcome.failure
+    off = {name: px for name, px in landmark_px.items() if px >= LANDMARK_PX}
+    if off:
+        worst = max(off, key=lambda name: off[name])
+        return "failed", f"landmarks of scheme {worst} are {off[worst]:.1f} px off in the median (limit {LANDMARK_PX})"
+    if outcome.motion_mm >= SETTLED_MM:
+        return "stopped", f"vertices still moved by {outcome.motion_mm:.3f} mm at the end (limit {SETTLED_MM})"
+    return "converged", f"vertices moved by {outcome.motion_mm:.3f} mm over the last tenth of the last stage"
+
+
+def _confidence(vertices: Float[np.ndarray, "V 3"], inputs: Inputs) -> Float[np.ndarray, "V"]:
+    """How well the views see each vertex: s / (1 + s), s the sum of cosines of incidence over the views that do."""
+    triangles = inputs.data.triangles
+    normals = vertex_normals(torch.as_tensor(vertices), torch.as_tensor(triangles.astype(np.int64))).numpy()
+    total = np.zeros(len(vertices))
+    for view in inputs.capture.views:
+        to_camera = view.camera.centre - vertices
+        cosine = (normals * to_camera).sum(1) / np.linalg.norm(to_camera, axis=1)
+        total += np.clip(cosine, 0, 1) * visible(vertices, vertices, triangles, view.camera)
+    return (total / (1 + total)).astype(np.float32)
+
+
+def _judge(inputs: Inputs, fit: Fit, registration: Registration, progress: Progress) -> tuple[Registration, str]:
+    """Figures against the scan, if there is one, and the report."""
+    evaluation: Evaluation | None = None
+    finite = np.isfinite(registration.vertices).all()
+    if inputs.capture.scan is not None and finite:
+        progress.note("measuring against the scan")
+        evaluation = evaluate(registration, inputs.capture)
+        registration = replace(registration, figures={**registration.figures, **evaluation.figures})
+    progress.note("drawing the report")
+    batch, rendered = fit.picture(spread_views([v.camera for v in inputs.capture.views], _REPORT_VIEWS))
+    page = write_report(
+        ReportInputs(
+            registration=registration,
+            subject=inputs.capture.subject,
+            expression=inputs.capture.expression,
+            views=report_views(batch, rendered),
+            class_names=batch.class_names,
+            heat_map=None if evaluation is None else heat_map(registration, evaluation.vertex_distance_mm),
+            versions=hashes.versions(),
+        )
+    )
+    return registration, page
