@@ -55,7 +55,7 @@ class AdamUniformBlock:
     QUANTILE = 0.998
 
     def __init__(self, latent: Tensor, rate: Rate, betas: tuple[float, float] = (0.9, 0.99)):
-        self.tensors = (latent,)
+        self.tensors: Sequence[Tensor] = (latent,)
         self._rate = rate
         self._betas = betas
         self._first = torch.zeros_like(latent)

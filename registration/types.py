@@ -158,7 +158,7 @@ class Targets:
             y=take(self.pixels.y),
             index=torch.where(index < 0, index, index + shift).to(device),
         )
-        values = {
+        values: dict[str, Any] = {
             f.name: take(getattr(self, f.name)).to(torch.float32)
             for f in fields(self)
             if isinstance(getattr(self, f.name), Tensor)

@@ -4,6 +4,9 @@ The unknown is u = M d with M = I + lambda L, L the combinatorial Laplacian; d =
 On a regular triangulation of edge length h this smooths over l = h sqrt(1.5 lambda).
 """
 
+import warnings
+from typing import Any
+
 import cholespy
 import numpy as np
 import torch
@@ -25,7 +28,7 @@ def normalised_laplacian(triangles: Int[np.ndarray, "F 3"], vertex_count: int) -
     return (diags(1 / np.maximum(degree, 1)) @ (diags(degree) - adjacency)).tocsr()
 
 
-def _adjacency(triangles, vertex_count: int) -> csr_matrix:
+def _adjacency(triangles: Int[np.ndarray, "F 3"], vertex_count: int) -> csr_matrix:
     start = np.concatenate([triangles[:, k] for k in range(3)])
     end = np.concatenate([triangles[:, (k + 1) % 3] for k in range(3)])
     one_way = coo_matrix((np.ones(len(start)), (start, end)), (vertex_count, vertex_count)).tocsr()
@@ -35,14 +38,17 @@ def _adjacency(triangles, vertex_count: int) -> csr_matrix:
 def to_torch(matrix: csr_matrix, device: torch.device) -> Tensor:
     """A SciPy sparse matrix as a float32 torch one, for products that carry gradients."""
     matrix = matrix.tocsr()
-    return torch.sparse_csr_tensor(
-        torch.as_tensor(matrix.indptr.astype(np.int64)),
-        torch.as_tensor(matrix.indices.astype(np.int64)),
-        torch.as_tensor(matrix.data.astype(np.float32)),
-        matrix.shape,
-        device=device,
-        check_invariants=False,
-    )
+    with warnings.catch_warnings():
+        # A product is 30 times faster than with COO, which would not warn.
+        warnings.filterwarnings("ignore", "Sparse CSR tensor support is in beta", UserWarning)
+        return torch.sparse_csr_tensor(
+            torch.as_tensor(matrix.indptr.astype(np.int64)),
+            torch.as_tensor(matrix.indices.astype(np.int64)),
+            torch.as_tensor(matrix.data.astype(np.float32)),
+            matrix.shape,
+            device=device,
+            check_invariants=False,
+        )
 
 
 class LargeSteps:
@@ -80,14 +86,14 @@ class LargeSteps:
 
 class _Solve(torch.autograd.Function):
     @staticmethod
-    def forward(ctx, right, solver):
+    def forward(ctx: Any, right: Tensor, solver: cholespy.CholeskySolverF) -> Tensor:
         ctx.solver = solver
         out = torch.zeros_like(right)
         solver.solve(right.detach().contiguous(), out)
         return out
 
     @staticmethod
-    def backward(ctx, *grad_outputs):
+    def backward(ctx: Any, *grad_outputs: Tensor) -> tuple[Tensor, None]:
         # M is symmetric, so its adjoint is the same solve.
         out = torch.zeros_like(grad_outputs[0])
         ctx.solver.solve(grad_outputs[0].contiguous(), out)

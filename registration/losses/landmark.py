@@ -1,5 +1,6 @@
 """Landmarks: how far the model's projected points lie from those seen in the images."""
 
+import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -12,7 +13,7 @@ _MIN_CONFIDENCE = 0.5
 def project(cameras: tuple[Camera, ...], points: Float[Tensor, "L 3"]) -> Float[Tensor, "N L 2"]:
     """World points (m) in every camera's pixels; differentiable."""
 
-    def stack(values):
+    def stack(values: list[np.ndarray]) -> Tensor:
         return torch.stack([torch.as_tensor(v) for v in values]).to(points)
 
     rotation = stack([c.T_cam_world[:3, :3] for c in cameras])

@@ -7,6 +7,8 @@ there is no shading, no film and no filter; a pixel is a box.
 
 from __future__ import annotations  # mi.Float exists only once a variant is chosen
 
+from typing import Any
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -138,7 +140,7 @@ class Renderer:
         value = sum((g[k] * channels[k] for k in range(first, len(channels)) if k != MASK), mi.Float(0))
         dr.backward(value * (1 / len(self._pixel_offsets)))
 
-    def _splat(self, surface: Surface, pixels: PixelList, values: Tensor, weights: Tensor):
+    def _splat(self, surface: Surface, pixels: PixelList, values: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:
         size, depth = surface.texture_size, values.shape[-1]
         with dr.suspend_grad():
             origin, direction = pixels.rays(_CENTRE)
@@ -168,7 +170,9 @@ class _Draw(torch.autograd.Function):
     """The bridge: torch tensors in and out, Dr.Jit between. Memory is shared, so every hand-over waits."""
 
     @staticmethod
-    def forward(ctx, positions, normals, texture, renderer: Renderer, pixels: PixelList):
+    def forward(
+        ctx: Any, positions: Tensor, normals: Tensor, texture: Tensor | None, renderer: Renderer, pixels: PixelList
+    ) -> Tensor:
         renderer._scene.move(positions)
         surface = renderer._surface(positions, normals, texture)
         image, ctx.seen = renderer._forward(surface, pixels)
@@ -177,7 +181,7 @@ class _Draw(torch.autograd.Function):
         return image.torch().view(pixels.count, surface.channel_count)
 
     @staticmethod
-    def backward(ctx, *grad_outputs):
+    def backward(ctx: Any, *grad_outputs: Tensor) -> tuple[Tensor | None, ...]:
         positions, normals, *rest = ctx.saved_tensors
         texture = rest[0] if rest else None
         renderer: Renderer = ctx.renderer

@@ -35,6 +35,8 @@ class TriangleScene:
         self._params[self._key] = mi.Float(self._now.reshape(-1))
         self._params.update()
 
-    def cast(self, origin: mi.Point3f, direction: mi.Vector3f, active: mi.Bool, *, coherent: bool):
+    def cast(
+        self, origin: mi.Point3f, direction: mi.Vector3f, active: mi.Bool, *, coherent: bool
+    ) -> mi.PreliminaryIntersection3f:
         """Nearest hits. `direction` need not be unit: t is in units of its length."""
         return self._scene.ray_intersect_preliminary(mi.Ray3f(origin, direction), coherent=coherent, active=active)

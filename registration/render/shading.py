@@ -57,7 +57,9 @@ class Surface:
         """The channels of a point on an edge, at share t of the way from its first to its second end."""
         return self._mix([1 - t, t], [vertex.x, vertex.y], [corner.x, corner.y], active)
 
-    def _mix(self, weights, vertices, corners, active) -> list[mi.Float]:
+    def _mix(
+        self, weights: list[mi.Float], vertices: list[mi.UInt32], corners: list[mi.UInt32], active: mi.Bool
+    ) -> list[mi.Float]:
         # prim_uv is undefined on a miss: weights must be silenced there or NaNs spread.
         weights = [dr.select(active, w, 0) for w in weights]
         pairs = list(zip(weights, vertices, strict=True))
@@ -78,7 +80,7 @@ class Surface:
         return [*colour, normal.x, normal.y, normal.z, mask, *classes]
 
     def _lookup(self, uv: mi.Point2f, active: mi.Bool) -> mi.Color3f:
-        def texel(index):
+        def texel(index: mi.UInt32) -> mi.Color3f:
             return dr.gather(mi.Color3f, self.texture, index, active)
 
         index, fx, fy = texel_footprint(uv, self.texture_size)

@@ -15,6 +15,7 @@ from dataclasses import dataclass
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
 
 from registration.geometry.topology import Edges
 from registration.render.cameras import CameraLanes, PixelList
@@ -41,9 +42,7 @@ class EdgeArrays:
 
 
 def upload(edges: Edges) -> EdgeArrays:
-    import numpy as np
-
-    def flat(array):
+    def flat(array: np.ndarray) -> mi.UInt32:
         return mi.UInt32(np.where(array < 0, _NONE, array).astype(np.uint32).ravel())
 
     return EdgeArrays(
@@ -105,7 +104,7 @@ def _sample(found: _Silhouettes, samples: int, seed: int) -> tuple[mi.UInt32, mi
     position = (mi.Float(lane) + jitter) / dr.opaque(mi.Float, samples) * found.total_px
     last = found.count - 1
 
-    def before(index):
+    def before(index: mi.UInt32) -> mi.Bool:
         index = mi.UInt32(index)
         return (index < last) & (dr.gather(mi.Float, found.length_px, dr.minimum(index, last)) < position)
 

@@ -5,6 +5,7 @@ Each view is decoded once, at the finest resolution a recipe asks for; coarser l
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from typing import Any
 
 import cv2
 import numpy as np
@@ -80,7 +81,7 @@ def build_pyramid(
 
 def _subject_height(capture: Capture) -> float:
     """Median height of the subject in full-size pixels, from masks or labels, else from the images."""
-    heights = []
+    heights: list[int] = []
     for view in capture.views:
         rows = np.arange(view.camera.height_px)
         if view.segmentation is not None:
@@ -90,7 +91,7 @@ def _subject_height(capture: Capture) -> float:
             rows = np.flatnonzero(~np.isin(labels, away).all(1))
         elif view.mask is not None:
             rows = np.flatnonzero((read_mask(view.mask, view.camera) > 127).any(1))
-        heights.append(np.ptp(rows) + 1 if len(rows) else view.camera.height_px)
+        heights.append(int(np.ptp(rows)) + 1 if len(rows) else view.camera.height_px)
     return float(np.median(heights))
 
 
@@ -148,11 +149,16 @@ def _cut_to_head(whole: _Window) -> _Window:
     margin = int(np.ceil(_MARGIN * head_px)) + 8
     top, left = max(0, rows[0] - margin), max(0, columns[0] - margin)
     bottom, right = rows[-1] + 1 + margin, columns[-1] + 1 + margin
-    cut = {name: value[top:bottom, left:right] for name, value in vars(whole).items() if isinstance(value, np.ndarray)}
+    cut = _each(whole, lambda value: value[top:bottom, left:right])
     height, width = cut["mask"].shape
     landmarks = {scheme: points - [left, top, 0] for scheme, points in whole.landmarks.items()}
     camera = whole.camera.cropped(int(left), int(top), width, height)
     return replace(whole, camera=camera, landmarks=landmarks, head_px=head_px, **cut)
+
+
+def _each(window: _Window, change: Callable[[np.ndarray], np.ndarray]) -> dict[str, Any]:
+    """Every channel of a window, changed alike."""
+    return {name: change(value) for name, value in vars(window).items() if isinstance(value, np.ndarray)}
 
 
 def _padded(window: _Window, height: int, width: int) -> _Window:
@@ -162,7 +168,7 @@ def _padded(window: _Window, height: int, width: int) -> _Window:
     def pad(value: np.ndarray) -> np.ndarray:
         return np.pad(value, [(0, rows), (0, columns)] + [(0, 0)] * (value.ndim - 2))
 
-    grown = {name: pad(value) for name, value in vars(window).items() if isinstance(value, np.ndarray)}
+    grown = _each(window, pad)
     return replace(window, camera=window.camera.cropped(0, 0, width, height), **grown)
 
 
@@ -171,7 +177,7 @@ def _halved(window: _Window) -> _Window:
         h, w = value.shape[0] // 2, value.shape[1] // 2
         return value.reshape(h, 2, w, 2, *value.shape[2:]).mean((1, 3))
 
-    means = {name: mean(value) for name, value in vars(window).items() if isinstance(value, np.ndarray)}
+    means = _each(window, mean)
     height, width = means["mask"].shape
     return replace(
         window,
