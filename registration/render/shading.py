@@ -30,15 +30,15 @@ class Surface:
     def channel_count(self) -> int:
         return CLASSES + self.class_count
 
-    def corners(self, face: mi.UInt32, active: mi.Bool) -> mi.Point3u:
+    def corners(self, face: mi.UInt32, active: mi.Bool | bool = True) -> mi.Point3u:
         return dr.gather(mi.Point3u, self.faces, face, active)
 
-    def position(self, vertex: mi.UInt32, active: mi.Bool = True) -> mi.Point3f:
+    def position(self, vertex: mi.UInt32, active: mi.Bool | bool = True) -> mi.Point3f:
         return dr.gather(mi.Point3f, self.positions, vertex, active)
 
     def barycentrics(self, face: mi.UInt32, origin: mi.Point3f, direction: mi.Vector3f) -> tuple[mi.Float, mi.Float]:
         """Where a fixed ray meets the plane of a face (Moeller and Trumbore); differentiable in `positions`."""
-        corners = self.corners(face, True)
+        corners = self.corners(face)
         a, b, c = (self.position(corners[k]) for k in range(3))
         ab, ac = b - a, c - a
         p = dr.cross(direction, ac)

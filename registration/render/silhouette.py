@@ -67,7 +67,7 @@ def _find(surface: Surface, edges: EdgeArrays, pixels: PixelList) -> _Silhouette
 
     lane = dr.arange(mi.UInt32, pixels.camera_count * face_count)
     view = lane // faces
-    corners = surface.corners(lane - view * faces, True)
+    corners = surface.corners(lane - view * faces)
     a, b, c = (surface.position(corners[k]) for k in range(3))
     facing = dr.dot(dr.cross(b - a, c - a), pixels.centre(view) - a) > 0
     dr.eval(facing)
@@ -104,7 +104,7 @@ def _sample(found: _Silhouettes, samples: int, seed: int) -> tuple[mi.UInt32, mi
     position = (mi.Float(lane) + jitter) / dr.opaque(mi.Float, samples) * found.total_px
     last = found.count - 1
 
-    def before(index: mi.UInt32) -> mi.Bool:
+    def before(index: mi.Int32 | int) -> mi.Bool:
         index = mi.UInt32(index)
         return (index < last) & (dr.gather(mi.Float, found.length_px, dr.minimum(index, last)) < position)
 
@@ -119,7 +119,7 @@ def _outward(surface: Surface, camera: CameraLanes, face: mi.UInt32, xa: mi.Poin
     along = xb - xa
     along /= dr.maximum(dr.norm(along), 1e-12)
     normal = mi.Vector2f(-along.y, along.x)
-    corners = surface.corners(face, True)
+    corners = surface.corners(face)
     centre, _ = camera.project(sum((surface.position(corners[k]) for k in range(3)), mi.Point3f(0)) / 3)
     return dr.select(dr.dot(centre - xa, normal) > 0, -normal, normal)
 
