@@ -38,7 +38,7 @@ $(INSTALLED): .venv/bin/python
 	lacking() { $(BIN)/python -c 'import pymeshlab' 2>&1 | grep -oE 'lib[^ (:]+: cannot open shared object|.*Error: .*' | sort -u || true; }
 	[ -z "$$(lacking)" ] || $(call packages,libgl1 libopengl0) || true
 	if [ -n "$$(lacking)" ]; then
-		echo "PyMeshLab, which only cleaning scans needs, cannot start:"
+		echo "PyMeshLab, which only checking scans needs, cannot start:"
 		lacking
 		echo "To have it: sudo apt-get install -y libgl1 libopengl0"
 	fi

@@ -19,6 +19,7 @@ from registration.capture.scan import Scan, read_scan, read_truth
 from registration.capture.sheet import draw
 from registration.errors import InputError
 from registration.frames import MM_PER_M, opencv_intrinsics
+from registration.geometry.meshlab import scan_topology
 from registration.types import Camera, Capture, View
 
 EYE_DISTANCE_M = (0.05, 0.15)  # between the outer corners; adults have 0.08 to 0.1
@@ -231,6 +232,8 @@ class Report:
         if self.scan is not None:
             extent = " x ".join(f"{MM_PER_M * side:.0f}" for side in np.ptp(self.scan.vertices, axis=0))
             facts.append(f"scan: {len(self.scan.vertices)} vertices, {len(self.scan.triangles)} faces, {extent} mm")
+            if len(self.scan.triangles) and (topology := scan_topology(self.scan.vertices, self.scan.triangles)):
+                facts.append(f"scan's surface: {topology}")
         if capture.ground_truth is not None:
             facts.append(f"ground truth: {len(read_truth(capture.ground_truth))} vertices")
         if self.sheet is not None:
