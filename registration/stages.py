@@ -74,7 +74,7 @@ def _offsets(
         steps=steps,
         level=level,
         smoothing_mm=smoothing_mm,
-        free=(("offsets", Rate(start=start, end=end)), ("eyes", Rate(start=3e-4, end=3e-4))),
+        free=(("offsets", Rate(start=start, end=end)), ("eyes", Rate(start=start / 10, end=end / 10))),
         weights=Weights(rgb=1.0, ssim=ssim, classes=0.1, landmarks=0.01),
         texture=True,
     )
