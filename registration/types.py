@@ -172,7 +172,7 @@ class Rendered:
     """What the renderer draws at some pixels; nothing is shaded."""
 
     rgb: Float[Tensor, "P 3"]  # the texture's colour, linear
-    normals: Float[Tensor, "P 3"]  # world frame, unit; 0 on a miss
+    normals: Float[Tensor, "P 3"]  # world frame, unit, of the side that is seen; 0 on a miss
     classes: Float[Tensor, "P K"]  # soft share of each class; 0 on a miss
     mask: Float[Tensor, "P"]  # 1 on a hit
 

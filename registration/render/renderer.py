@@ -54,7 +54,7 @@ class Renderer:
         """
         vertex_count, self._class_count = vertex_classes.shape
         self._scene = TriangleScene(vertex_count, triangles)
-        self._edges = silhouette.upload(edges(triangles))
+        self._edges = silhouette.upload(edges(triangles), corner_uvs)
         self._faces = mi.UInt32(triangles.astype(np.uint32).ravel())
         self._corner_uvs = mi.Float(corner_uvs.astype(np.float32).ravel())
         self._classes = mi.Float(vertex_classes.astype(np.float32).ravel())
@@ -117,7 +117,7 @@ class Renderer:
                 hit = self._scene.cast(origin, direction, mi.Bool(True), coherent=True)
                 is_hit = hit.is_valid()
                 face = dr.select(is_hit, hit.prim_index, 0)
-                channels = surface.shade(face, hit.prim_uv.x, hit.prim_uv.y, is_hit)
+                channels = surface.shade(face, hit.prim_uv.x, hit.prim_uv.y, direction, is_hit)
                 image += dr.ravel(mi.ArrayXf(channels)) * (1 / len(self._pixel_offsets))
                 seen.append(dr.select(is_hit, hit.prim_index, _MISS))
                 dr.eval(image, seen)
@@ -134,7 +134,7 @@ class Renderer:
         face = dr.gather(mi.UInt32, seen, pixel)
         origin, direction = pixels.rays(offset, pixel)
         b1, b2 = surface.barycentrics(face, origin, direction)
-        channels = surface.shade(face, b1, b2, mi.Bool(True))
+        channels = surface.shade(face, b1, b2, direction, mi.Bool(True))
         g = dr.gather(mi.ArrayXf, adjoint, pixel, shape=(surface.channel_count, dr.width(pixel)))
         first = 0 if surface.texture is not None else NORMAL.start
         value = sum((g[k] * channels[k] for k in range(first, len(channels)) if k != MASK), mi.Float(0))

@@ -1,6 +1,6 @@
 """What a surface point looks like, unshaded: texture colour, world normal, soft classes, mask.
 
-Everything is a Dr.Jit gather; looking a point up needs its face and barycentrics only.
+Everything is a Dr.Jit gather; looking a point up needs its face, its barycentrics and where it is seen from.
 """
 
 from __future__ import annotations  # mi.Float exists only once a variant is chosen
@@ -46,25 +46,50 @@ class Surface:
         t = origin - a
         return dr.dot(t, p) * scale, dr.dot(direction, dr.cross(t, ab)) * scale
 
-    def shade(self, face: mi.UInt32, b1: mi.Float, b2: mi.Float, active: mi.Bool) -> list[mi.Float]:
-        """The channels of the surface point (face; 1 - b1 - b2, b1, b2); zero where not active."""
+    def shade(
+        self, face: mi.UInt32, b1: mi.Float, b2: mi.Float, direction: mi.Vector3f, active: mi.Bool
+    ) -> list[mi.Float]:
+        """The channels of (face; 1 - b1 - b2, b1, b2) seen along `direction`; zero where not active."""
         corners = self.corners(face, active)
         return self._mix(
-            [1 - b1 - b2, b1, b2], [corners[k] for k in range(3)], [3 * face + k for k in range(3)], active
+            [1 - b1 - b2, b1, b2],
+            [corners[k] for k in range(3)],
+            [3 * face + k for k in range(3)],
+            self._from_behind(corners, direction, active),
+            active,
         )
 
-    def shade_edge(self, vertex: mi.Point2u, corner: mi.Point2u, t: mi.Float, active: mi.Bool) -> list[mi.Float]:
-        """The channels of a point on an edge, at share t of the way from its first to its second end."""
-        return self._mix([1 - t, t], [vertex.x, vertex.y], [corner.x, corner.y], active)
+    def shade_edge(
+        self,
+        face: mi.UInt32,
+        vertex: mi.Point2u,
+        corner: mi.Point2u,
+        t: mi.Float,
+        direction: mi.Vector3f,
+        active: mi.Bool,
+    ) -> list[mi.Float]:
+        """The channels of a point on a face's edge, at share t of the way from its first to its second end."""
+        behind = self._from_behind(self.corners(face, active), direction, active)
+        return self._mix([1 - t, t], [vertex.x, vertex.y], [corner.x, corner.y], behind, active)
+
+    def _from_behind(self, corners: mi.Point3u, direction: mi.Vector3f, active: mi.Bool) -> mi.Bool:
+        """Whether a ray meets the inner side of a face: a scanner's normals point to the camera there too."""
+        a, b, c = (dr.detach(self.position(corners[k], active)) for k in range(3))
+        return dr.dot(dr.cross(b - a, c - a), direction) > 0
 
     def _mix(
-        self, weights: list[mi.Float], vertices: list[mi.UInt32], corners: list[mi.UInt32], active: mi.Bool
+        self,
+        weights: list[mi.Float],
+        vertices: list[mi.UInt32],
+        corners: list[mi.UInt32],
+        behind: mi.Bool,
+        active: mi.Bool,
     ) -> list[mi.Float]:
         # prim_uv is undefined on a miss: weights must be silenced there or NaNs spread.
         weights = [dr.select(active, w, 0) for w in weights]
         pairs = list(zip(weights, vertices, strict=True))
         normal = sum((w * dr.gather(mi.Vector3f, self.normals, v, active) for w, v in pairs), mi.Vector3f(0))
-        normal *= dr.rsqrt(dr.maximum(dr.squared_norm(normal), 1e-12))
+        normal *= dr.rsqrt(dr.maximum(dr.squared_norm(normal), 1e-12)) * dr.select(behind, mi.Float(-1), 1)
         classes = [mi.Float(0)] * self.class_count
         for w, v in pairs:
             row = dr.gather(mi.ArrayXf, self.classes, v, active, shape=(self.class_count, dr.width(v)))

@@ -1,6 +1,7 @@
 """The gradient of visibility: primary edge sampling (Li et al. 2018) over the silhouettes of all views at once.
 
-An edge is a silhouette of a view if exactly one of its faces looks at the camera, or if it has one face only.
+An edge is a silhouette of a view if exactly one of its faces looks at the camera, or if it has one face only. Seams
+of the texture's charts are sampled like silhouettes: nothing is hidden there, but the colour may jump.
 Samples are uniform over the projected length L (px) of all silhouettes of all views; with N samples
 
     dLoss = (L / N) sum [g(pixel) . (f_in - f_out)] n . [(1 - s) dx_A + s dx_B]
@@ -16,6 +17,7 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+from jaxtyping import Float
 
 from registration.geometry.topology import Edges
 from registration.render.cameras import CameraLanes, PixelList
@@ -38,15 +40,22 @@ class EdgeArrays:
     vertices: mi.UInt32  # 2E
     faces: mi.UInt32  # 2E
     corners: mi.UInt32  # 4E
+    seams: mi.Bool  # E
     count: int
 
 
-def upload(edges: Edges) -> EdgeArrays:
+def upload(edges: Edges, corner_uvs: Float[np.ndarray, "F 3 2"]) -> EdgeArrays:
     def flat(array: np.ndarray) -> mi.UInt32:
         return mi.UInt32(np.where(array < 0, _NONE, array).astype(np.uint32).ravel())
 
+    uvs = corner_uvs.reshape(-1, 2)
+    seams = (edges.faces[:, 1] >= 0) & (uvs[edges.corners[:, 0]] != uvs[edges.corners[:, 1]]).any((1, 2))
     return EdgeArrays(
-        vertices=flat(edges.vertices), faces=flat(edges.faces), corners=flat(edges.corners), count=len(edges.vertices)
+        vertices=flat(edges.vertices),
+        faces=flat(edges.faces),
+        corners=flat(edges.corners),
+        seams=mi.Bool(seams),
+        count=len(edges.vertices),
     )
 
 
@@ -79,7 +88,10 @@ def _find(surface: Surface, edges: EdgeArrays, pixels: PixelList) -> _Silhouette
     boundary = pair.y == _NONE
     first = dr.gather(mi.Bool, facing, view * faces + pair.x)
     second = dr.gather(mi.Bool, facing, view * faces + pair.y, ~boundary)
-    ids = dr.compress(boundary | (first != second))
+    jumps = boundary | (first != second)
+    if surface.texture is not None:
+        jumps |= first & dr.gather(mi.Bool, edges.seams, edge)
+    ids = dr.compress(jumps)
     if dr.width(ids) == 0:
         return None
     side = dr.gather(mi.UInt32, dr.select(boundary | first, mi.UInt32(0), 1), ids)
@@ -154,7 +166,8 @@ def backward(
         camera = pixels.camera(view)
         xa, za = camera.project(surface.position(ends.x))
         xb, zb = camera.project(surface.position(ends.y))
-        normal = _outward(surface, camera, dr.gather(mi.UInt32, edges.faces, 2 * edge + side), xa, xb)
+        own = dr.gather(mi.UInt32, edges.faces, 2 * edge + side)
+        normal = _outward(surface, camera, own, xa, xb)
 
         x = dr.lerp(xa, xb, s)
         depth = dr.rcp((1 - s) / za + s / zb)
@@ -163,14 +176,15 @@ def backward(
         g = dr.gather(mi.ArrayXf, adjoint, pixel, inside, shape=(channels, samples))
 
         beyond = x + normal * (_STEP * camera.fx)
-        hit = scene.cast(camera.centre, camera.direction(beyond.x, beyond.y), inside, coherent=False)
+        direction = camera.direction(beyond.x, beyond.y)
+        hit = scene.cast(camera.centre, direction, inside, coherent=False)
         is_hit = inside & hit.is_valid()
         seen = inside & ~(is_hit & (hit.t < depth * (1 - _DEPTH_TOLERANCE)))
         face = dr.select(is_hit, hit.prim_index, 0)
-        f_out = surface.shade(face, hit.prim_uv.x, hit.prim_uv.y, is_hit & seen)
+        f_out = surface.shade(face, hit.prim_uv.x, hit.prim_uv.y, direction, is_hit & seen)
         corners = dr.gather(mi.Point2u, edges.corners, 2 * edge + side, seen)
         perspective = s * za / dr.maximum((1 - s) * zb + s * za, 1e-9)
-        f_in = surface.shade_edge(ends, corners, perspective, seen)
+        f_in = surface.shade_edge(own, ends, corners, perspective, direction, seen)
         first = 0 if surface.texture is not None else MASK - 3
         jump = sum((g[k] * (f_in[k] - f_out[k]) for k in range(first, channels)), mi.Float(0))
         weight = dr.select(seen, jump, 0) * (found.total_px / dr.opaque(mi.Float, samples))
