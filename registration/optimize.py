@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import torch
 from torch import Tensor
@@ -24,6 +24,7 @@ class Rate:
         return self.start * (self.end / self.start) ** fall
 
 
+@runtime_checkable
 class Block(Protocol):
     """Unknowns that are updated by one rule. Their gradients are cleared and filled by the loop."""
 

@@ -4,11 +4,12 @@ import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 _LINE_EVERY_S = 15.0
 
 
+@runtime_checkable
 class Progress(Protocol):
     """What long work reports to."""
 
