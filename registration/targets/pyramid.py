@@ -17,6 +17,7 @@ from registration.targets.classes import BACKGROUND, ClassMap
 from registration.types import Camera, Capture, Pixels, Targets, View, ViewPixels
 
 _MARGIN = 0.08  # of the head's height: how far around the head pixels are kept and silhouettes pull
+_NECK = 0.3  # of the head's height: how much of what is below the head is kept
 _PURE = 0.99  # coverage from which a pixel counts as wholly inside the subject
 _LEAST_NORMAL = 0.85  # mean length of a block's normals below which they disagree too much
 
@@ -149,6 +150,7 @@ def _cut_to_head(whole: _Window) -> _Window:
     margin = int(np.ceil(_MARGIN * head_px)) + 8
     top, left = max(0, rows[0] - margin), max(0, columns[0] - margin)
     bottom, right = rows[-1] + 1 + margin, columns[-1] + 1 + margin
+    bottom += int(_NECK * head_px)
     cut = _each(whole, lambda value: value[top:bottom, left:right])
     height, width = cut["mask"].shape
     landmarks = {scheme: points - [left, top, 0] for scheme, points in whole.landmarks.items()}
