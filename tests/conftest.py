@@ -7,7 +7,9 @@ import pytest
 from jaxtyping import install_import_hook
 
 # Before any test module imports the library: every jaxtyping annotation there becomes a checked one.
-install_import_hook(["registration", "coregister"], "beartype.beartype")
+# An int will do for a float, as PEP 484 has it.
+_CHECKER = "beartype.beartype(conf=beartype.BeartypeConf(is_pep484_tower=True))"
+install_import_hook(["registration", "coregister"], _CHECKER)
 
 SHARED = Path(__file__).resolve().parents[2] / "shared"
 needs_shared = pytest.mark.skipif(not SHARED.is_dir(), reason="no folder 'shared' beside the repository")
