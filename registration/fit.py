@@ -1,5 +1,6 @@
 """One fit: stages in order on one capture's targets."""
 
+import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 
@@ -31,6 +32,9 @@ _LEAST_DENSITY = 1e-3
 _SETTLED_SHARE = 0.1  # of the last stage's steps, over which vertices must stand still
 
 
+OnStep = Callable[[Stage, int], None]
+
+
 @dataclass
 class Outcome:
     """How the stages went. `motion_mm`: 95th percentile of vertex motion over the end of the last stage."""
@@ -60,7 +64,9 @@ class Fit:
         self.corner_uvs = corner_uvs
         self.renderer = Renderer(data.triangles, corner_uvs, vertex_classes(data)[1] @ mapping.from_model, seed=seed)
         self.schemes = {name: scheme for name, scheme in schemes.items() if name in pyramid[0].landmarks}
-        self.landmark_use = {name: np.ones(len(scheme.indices), bool) for name, scheme in self.schemes.items()}
+        self.landmark_use: dict[str, np.ndarray] = {  # bool (L,)
+            name: np.ones(len(scheme.indices), bool) for name, scheme in self.schemes.items()
+        }
         self.texture = torch.full((recipe.texture_px, recipe.texture_px, 3), _GREY, device=self.device)
         self.gains = torch.zeros(len(pyramid[0].names), 3, 2, device=self.device)  # log gain and bias per channel
         self._textured = False
@@ -92,10 +98,8 @@ class Fit:
         with torch.no_grad():
             return self.unknowns.vertices(self.unknowns.skin_offsets())
 
-    def run(self, stages: tuple[Stage, ...], outcome: Outcome, on_step: Callable[[Stage, int], None]) -> None:
+    def run(self, stages: tuple[Stage, ...], outcome: Outcome, on_step: OnStep) -> None:
         """Run stages until one fails; fills `outcome`."""
-        import time
-
         for stage in stages:
             begun = time.perf_counter()
             history, outcome.failure = self._run_stage(stage, outcome, on_step)
@@ -105,7 +109,7 @@ class Fit:
                 outcome.failure = f"stage {stage.name}: {outcome.failure}"
                 return
 
-    def _run_stage(self, stage: Stage, outcome: Outcome, on_step) -> tuple[History, str | None]:
+    def _run_stage(self, stage: Stage, outcome: Outcome, on_step: OnStep) -> tuple[History, str | None]:
         free = [name for name, _ in stage.free if name != "scale" or self.recipe.scale]
         steps = None
         if "offsets" in free:

@@ -30,7 +30,7 @@ from registration.render import backend
 from registration.report.inputs import ReportInputs, heat_map, report_views
 from registration.report.page import write_report
 from registration.stages import RECIPES, Recipe, Stage, expression_of
-from registration.start import from_landmarks, from_masks, spread_views
+from registration.start import LEAST_LANDMARKS, LEAST_OVERLAP, from_landmarks, from_masks, spread_views
 from registration.targets.classes import class_map
 from registration.targets.pyramid import build_pyramid
 from registration.types import Capture, Parameters, Registration, Status
@@ -48,6 +48,7 @@ class Inputs:
     capture: Capture
     data: gnm_npz.GNMData
     schemes: Mapping[str, LandmarkScheme]
+    landmarks: Mapping[str, Float[np.ndarray, "L 3"]]  # triangulated, of the schemes that capture and model share
     recipe: Recipe
     neutral: Registration | None
     digests: Mapping[str, str]  # of the input files
@@ -95,7 +96,13 @@ def register(
     progress = progress or Silent()
     check_out(out)
     inputs = _read_inputs(
-        capture_path, model_path, recipe, views, seed, neutral, deterministic, variant, landmark_files
+        Path(capture_path),
+        Path(model_path),
+        recipe,
+        views,
+        None if neutral is None else Path(neutral),
+        {name: Path(file) for name, file in (landmark_files or {}).items()},
+        {"seed": seed, "deterministic": deterministic, "variant": variant},
     )
     digest = hashes.input_hash(inputs.digests, inputs.config)
     if not force and (same := find_same(out, digest)) is not None:
@@ -111,8 +118,15 @@ def register(
 
 
 def _read_inputs(
-    capture_path, model_path, recipe_name, views, seed, neutral_path, deterministic, variant, landmark_files
+    capture_path: Path,
+    model_path: Path,
+    recipe_name: str,
+    views: int | None,
+    neutral_path: Path | None,
+    landmark_files: Mapping[str, Path],
+    settings: Mapping[str, Any],
 ) -> Inputs:
+    """Read and check everything; only landmarks are triangulated."""
     if recipe_name not in RECIPES:
         raise InputError(
             "There is no such recipe",
@@ -121,39 +135,59 @@ def _read_inputs(
             got=recipe_name,
             fix="choose one of them",
         )
-    capture = read(Path(capture_path))
+    recipe = RECIPES[recipe_name]()
+    capture = read(capture_path)
     validate(capture)
     if views is not None:
-        if not 2 <= views:
-            raise InputError(
-                "Too few views", where="views", expected="at least 2", got=views, fix="use at least two views"
-            )
-        chosen = spread_views([view.camera for view in capture.views], views)
-        capture = replace(capture, views=tuple(capture.views[i] for i in chosen))
-    data = gnm_npz.read(Path(model_path))
-    count = len(data.template_vertex_positions)
-    schemes = dict(schemes_beside(Path(model_path), count))
-    schemes |= {name: read_scheme(Path(file), count, name) for name, file in (landmark_files or {}).items()}
+        capture = _some_views(capture, views)
+    data = gnm_npz.read(model_path)
     neutral = None
-    recipe = RECIPES[recipe_name]()
     if neutral_path is not None:
-        neutral = load_registration(Path(neutral_path))
-        _check_topology(neutral, data, Path(neutral_path), Path(model_path))
+        neutral = load_registration(neutral_path)
+        _check_topology(neutral, data, neutral_path, model_path)
         recipe = expression_of(recipe)
+    count = len(data.template_vertex_positions)
+    schemes = schemes_beside(model_path, count)
+    schemes |= {name: read_scheme(file, count, name) for name, file in landmark_files.items()}
     digests = {"capture": hashes.hash_capture(capture), "model": gnm_npz.content_hash(data)}
     digests |= {f"landmarks {name}": hashes.content_of(s.indices, s.weights) for name, s in schemes.items()}
     if neutral is not None:
         digests["neutral"] = hashes.content_of(neutral.identity, neutral.offsets, neutral.vertices, neutral.texture)
-    config = {
-        "recipe": hashes.plain(recipe),
-        "views": [view.name for view in capture.views],
-        "seed": seed,
-        "deterministic": deterministic,
-        "variant": variant,
-    }
+    config = {"recipe": hashes.plain(recipe), "views": [view.name for view in capture.views], **settings}
     return Inputs(
-        capture=capture, data=data, schemes=schemes, recipe=recipe, neutral=neutral, digests=digests, config=config
+        capture=capture,
+        data=data,
+        schemes=schemes,
+        landmarks=_landmarks(capture, schemes),
+        recipe=recipe,
+        neutral=neutral,
+        digests=digests,
+        config=config,
     )
+
+
+def _some_views(capture: Capture, count: int) -> Capture:
+    if count < 2:
+        raise InputError("Too few views", where="views", expected="at least 2", got=count, fix="use at least two views")
+    chosen = spread_views([view.camera for view in capture.views], count)
+    return replace(capture, views=tuple(capture.views[i] for i in chosen))
+
+
+def _landmarks(capture: Capture, schemes: Mapping[str, LandmarkScheme]) -> dict[str, Float[np.ndarray, "L 3"]]:
+    """Triangulated landmarks (world, metres; NaN = unseen) of every scheme that capture and model share."""
+    solved = {}
+    for name in sorted({name for view in capture.views for name in view.landmarks} & set(schemes)):
+        solved[name] = triangulate(capture, name)[0]
+        expected = len(schemes[name].indices)
+        if len(solved[name]) != expected:
+            raise InputError(
+                "Landmarks of another length than the model's scheme",
+                where=f"scheme {name} of {capture.root}",
+                expected=f"{expected} landmarks",
+                got=len(solved[name]),
+                fix=f"name the scheme otherwise, or give the model's with --landmarks {name}=FILE",
+            )
+    return solved
 
 
 def _check_topology(neutral: Registration, data: gnm_npz.GNMData, neutral_path: Path, model_path: Path) -> None:
@@ -209,29 +243,23 @@ def _start(inputs: Inputs, fit: Fit, progress: Progress) -> Start:
     neutral = None
     if inputs.neutral is not None:
         neutral = start_of(_parameters(inputs.neutral), inputs.neutral.offsets, fit.model, inputs.data)
-    known = {view_scheme for view in inputs.capture.views for view_scheme in view.landmarks}
-    skipped = sorted(known - set(inputs.schemes))
+    skipped = {name for view in inputs.capture.views for name in view.landmarks} - set(inputs.schemes)
     if skipped:
-        progress.note(f"landmark schemes that the model does not know, skipped: {', '.join(skipped)}")
-    solved = {name: triangulate(inputs.capture, name)[0] for name in sorted(known & set(inputs.schemes))}
-    for name, points in solved.items():
-        expected = len(inputs.schemes[name].indices)
-        if len(points) != expected:
-            raise InputError(
-                "Landmarks of another length than the model's scheme",
-                where=f"scheme {name}",
-                expected=f"{expected} landmarks",
-                got=len(points),
-                fix=f"name the scheme otherwise, or give the model's with --landmarks {name}=FILE",
-            )
-    if solved:
-        best = max(solved, key=lambda name: int(np.isfinite(solved[name]).all(1).sum()))
+        progress.note(f"landmark schemes that the model does not know, skipped: {', '.join(sorted(skipped))}")
+    seen = {name: int(np.isfinite(points).all(1).sum()) for name, points in inputs.landmarks.items()}
+    best = max(seen, key=lambda name: seen[name], default=None)
+    if best is not None and seen[best] >= LEAST_LANDMARKS:
         start = from_landmarks(
-            inputs.data, inputs.schemes[best], solved[best], free_scale=inputs.recipe.scale, neutral=neutral
+            inputs.data,
+            inputs.schemes[best],
+            inputs.landmarks[best],
+            free_scale=inputs.recipe.scale,
+            neutral=neutral,
         )
+        assert start.landmarks_used is not None
         fit.landmark_use[best] = start.landmarks_used
         return start
-    if neutral is not None and fit.assess(neutral).overlap >= 0.7:
+    if neutral is not None and fit.assess(neutral).overlap >= LEAST_OVERLAP:
         return replace(neutral, notes=("no landmarks: starting from the neutral's pose",))
     progress.note("no landmarks that the model knows: searching the head's pose in the masks")
     return from_masks(inputs.data, fit.pyramid[-1], fit.assess, fit.refine)

@@ -19,7 +19,7 @@ _EXPRESSION_SHARE = 0.5  # standard deviation granted to expressions against ide
 _OUTLIER_M = 8e-3
 _ROUNDS = 15
 _TRIMMING_ROUNDS = (2, 5, 8)  # after which outliers are found anew
-_LEAST_LANDMARKS = 6
+LEAST_LANDMARKS = 6
 LEAST_OVERLAP = 0.7
 _YAWS, _PITCHES = np.radians(np.arange(0, 360, 45)), np.radians([-25.0, 0.0, 25.0])
 _REFINED = 5  # of the starts that are refined
@@ -38,9 +38,7 @@ def from_landmarks(
     Alternates the rigid motion (Umeyama 1991) with the coefficients' ridge solution. Landmarks that disagree with the
     model by more than 8 mm after the first rounds are left out and named: schemes differ along the jaw.
     From a `neutral`, its identity, offsets and scale are kept and only pose and expression are sought.
-
-    Raises:
-        InputError: fewer than six landmarks were triangulated.
+    At least LEAST_LANDMARKS must be seen.
     """
     template = scheme.points(data.template_vertex_positions.astype(np.float64))
     identity_basis = scheme.points(data.vertex_identity_basis.astype(np.float64))
@@ -54,14 +52,6 @@ def from_landmarks(
         basis = neutral.scale * basis
     used = np.isfinite(points).all(1)
     seen = used.copy()
-    if seen.sum() < _LEAST_LANDMARKS:
-        raise InputError(
-            "Too few landmarks",
-            where=f"scheme {scheme.name}",
-            expected=f"{_LEAST_LANDMARKS} that at least two views agree on",
-            got=f"{seen.sum()}",
-            fix="check the landmarks' pixels and confidences, or remove the files to start from the masks",
-        )
     coefficients = np.zeros(len(basis))
     for round_ in range(_ROUNDS):
         model = template + np.tensordot(coefficients, basis, 1)
@@ -74,7 +64,7 @@ def from_landmarks(
             fitted = scale * (template + np.tensordot(coefficients, basis, 1)) @ rotation.T + shift
             distance = np.linalg.norm(fitted - points, axis=1)
             keep = seen & (distance < max(_OUTLIER_M, 3 * np.median(distance[seen])))
-            used = keep if keep.sum() >= _LEAST_LANDMARKS else used
+            used = keep if keep.sum() >= LEAST_LANDMARKS else used
     split = len(basis) - len(data.expression_basis)
     dropped = np.flatnonzero(seen & ~used)
     note = f"landmarks {_ranges(dropped)} of scheme {scheme.name} lie elsewhere than the model's: left out"

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
@@ -26,7 +27,7 @@ class Start:
     scale: float = 1.0
     identity: Float[np.ndarray, "I"] | None = None
     expression: Float[np.ndarray, "E"] | None = None
-    joints: Float[np.ndarray, "J-1 3"] | None = None
+    joints: Float[np.ndarray, "C 3"] | None = None  # rotations of all joints but the root
     offsets: Float[np.ndarray, "V 3"] | None = None
     landmarks_used: Bool[np.ndarray, "L"] | None = None  # of the scheme it was found with
     notes: tuple[str, ...] = ()  # what the person should know about how it was found
@@ -43,7 +44,7 @@ class Unknowns:
     def __init__(self, model: GNM, data: GNMData, start: Start):
         device, count = model.template.device, len(data.template_vertex_positions)
 
-        def tensor(value, *shape: int) -> Tensor:
+        def tensor(value: Any, *shape: int) -> Tensor:
             value = np.zeros(shape) if value is None else np.array(value)
             return torch.tensor(value, dtype=torch.float32, device=device).reshape(shape)
 
