@@ -64,7 +64,7 @@ class _Silhouettes:
     """The silhouette edges of all views: which, how they lie in the cumulated length, which side is seen."""
 
     ids: mi.UInt32  # view * edge count + edge
-    side: mi.UInt32  # 0 or 1: the side that faces the camera
+    side: mi.UInt32  # 0 or 1: the side that is seen
     length_px: mi.Float  # cumulated
     count: mi.UInt32
     total_px: mi.Float
@@ -97,7 +97,9 @@ def _find(surface: Surface, edges: EdgeArrays, pixels: PixelList) -> _Silhouette
     side = dr.gather(mi.UInt32, dr.select(boundary | first, mi.UInt32(0), 1), ids)
 
     view = ids // edge_count
-    ends = dr.gather(mi.Point2u, edges.vertices, ids - view * edge_count)
+    edge = ids - view * edge_count
+    side = _nearer(surface, edges, edge, side)
+    ends = dr.gather(mi.Point2u, edges.vertices, edge)
     camera = pixels.camera(view)
     xa, za = camera.project(surface.position(ends.x))
     xb, zb = camera.project(surface.position(ends.y))
@@ -106,6 +108,23 @@ def _find(surface: Surface, edges: EdgeArrays, pixels: PixelList) -> _Silhouette
     total = dr.gather(mi.Float, length, count - 1)
     dr.eval(ids, side, length, total)
     return _Silhouettes(ids=ids, side=side, length_px=length, count=count, total_px=total)
+
+
+def _nearer(surface: Surface, edges: EdgeArrays, edge: mi.UInt32, facing: mi.UInt32) -> mi.UInt32:
+    """The side of each edge that hides the other, given a side that faces the camera.
+
+    Both faces of a silhouette lie on one side of it in the image. On an outer bulge the one that faces the camera is
+    nearer; on a fold that is seen from inside an open mesh it is the other, which then lies before the first's plane.
+    """
+    pair = dr.gather(mi.Point2u, edges.faces, edge)
+    other = dr.select(facing == 0, pair.y, pair.x)
+    has_other = other != _NONE
+    corners = surface.corners(dr.select(facing == 0, pair.x, pair.y))
+    a, b, c = (surface.position(corners[k]) for k in range(3))
+    corners = surface.corners(other, has_other)
+    beside = sum((surface.position(corners[k], has_other) for k in range(3)), mi.Point3f(0)) / 3
+    folded = has_other & (dr.dot(dr.cross(b - a, c - a), beside - a) > 0)
+    return dr.select(folded, 1 - facing, facing)
 
 
 def _sample(found: _Silhouettes, samples: int, seed: int) -> tuple[mi.UInt32, mi.Float]:
