@@ -19,22 +19,23 @@ from registration.errors import InputError
 from registration.evaluate.evaluation import Evaluation, evaluate
 from registration.fit import Fit, Outcome
 from registration.geometry.raster import visible
-from registration.geometry.topology import vertex_normals
+from registration.geometry.topology import edges, vertex_normals
 from registration.losses.landmark import residuals
 from registration.model import gnm_npz
 from registration.model.atlas import texture_atlas
 from registration.model.gnm import GNM
 from registration.model.landmarks import LandmarkScheme, read_scheme, schemes_beside
+from registration.model.regions import vertex_classes
 from registration.progress import Progress, Silent
 from registration.render import backend
 from registration.report.inputs import ReportInputs, heat_map, report_views
 from registration.report.page import write_report
 from registration.stages import RECIPES, Recipe, Stage, expression_of
 from registration.start import LEAST_LANDMARKS, LEAST_OVERLAP, from_landmarks, from_masks, spread_views
-from registration.targets.classes import class_map
+from registration.targets.classes import BACKGROUND, class_map
 from registration.targets.pyramid import build_pyramid
 from registration.types import Capture, Parameters, Registration, Status
-from registration.unknowns import Start, start_of
+from registration.unknowns import Start, pivot, start_of
 
 SETTLED_MM = 0.05  # 95th percentile of vertex motion over the last tenth of the last stage
 LANDMARK_PX = 3.0  # median residual at 512 px of head height
@@ -141,6 +142,7 @@ def _read_inputs(
     if views is not None:
         capture = _some_views(capture, views)
     data = gnm_npz.read(model_path)
+    _check_parts(data)
     neutral = None
     if neutral_path is not None:
         neutral = load_registration(neutral_path)
@@ -149,6 +151,8 @@ def _read_inputs(
     count = len(data.template_vertex_positions)
     schemes = schemes_beside(model_path, count)
     schemes |= {name: read_scheme(file, count, name) for name, file in landmark_files.items()}
+    landmarks = _landmarks(capture, schemes)
+    _check_start(capture, landmarks)
     digests = {"capture": hashes.hash_capture(capture), "model": gnm_npz.content_hash(data)}
     digests |= {f"landmarks {name}": hashes.content_of(s.indices, s.weights) for name, s in schemes.items()}
     if neutral is not None:
@@ -158,7 +162,7 @@ def _read_inputs(
         capture=capture,
         data=data,
         schemes=schemes,
-        landmarks=_landmarks(capture, schemes),
+        landmarks=landmarks,
         recipe=recipe,
         neutral=neutral,
         digests=digests,
@@ -188,6 +192,28 @@ def _landmarks(capture: Capture, schemes: Mapping[str, LandmarkScheme]) -> dict[
                 fix=f"name the scheme otherwise, or give the model's with --landmarks {name}=FILE",
             )
     return solved
+
+
+def _check_parts(data: gnm_npz.GNMData) -> None:
+    """Raise now what the fit would trip over: missing vertex groups or components, a mesh that is no manifold."""
+    vertex_classes(data)
+    pivot(data)
+    texture_atlas(data)
+    edges(data.triangles)
+
+
+def _check_start(capture: Capture, landmarks: Mapping[str, Float[np.ndarray, "L 3"]]) -> None:
+    counts = {name: int(np.isfinite(points).all(1).sum()) for name, points in landmarks.items()}
+    labelled = BACKGROUND in capture.classes and any(view.segmentation for view in capture.views)
+    if max(counts.values(), default=0) < LEAST_LANDMARKS and not labelled and not any(v.mask for v in capture.views):
+        found = [f"{count} triangulated of scheme {name}" for name, count in counts.items()]
+        raise InputError(
+            "Nothing tells where the head is",
+            where=capture.root,
+            expected=f"{LEAST_LANDMARKS} landmarks of a scheme that the model knows, or masks",
+            got=", ".join([*(found or ["no landmarks that the model knows"]), "no masks"]),
+            fix="add masks (or label maps with a background), landmarks, or the model's landmarks with --landmarks",
+        )
 
 
 def _check_topology(neutral: Registration, data: gnm_npz.GNMData, neutral_path: Path, model_path: Path) -> None:
