@@ -22,7 +22,7 @@ from registration.stages import Recipe, Stage, rigid
 from registration.start import Candidate, assess
 from registration.targets.classes import ClassMap
 from registration.types import Rendered, Targets
-from registration.unknowns import Start, Unknowns, skin_topology
+from registration.unknowns import Start, Unknowns, skin_topology, skin_vertices
 
 # Surfaces of their own: a pixel that sees one where the target sees another compares nothing but classes.
 _SEPARATE = ("left_eye", "right_eye", "mouth_interior")
@@ -74,14 +74,12 @@ class Fit:
         self._order: list[int] = []
         self._surfaces = [mapping.names.index(name) for name in _SEPARATE if name in mapping.names]
         self._class_names = mapping.names
+        self._read_topology()
 
-    def begin(self, start: Start, texture: Float[np.ndarray, "R R 3"] | None = None) -> None:
-        """Set the unknowns, and the texture if one is known."""
-        self.unknowns = Unknowns(self.model, self.data, start)
-        skin = self.unknowns.skin
-        self._skin_triangles, edge_list = skin_topology(
-            self.data.triangles, skin, len(self.data.template_vertex_positions)
-        )
+    def _read_topology(self) -> None:
+        """What the offsets' terms need of the mesh: once, for any start."""
+        skin, count = skin_vertices(self.data), len(self.data.template_vertex_positions)
+        self._skin_triangles, edge_list = skin_topology(self.data.triangles, skin, count)
         points = self.data.template_vertex_positions[skin]
         lengths = np.linalg.norm(points[edge_list[:, 0]] - points[edge_list[:, 1]], axis=1)
         self._edge_length = float(np.median(lengths))
@@ -90,6 +88,10 @@ class Fit:
             edges=torch.as_tensor(edge_list, device=self.device),
             weights=torch.ones(len(edge_list), device=self.device),
         )
+
+    def begin(self, start: Start, texture: Float[np.ndarray, "R R 3"] | None = None) -> None:
+        """Set the unknowns, and the texture if one is known."""
+        self.unknowns = Unknowns(self.model, self.data, start)
         if texture is not None:
             self.texture = torch.as_tensor(texture, device=self.device)
             self._textured = True

@@ -51,7 +51,7 @@ class Unknowns:
         self.model = model
         self.pivot = tensor(pivot(data), 3)
         self.base_rotation = tensor(start.rotation, 3, 3)
-        self.skin = np.flatnonzero(group(data, "skin") > 0.5)
+        self.skin = skin_vertices(data)
         self._skin = torch.as_tensor(self.skin, device=device)
         eyes = [np.flatnonzero(group(data, name) > 0.5) for name in ("left_eye", "right_eye")]
         self._eyes = [torch.as_tensor(index, device=device) for index in eyes]
@@ -121,9 +121,10 @@ class Unknowns:
         """The mesh in the capture's world, metres."""
         bind, joints = self._bind or self._bind_pose()
         bind = bind + self.offsets(skin_offsets, bind)
-        turned = torch.cat([self.base_rotation.new_zeros(1, 3), self.tensors["joints"]])
-        posed = self.model.skin(bind, joints, turned) - self.pivot
-        return self.tensors["scale"].exp() * posed @ self.rotation().T + self.tensors["position"]
+        local = torch.cat([self.rotation()[None], axis_angle_to_matrix(self.tensors["joints"])])
+        # The root turns the head about its joint; the pivot, turned likewise, is then put in its place.
+        pivot = local[0] @ (self.pivot - joints[0]) + joints[0]
+        return self.tensors["scale"].exp() * (self.model.pose(bind, joints, local) - pivot) + self.tensors["position"]
 
     @torch.no_grad()
     def parameters(self) -> tuple[Parameters, Float[Tensor, "V 3"]]:
@@ -167,6 +168,11 @@ def start_of(parameters: Parameters, offsets: Float[np.ndarray, "V 3"], model: G
         joints=parameters.rotations[1:].cpu().numpy(),
         offsets=offsets,
     )
+
+
+def skin_vertices(data: GNMData) -> Int[np.ndarray, "S"]:
+    """The vertices that carry free offsets: all of the skin, its inner linings included."""
+    return np.flatnonzero(group(data, "skin") > 0.5)
 
 
 def skin_topology(

@@ -66,12 +66,18 @@ class GNM(torch.nn.Module):
         `offsets` are added in bind space and broadcast over the batch.
         """
         bind = self.bind(parameters.identity, parameters.expression)
-        if self.corrective_basis is not None:
-            bind = bind + self.correctives(parameters.rotations)
         if offsets is not None:
             bind = bind + offsets
-        skinned = self.skin(bind, self.joints(parameters.identity), parameters.rotations)
-        return parameters.scale[..., None, None] * skinned + parameters.translation[..., None, :]
+        posed = self.pose(bind, self.joints(parameters.identity), axis_angle_to_matrix(parameters.rotations))
+        return parameters.scale[..., None, None] * posed + parameters.translation[..., None, :]
+
+    def pose(
+        self, bind: Float[Tensor, "*B V 3"], joints: Float[Tensor, "*C J 3"], rotations: Float[Tensor, "*D J 3 3"]
+    ) -> Float[Tensor, "*E V 3"]:
+        """The bind pose with pose correctives, skinned; rotations as matrices, each relative to its parent."""
+        if self.corrective_basis is not None:
+            bind = bind + self.correctives(rotations)
+        return self.skin(bind, joints, rotations)
 
     def bind(self, identity: Float[Tensor, "*B I"], expression: Float[Tensor, "*B E"]) -> Float[Tensor, "*B V 3"]:
         """The bind pose: template plus both bases (paper, equation `gnm_feedforward`), without pose correctives."""
@@ -82,24 +88,22 @@ class GNM(torch.nn.Module):
         """Joint positions in the bind pose."""
         return (self.joint_template + identity @ self.joint_basis).unflatten(-1, (-1, 3))
 
-    def correctives(self, rotations: Float[Tensor, "*B J 3"]) -> Float[Tensor, "*B V 3"]:
+    def correctives(self, rotations: Float[Tensor, "*B J 3 3"]) -> Float[Tensor, "*B V 3"]:
         """What the rotations add to the bind pose before skinning; in the released file, not in the paper."""
         if self.corrective_basis is None:
-            return self.template.new_zeros(*rotations.shape[:-2], *self.weights.shape[:1], 3)
-        turned = axis_angle_to_matrix(rotations)
-        turned = turned - torch.eye(3, dtype=turned.dtype, device=turned.device)
+            return self.template.new_zeros(*rotations.shape[:-3], *self.weights.shape[:1], 3)
+        turned = rotations - torch.eye(3, dtype=rotations.dtype, device=rotations.device)
         return (turned.flatten(-3) @ self.corrective_basis).unflatten(-1, (-1, 3))
 
     def skin(
-        self, bind: Float[Tensor, "*B V 3"], joints: Float[Tensor, "*C J 3"], rotations: Float[Tensor, "*D J 3"]
+        self, bind: Float[Tensor, "*B V 3"], joints: Float[Tensor, "*C J 3"], rotations: Float[Tensor, "*D J 3 3"]
     ) -> Float[Tensor, "*E V 3"]:
         """Linear blend skinning by the kinematic chain; batch axes broadcast."""
-        local = axis_angle_to_matrix(rotations)
-        turned, moved = [local[..., 0, :, :]], [joints[..., 0, :]]
+        turned, moved = [rotations[..., 0, :, :]], [joints[..., 0, :]]
         for j, parent in enumerate(self.parents[1:], start=1):
             bone = joints[..., j, :] - joints[..., parent, :]
             moved.append(moved[parent] + (turned[parent] @ bone[..., None])[..., 0])
-            turned.append(turned[parent] @ local[..., j, :, :])
+            turned.append(turned[parent] @ rotations[..., j, :, :])
         rotation = torch.stack(turned, -3)
         shift = torch.stack(moved, -2) - (rotation @ joints[..., None])[..., 0]
         affine = self.weights @ torch.cat([rotation, shift[..., None]], -1).flatten(-2)
