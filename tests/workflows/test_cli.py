@@ -1,9 +1,12 @@
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
+import registration.register
+from tests.capture.small import make
 from workflows.cli import main
 
 TINY_MODEL = Path(__file__).parents[1] / "fixtures" / "tiny_gnm.npz"
@@ -76,3 +79,62 @@ def test_missing_input_is_told_and_nothing_is_written(
     error = capsys.readouterr().err
     assert str(missing) in error and "fix:" in error
     assert list(tmp_path.iterdir()) == []
+
+
+def test_missing_capture_of_a_registration(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    missing, out = tmp_path / "missing", tmp_path / "out"
+    assert main(["register", str(missing), "--model", str(TINY_MODEL), "--out", str(out)]) == 2
+    error = capsys.readouterr().err
+    assert "The capture folder is missing" in error and str(missing) in error and "fix:" in error
+    assert "Traceback" not in error
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_unknown_recipe_stops_with_code_2(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as stop:
+        main(["register", "C", "--model", "M", "--out", str(tmp_path / "out"), "--recipe", "drafty"])
+    assert stop.value.code == 2
+    error = capsys.readouterr().err
+    assert "drafty" in error and "draft" in error and "studio" in error
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_capture_check_tells_and_draws(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    capture, sheet = make(tmp_path / "capture"), tmp_path / "sheet.png"
+    assert main(["capture", "check", str(capture), "--out", str(sheet)]) == 0
+    told = capsys.readouterr().out
+    assert "5 views, all checks passed" in told and str(sheet) in told
+    assert sheet.read_bytes().startswith(b"\x89PNG")
+
+
+@pytest.mark.parametrize("status, code", [("converged", 0), ("stopped", 0), ("failed", 1)])
+def test_register_passes_every_argument_on(
+    status: str, code: int, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The library's own work is tested in tests/register; here only what the command hands over and makes of it."""
+    heard = {}
+
+    def listen(capture: Path, **options) -> SimpleNamespace:
+        heard.update(options, capture=capture)
+        return SimpleNamespace(status=status, reason="because")
+
+    monkeypatch.setattr(registration.register, "register", listen)
+    flags = "--recipe studio --views 7 --seed 3 --neutral N --deterministic --force --variant cuda --landmarks 68=a 5=b"
+    assert main(["register", "C", "--model", "M.npz", "--out", "O", *flags.split()]) == code
+    heard.pop("progress").note("told")
+    assert heard == {
+        "capture": Path("C"),
+        "model_path": Path("M.npz"),
+        "out": Path("O"),
+        "recipe": "studio",
+        "views": 7,
+        "seed": 3,
+        "neutral": Path("N"),
+        "deterministic": True,
+        "force": True,
+        "variant": "cuda",
+        "landmark_files": {"68": Path("a"), "5": Path("b")},
+    }
+    told = capsys.readouterr()
+    assert told.out == f"{status}: because\nO\n"
+    assert "told" in told.err
