@@ -41,7 +41,8 @@ def rgb_l1(rendered: Rendered, targets: Targets, agree: Tensor) -> Tensor:
 def rgb_ssim(rendered: Rendered, targets: Targets, agree: Tensor) -> Tensor:
     """1 - SSIM on perceptually encoded colour, window 11, sigma 1.5 px."""
     # What is not compared must not enter the windows' statistics: there both images show the target.
-    shown = torch.where(agree[:, None], encoded(rendered.rgb), encoded(targets.rgb))
+    compared = agree & (targets.rgb_weight > 0)
+    shown = torch.where(compared[:, None], encoded(rendered.rgb), encoded(targets.rgb))
     ours, theirs = (targets.pixels.image(c).permute(0, 3, 1, 2) for c in (shown, encoded(targets.rgb)))
     dissimilarity = 1 - ssim(ours, theirs, 11).mean(1)
     weight = targets.pixels.image((targets.rgb_weight * agree)[:, None])[..., 0]

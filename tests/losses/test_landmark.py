@@ -1,0 +1,74 @@
+"""Landmarks: projection against the camera's own, residuals by hand, and a robust mean that outliers cannot rule."""
+
+import numpy as np
+import pytest
+import torch
+
+from registration.losses import landmark
+from registration.types import Camera
+
+
+def cameras() -> tuple[Camera, ...]:
+    pose = np.eye(4)
+    pose[:3, 3] = [0.01, -0.02, 0.5]
+    turned = np.array([[0, 0, 1.0, 0], [0, 1, 0, 0], [-1, 0, 0, 0.6], [0, 0, 0, 1]])
+    intrinsics = np.array([[200.0, 0, 61.3], [0, 210.0, 48.9], [0, 0, 1]])
+    return tuple(
+        Camera(width_px=120, height_px=100, intrinsics=intrinsics, T_cam_world=T_cam_world)
+        for T_cam_world in (pose, turned)
+    )
+
+
+POINTS = 0.08 * np.random.default_rng(0).standard_normal((5, 3))
+
+
+def test_projection_is_the_cameras():
+    projected = landmark.project(cameras(), torch.tensor(POINTS))
+    for camera, image in zip(cameras(), projected, strict=True):
+        np.testing.assert_allclose(image, camera.project(POINTS)[0], rtol=1e-12)
+
+
+def test_residuals_by_hand():
+    """3 and 4 px off are 5; at a head of 256 px that is 10 of the standard head; confidence 0.5 is not enough."""
+    seen = torch.tensor(np.stack([np.column_stack([c.project(POINTS)[0], np.ones(5)]) for c in cameras()]))
+    seen[0, 0, :2] += torch.tensor([3.0, -4.0])
+    seen[1, 2, 2], seen[1, 3, 2], seen[0, 1, 2] = 0.5, 0.51, 0.0
+    distance, counts = landmark.residuals(cameras(), torch.tensor(POINTS), seen, 256.0)
+    expected = torch.zeros(2, 5, dtype=torch.float64)
+    expected[0, 0] = 10
+    torch.testing.assert_close(distance, expected, atol=1e-5, rtol=0)
+    assert counts.tolist() == [[1, 0, 1, 1, 1], [1, 1, 0, 1, 1]]
+
+
+def test_robust_mean_by_hand():
+    residual = torch.tensor([0.0, 3.0, 300.0, 1e6], dtype=torch.float64)
+    weight = torch.tensor([1.0, 1, 1, 0], dtype=torch.float64)
+    expected = (0 + 0.5 + 1e4 / (1 + 1e4)) / 3
+    assert landmark.robust(residual, weight, 3.0).item() == pytest.approx(expected)
+    small = torch.tensor([0.03], dtype=torch.float64)
+    assert landmark.robust(small, torch.ones(1), 3.0).item() == pytest.approx(1e-4, rel=1e-3)
+    assert landmark.robust(residual, torch.zeros(4), 3.0).item() == 0
+
+
+def test_an_outlier_hardly_pulls():
+    residual = torch.tensor([3.0, 300.0], dtype=torch.float64, requires_grad=True)
+    landmark.robust(residual, torch.ones(2), 3.0).backward()
+    assert 0 < residual.grad[1] < 1e-5 * residual.grad[0]
+
+
+def test_gradient_through_projection():
+    seen = torch.tensor(np.stack([np.column_stack([c.project(POINTS)[0] + 2, np.ones(5)]) for c in cameras()]))
+
+    def cost(points: torch.Tensor) -> torch.Tensor:
+        distance, counts = landmark.residuals(cameras(), points, seen, 300.0)
+        return landmark.robust(distance, counts, 3.0)
+
+    assert torch.autograd.gradcheck(cost, torch.tensor(POINTS, requires_grad=True))
+
+
+def test_a_perfect_fit_has_a_finite_gradient():
+    points = torch.tensor(POINTS, requires_grad=True)
+    seen = torch.tensor(np.stack([np.column_stack([c.project(POINTS)[0], np.ones(5)]) for c in cameras()]))
+    distance, counts = landmark.residuals(cameras(), points, seen, 300.0)
+    landmark.robust(distance, counts, 3.0).backward()
+    assert points.grad.isfinite().all() and points.grad.abs().max() < 1e-3
