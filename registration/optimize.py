@@ -60,7 +60,7 @@ class AdamUniformBlock:
         self._rate = rate
         self._betas = betas
         self._first = torch.zeros_like(latent)
-        self._second = torch.zeros((), device=latent.device)
+        self._second = latent.new_zeros(())
         self._steps = 0
 
     @torch.no_grad()
@@ -83,8 +83,8 @@ def minimise(
 ) -> tuple[History, str | None]:
     """Take `steps` steps on the sum of the objective's weighted terms.
 
-    Returns the value of every term at every step, and None or why it had to stop: a term that is not finite. The
-    unknowns are then those before that step.
+    Returns the value of every term at every step, and None or why it had to stop: a term or a gradient that is not
+    finite. The unknowns are then those before that step.
     """
     history: History = {}
     for step in range(steps):
@@ -98,6 +98,9 @@ def minimise(
             for tensor in block.tensors:
                 tensor.grad = None
         torch.stack(list(terms.values())).sum().backward()
+        gradients = [tensor.grad for block in blocks for tensor in block.tensors if tensor.grad is not None]
+        if not all(gradient.isfinite().all() for gradient in gradients):
+            return history, f"gradient not finite at step {step}"
         for block in blocks:
             block.step(step / max(1, steps - 1))
         after_step(step)

@@ -1,0 +1,65 @@
+"""Plain lines in a log, a bar in a terminal."""
+
+import io
+import sys
+
+import pytest
+
+from registration import progress
+
+
+class Terminal(io.StringIO):
+    def isatty(self) -> bool:
+        return True
+
+
+@pytest.fixture
+def clock(monkeypatch):
+    """A clock that tests turn by hand; a list of one number."""
+    now = [100.0]
+    monkeypatch.setattr(progress.time, "monotonic", lambda: now[0])
+    return now
+
+
+def test_lines_in_a_log(clock, capsys):
+    """A line when something new begins, then one each 15 s; notes at once."""
+    with progress.shown() as shown:
+        for done in range(60):
+            shown.at(done, 60, "model")
+            clock[0] += 1.0
+        shown.note("something [odd]")
+        shown.at(0, 30, "offsets")
+        shown.at(1, 30, "offsets")
+    out, lines = capsys.readouterr()
+    assert out == ""
+    assert lines.splitlines() == [
+        "[   0.0 s] model: 0/60",
+        "[  15.0 s] model: 15/60",
+        "[  30.0 s] model: 30/60",
+        "[  45.0 s] model: 45/60",
+        "something [odd]",
+        "[  60.0 s] offsets: 0/30",
+    ]
+
+
+def test_a_bar_in_a_terminal(monkeypatch):
+    """Notes are printed as they are: a path may hold what rich would take for markup."""
+    terminal = Terminal()
+    monkeypatch.setattr(sys, "stderr", terminal)
+    with progress.shown() as shown:
+        shown.at(3, 10, "offsets [8 mm]")
+        shown.note("run[/red] [bold] is there")
+        shown.at(7, 10, "offsets [8 mm]")
+    text = terminal.getvalue()
+    assert "offsets [8 mm]" in text and "7/10" in text
+    assert "run[/red] [bold] is there" in text
+
+
+def test_all_are_progress(capsys):
+    silent = progress.Silent()
+    assert isinstance(silent, progress.Progress)
+    silent.note("a")
+    silent.at(1, 2, "b")
+    with progress.shown() as shown:
+        assert isinstance(shown, progress.Progress)
+    assert capsys.readouterr() == ("", "")
