@@ -1,14 +1,16 @@
-"""Registrations that several tests look at; each is made once."""
+"""Registrations that several tests look at; each is made once, some in a process beside the tests' own."""
 
 import shutil
 import subprocess
 import sys
-from dataclasses import dataclass
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from registration.artifacts import load_registration
 from registration.register import register
 from registration.types import Registration
 from tests.register.synthetic import MODEL, Truth, make
@@ -32,7 +34,7 @@ class Notes:
 
 @dataclass(frozen=True, kw_only=True)
 class Run:
-    """A registration that was made, and what was heard of it."""
+    """A registration that was made."""
 
     truth: Truth
     out: Path
@@ -43,6 +45,33 @@ class Run:
     def error_mm(self) -> np.ndarray:
         """Distance of each vertex from the true one."""
         return 1e3 * np.linalg.norm(self.result.vertices - self.truth.vertices, axis=1)
+
+
+class Beside:
+    """`gnmreg register` in a process of its own."""
+
+    def __init__(self, truth: Truth, out: Path, *options: str):
+        self.truth, self.out = truth, out
+        command = [sys.executable, "-m", "workflows.cli", "register", str(truth.root), "--model", str(MODEL)]
+        self._process = subprocess.Popen(
+            [*command, "--out", str(out), *options], text=True, stdout=subprocess.PIPE, stderr=subprocess.PIPE
+        )
+        self._ended: Run | None = None
+        self.stdout = ""
+
+    def run(self) -> Run:
+        """Wait for it; the notes are the lines of its log."""
+        if self._ended is None:
+            self.stdout, log = self._process.communicate(timeout=600)
+            assert self._process.returncode == 0, log
+            progress = Notes()
+            progress.notes = log.splitlines()
+            self._ended = Run(truth=self.truth, out=self.out, result=load_registration(self.out), progress=progress)
+        return self._ended
+
+    def end(self) -> None:
+        self._process.kill()
+        self._process.communicate()
 
 
 def run(truth: Truth, out: Path, **options) -> Run:
@@ -62,46 +91,50 @@ def neutral(folder: Path) -> Truth:
 
 
 @pytest.fixture(scope="session")
-def registered(neutral: Truth, folder: Path) -> Run:
+def again_beside(neutral: Truth, folder: Path) -> Iterator[Beside]:
+    beside = Beside(neutral, folder / "out" / "again")
+    yield beside
+    beside.end()
+
+
+@pytest.fixture(scope="session")
+def registered(neutral: Truth, again_beside: Beside, folder: Path) -> Run:
     """The neutral, as anyone would register it."""
     return run(neutral, folder / "out" / "neutral")
 
 
 @pytest.fixture(scope="session")
-def again(neutral: Truth, folder: Path) -> Run:
+def again(again_beside: Beside) -> Run:
     """The same once more."""
-    return run(neutral, folder / "out" / "again")
+    return again_beside.run()
 
 
 @pytest.fixture(scope="session")
-def smile(registered: Run, folder: Path) -> Run:
+def without_landmarks_beside(neutral: Truth, folder: Path) -> Iterator[Beside]:
+    root = folder / "without_landmarks"
+    shutil.copytree(neutral.root, root, ignore=shutil.ignore_patterns("landmarks"))
+    beside = Beside(replace(neutral, root=root), folder / "out" / "without_landmarks")
+    yield beside
+    beside.end()
+
+
+@pytest.fixture(scope="session")
+def without_landmarks(without_landmarks_beside: Beside) -> Run:
+    """The neutral with its landmark files hidden."""
+    return without_landmarks_beside.run()
+
+
+@pytest.fixture(scope="session")
+def smile(registered: Run, again: Run, without_landmarks_beside: Beside, folder: Path) -> Run:
     """Another expression of the subject, from its neutral."""
     return run(make(folder / "smile", "smile"), folder / "out" / "smile", neutral=registered.out)
 
 
 @pytest.fixture(scope="session")
-def without_landmarks(neutral: Truth, folder: Path) -> Run:
-    """The neutral with its landmark files hidden."""
-    root = folder / "without_landmarks"
-    shutil.copytree(neutral.root, root, ignore=shutil.ignore_patterns("landmarks"))
-    hidden = Truth(**{**vars(neutral), "root": root})
-    return run(hidden, folder / "out" / "without_landmarks")
-
-
-@pytest.fixture(scope="session")
-def deterministic(neutral: Truth, folder: Path) -> list[tuple[Path, "subprocess.CompletedProcess[str]"]]:
-    """Two runs of the command side by side, with `--deterministic`, three views and another seed."""
-    outs = [folder / "out" / f"deterministic_{i}" for i in range(2)]
-    command = [sys.executable, "-m", "workflows.cli", "register", str(neutral.root), "--model", str(MODEL)]
-    options = ["--views", "3", "--seed", "5", "--deterministic"]
-    running = [
-        subprocess.Popen(
-            [*command, *options, "--out", str(out)], text=True, stdout=subprocess.PIPE, stderr=subprocess.PIPE
-        )
-        for out in outs
-    ]
-    ended = []
-    for out, process in zip(outs, running, strict=True):
-        stdout, stderr = process.communicate(timeout=600)
-        ended.append((out, subprocess.CompletedProcess(process.args, process.returncode, stdout, stderr)))
-    return ended
+def deterministic(neutral: Truth, folder: Path) -> Iterator[list[Beside]]:
+    """Two runs side by side with `--deterministic`, three views and another seed."""
+    options = ("--views", "3", "--seed", "5", "--deterministic")
+    pair = [Beside(neutral, folder / "out" / f"deterministic_{i}", *options) for i in range(2)]
+    yield pair
+    for beside in pair:
+        beside.end()
