@@ -67,7 +67,8 @@ def edges(triangles: Int[np.ndarray, "F 3"]) -> Edges:
 
 def vertex_normals(vertices: Float[Tensor, "V 3"], triangles: Int[Tensor, "F 3"]) -> Float[Tensor, "V 3"]:
     """Area-weighted unit normals; zero where a vertex has no area around it. Differentiable."""
-    a, b, c = (vertices[triangles[:, k]] for k in range(3))
+    # Not vertices[...]: the adjoint of that sums in parallel, differently from run to run.
+    a, b, c = (vertices.index_select(0, triangles[:, k]) for k in range(3))
     normals = torch.linalg.cross(b - a, c - a)
     total = torch.zeros_like(vertices).index_add(0, triangles.T.reshape(-1), normals.repeat(3, 1))
     return total / total.norm(dim=-1, keepdim=True).clamp_min(1e-20)

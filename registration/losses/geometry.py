@@ -28,7 +28,9 @@ class EdgeCoupling:
     weights: Float[Tensor, "E"]
 
     def __call__(self, offsets: Float[Tensor, "V 3"]) -> Tensor:
-        change = (offsets[self.edges[:, 0]] - offsets[self.edges[:, 1]]).square().sum(-1)
+        change = (
+            (offsets.index_select(0, self.edges[:, 0]) - offsets.index_select(0, self.edges[:, 1])).square().sum(-1)
+        )
         return (change * self.weights).sum() / len(offsets)
 
 

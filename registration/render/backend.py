@@ -10,8 +10,10 @@ Variant = Literal["llvm", "cuda"]
 def activate(variant: Variant = "llvm", *, deterministic: bool = False) -> torch.device:
     """Select the variant and return the torch device whose memory it shares.
 
-    With `deterministic`, sums run in one fixed order: one thread on the CPU, which costs about half the speed
-    of two cores; on CUDA atomics stay unordered, so bit-for-bit equality is a promise of the CPU alone.
+    Sums over pixels run in a fixed order, so on the CPU two runs were equal bit for bit with any mode; a difference in
+    the last bit would grow to tenths of a millimetre within a fit. What is left to chance is the order in which threads
+    build the BVH: `deterministic` takes that away too, with one thread, for about twice the time. On CUDA torch's sums
+    stay unordered, and equality is no promise.
 
     Raises:
         InputError: no usable libLLVM (`llvm`), or no CUDA device (`cuda`).
@@ -33,8 +35,9 @@ def activate(variant: Variant = "llvm", *, deterministic: bool = False) -> torch
     import mitsuba as mi
 
     mi.set_variant(f"{variant}_ad_rgb")
+    torch.use_deterministic_algorithms(True, warn_only=variant == "cuda")
+    torch.utils.deterministic.fill_uninitialized_memory = False  # type: ignore[attr-defined]
     if deterministic:
         dr.set_thread_count(1)
         torch.set_num_threads(1)
-        torch.use_deterministic_algorithms(True)
     return torch.device("cuda" if variant == "cuda" else "cpu")

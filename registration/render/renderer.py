@@ -7,6 +7,7 @@ there is no shading, no film and no filter; a pixel is a box.
 
 from __future__ import annotations  # mi.Float exists only once a variant is chosen
 
+from collections.abc import Iterable
 from typing import Any
 
 import drjit as dr
@@ -20,7 +21,7 @@ from registration.geometry.topology import edges, vertex_normals
 from registration.render import silhouette
 from registration.render.cameras import PixelList, upload
 from registration.render.scene import TriangleScene
-from registration.render.shading import CLASSES, MASK, NORMAL, RGB, Surface, texel_footprint
+from registration.render.shading import CLASSES, MASK, NORMAL, RGB, Corners, Surface, texel_footprint
 from registration.types import Pixels, Rendered
 
 _MISS = 0xFFFFFFFF
@@ -117,7 +118,8 @@ class Renderer:
                 hit = self._scene.cast(origin, direction, mi.Bool(True), coherent=True)
                 is_hit = hit.is_valid()
                 face = dr.select(is_hit, hit.prim_index, 0)
-                channels = surface.shade(face, hit.prim_uv.x, hit.prim_uv.y, direction, is_hit)
+                corners = surface.load(face, is_hit)
+                channels = surface.shade(corners, hit.prim_uv.x, hit.prim_uv.y, direction, is_hit)
                 image += dr.ravel(mi.ArrayXf(channels)) * (1 / len(self._pixel_offsets))
                 seen.append(dr.select(is_hit, hit.prim_index, _MISS))
                 dr.eval(image, seen)
@@ -126,19 +128,21 @@ class Renderer:
 
     def _interior(
         self, surface: Surface, pixels: PixelList, offset: tuple[float, float], seen: mi.UInt32, adjoint: mi.Float
-    ) -> None:
-        """Add the part of the gradient that needs no visibility change, over the rays that hit."""
+    ) -> Corners | None:
+        """Fill the gradients of the corners that were hit: the part that needs no visibility change."""
         pixel = dr.compress(seen != _MISS)
         if dr.width(pixel) == 0:
-            return
-        face = dr.gather(mi.UInt32, seen, pixel)
+            return None
+        corners = surface.load(dr.gather(mi.UInt32, seen, pixel))
+        dr.enable_grad(corners.positions, corners.normals)
         origin, direction = pixels.rays(offset, pixel)
-        b1, b2 = surface.barycentrics(face, origin, direction)
-        channels = surface.shade(face, b1, b2, direction, mi.Bool(True))
+        b1, b2 = corners.barycentrics(origin, direction)
+        channels = surface.shade(corners, b1, b2, direction, mi.Bool(True))
         g = dr.gather(mi.ArrayXf, adjoint, pixel, shape=(surface.channel_count, dr.width(pixel)))
         first = 0 if surface.texture is not None else NORMAL.start
         value = sum((g[k] * channels[k] for k in range(first, len(channels)) if k != MASK), mi.Float(0))
         dr.backward(value * (1 / len(self._pixel_offsets)))
+        return corners
 
     def _splat(self, surface: Surface, pixels: PixelList, values: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:
         size, depth = surface.texture_size, values.shape[-1]
@@ -152,18 +156,18 @@ class Renderer:
             index, fx, fy = texel_footprint(b[0] * uvs[0] + b[1] * uvs[1] + b[2] * uvs[2], size)
             weight = _upload(weights)
             active &= weight > 0
-            total, density = dr.zeros(mi.Float, size * size * depth), dr.zeros(mi.Float, size * size)
-            lane = dr.arange(mi.UInt32, weights.numel())
-            value = dr.gather(mi.ArrayXf, _upload(values), lane, shape=(depth, weights.numel()))
-            corners = ((0, (1 - fx) * (1 - fy)), (1, fx * (1 - fy)), (size, (1 - fx) * fy), (size + 1, fx * fy))
-            for step, share in corners:
-                w = share * weight
-                dr.scatter_reduce(dr.ReduceOp.Add, density, w, index + step, active)
-                for k in range(depth):
-                    dr.scatter_reduce(dr.ReduceOp.Add, total, w * value[k], (index + step) * depth + k, active)
-            dr.eval(total, density)
+            shares = [(1 - fx) * (1 - fy), fx * (1 - fy), (1 - fx) * fy, fx * fy]
+            shares = [dr.select(active, share * weight, 0) for share in shares]
+            index = dr.select(active, index, 0)
+            dr.eval(index, shares)
             dr.sync_thread()
-        return total.torch().view(size, size, depth).clone(), density.torch().view(size, size).clone()
+        first = index.torch().long()
+        total, density = values.new_zeros(size * size, depth), values.new_zeros(size * size)
+        for step, share in zip((0, 1, size, size + 1), (share.torch() for share in shares), strict=True):
+            density.index_add_(0, first + step, share)
+            for k in range(depth):
+                total[:, k].index_add_(0, first + step, share * values[:, k])
+        return total.view(size, size, depth), density.view(size, size)
 
 
 class _Draw(torch.autograd.Function):
@@ -187,33 +191,42 @@ class _Draw(torch.autograd.Function):
         renderer: Renderer = ctx.renderer
         renderer._scene.move(positions)
         adjoint = _upload(grad_outputs[0])
-        surface, still = (renderer._surface(positions, normals, texture) for _ in range(2))
-        attached = {0: surface.positions, 1: surface.normals, 2: surface.texture}
-        wanted = [k for k in attached if ctx.needs_input_grad[k]]
-        dr.enable_grad(*(attached[k] for k in wanted))
+        surface = renderer._surface(positions, normals, texture)
+        if ctx.needs_input_grad[2]:
+            dr.enable_grad(surface.texture)
+        position_gradient, normal_gradient = torch.zeros_like(positions), torch.zeros_like(normals)
         for offset, seen in zip(renderer._pixel_offsets, ctx.seen, strict=True):
-            renderer._interior(surface, ctx.pixels, offset, seen, adjoint)
-        gradients = {k: dr.grad(attached[k]) for k in wanted}
-        if 0 in wanted:
-            moving = mi.Float(still.positions)
-            dr.enable_grad(moving)
+            corners = renderer._interior(surface, ctx.pixels, offset, seen, adjoint)
+            if corners is not None:
+                _add(position_gradient, zip(corners.vertices, map(dr.grad, corners.positions), strict=True))
+                _add(normal_gradient, zip(corners.vertices, map(dr.grad, corners.normals), strict=True))
+        texture_gradient = None
+        if texture is not None and ctx.needs_input_grad[2]:
+            texture_gradient = dr.grad(surface.texture).torch().reshape(texture.shape).clone()
+        if ctx.needs_input_grad[0]:
             renderer._seed += 1
-            silhouette.backward(
+            terms = silhouette.backward(
                 renderer._scene,
-                still,
-                moving,
+                renderer._surface(positions, normals, texture),
                 renderer._edges,
                 ctx.pixels,
                 adjoint,
                 samples_per_px=renderer._edge_samples,
                 seed=renderer._seed,
             )
-            gradients[0] = gradients[0] + dr.grad(moving)
-        dr.eval(gradients)
-        dr.sync_thread()
-        shapes = {0: positions.shape, 1: normals.shape, 2: texture.shape if texture is not None else None}
-        out = [gradients[k].torch().reshape(shapes[k]).clone() if k in gradients else None for k in range(3)]
-        return out[0], out[1], out[2], None, None
+            _add(position_gradient, terms)
+        return position_gradient, normal_gradient, texture_gradient, None, None
+
+
+def _add(total: Tensor, terms: Iterable[tuple[mi.UInt32, mi.Vector3f]]) -> None:
+    """Sum lanes to vertices one after the other: parallel sums of floats would differ from run to run."""
+    terms = list(terms)
+    dr.eval(terms)
+    dr.sync_thread()
+    flat, axis = total.view(-1), torch.arange(3, device=total.device)
+    for vertex, gradient in terms:
+        place = vertex.torch().long()[:, None] * 3 + axis
+        flat.index_add_(0, place.view(-1), dr.ravel(gradient).torch())
 
 
 def _upload(tensor: Tensor) -> mi.Float:

@@ -14,6 +14,30 @@ RGB, NORMAL, MASK, CLASSES = slice(0, 3), slice(3, 6), 6, 7  # channels of an im
 
 
 @dataclass(frozen=True, kw_only=True)
+class Corners:
+    """The three corners of one face per lane. Gradients stop here: lanes are summed to vertices in a fixed order."""
+
+    face: mi.UInt32
+    vertices: list[mi.UInt32]
+    positions: list[mi.Point3f]
+    normals: list[mi.Vector3f]
+
+    def barycentrics(self, origin: mi.Point3f, direction: mi.Vector3f) -> tuple[mi.Float, mi.Float]:
+        """Where a fixed ray meets the plane of the face (Moeller and Trumbore); differentiable in `positions`."""
+        a, b, c = self.positions
+        ab, ac = b - a, c - a
+        p = dr.cross(direction, ac)
+        scale = dr.rcp(dr.dot(ab, p))
+        t = origin - a
+        return dr.dot(t, p) * scale, dr.dot(direction, dr.cross(t, ab)) * scale
+
+    def from_behind(self, direction: mi.Vector3f) -> mi.Bool:
+        """Whether a ray meets the inner side of the face: a scanner's normals point to the camera there too."""
+        a, b, c = (dr.detach(position) for position in self.positions)
+        return dr.dot(dr.cross(b - a, c - a), direction) > 0
+
+
+@dataclass(frozen=True, kw_only=True)
 class Surface:
     """The arrays of one mesh on the device. `positions` and `normals` may carry gradients, `texture` too."""
 
@@ -36,26 +60,26 @@ class Surface:
     def position(self, vertex: mi.UInt32, active: mi.Bool | bool = True) -> mi.Point3f:
         return dr.gather(mi.Point3f, self.positions, vertex, active)
 
-    def barycentrics(self, face: mi.UInt32, origin: mi.Point3f, direction: mi.Vector3f) -> tuple[mi.Float, mi.Float]:
-        """Where a fixed ray meets the plane of a face (Moeller and Trumbore); differentiable in `positions`."""
-        corners = self.corners(face)
-        a, b, c = (self.position(corners[k]) for k in range(3))
-        ab, ac = b - a, c - a
-        p = dr.cross(direction, ac)
-        scale = dr.rcp(dr.dot(ab, p))
-        t = origin - a
-        return dr.dot(t, p) * scale, dr.dot(direction, dr.cross(t, ab)) * scale
+    def load(self, face: mi.UInt32, active: mi.Bool | bool = True) -> Corners:
+        corners = self.corners(face, active)
+        vertices = [corners[k] for k in range(3)]
+        return Corners(
+            face=face,
+            vertices=vertices,
+            positions=[self.position(v, active) for v in vertices],
+            normals=[dr.gather(mi.Vector3f, self.normals, v, active) for v in vertices],
+        )
 
     def shade(
-        self, face: mi.UInt32, b1: mi.Float, b2: mi.Float, direction: mi.Vector3f, active: mi.Bool
+        self, corners: Corners, b1: mi.Float, b2: mi.Float, direction: mi.Vector3f, active: mi.Bool
     ) -> list[mi.Float]:
         """The channels of (face; 1 - b1 - b2, b1, b2) seen along `direction`; zero where not active."""
-        corners = self.corners(face, active)
         return self._mix(
             [1 - b1 - b2, b1, b2],
-            [corners[k] for k in range(3)],
-            [3 * face + k for k in range(3)],
-            self._from_behind(corners, direction, active),
+            corners.normals,
+            corners.vertices,
+            [3 * corners.face + k for k in range(3)],
+            corners.from_behind(direction),
             active,
         )
 
@@ -69,17 +93,15 @@ class Surface:
         active: mi.Bool,
     ) -> list[mi.Float]:
         """The channels of a point on a face's edge, at share t of the way from its first to its second end."""
-        behind = self._from_behind(self.corners(face, active), direction, active)
-        return self._mix([1 - t, t], [vertex.x, vertex.y], [corner.x, corner.y], behind, active)
-
-    def _from_behind(self, corners: mi.Point3u, direction: mi.Vector3f, active: mi.Bool) -> mi.Bool:
-        """Whether a ray meets the inner side of a face: a scanner's normals point to the camera there too."""
-        a, b, c = (dr.detach(self.position(corners[k], active)) for k in range(3))
-        return dr.dot(dr.cross(b - a, c - a), direction) > 0
+        behind = self.load(face, active).from_behind(direction)
+        ends = [vertex.x, vertex.y]
+        normals = [dr.gather(mi.Vector3f, self.normals, v, active) for v in ends]
+        return self._mix([1 - t, t], normals, ends, [corner.x, corner.y], behind, active)
 
     def _mix(
         self,
         weights: list[mi.Float],
+        normals: list[mi.Vector3f],
         vertices: list[mi.UInt32],
         corners: list[mi.UInt32],
         behind: mi.Bool,
@@ -87,20 +109,18 @@ class Surface:
     ) -> list[mi.Float]:
         # prim_uv is undefined on a miss: weights must be silenced there or NaNs spread.
         weights = [dr.select(active, w, 0) for w in weights]
-        pairs = list(zip(weights, vertices, strict=True))
-        normal = sum((w * dr.gather(mi.Vector3f, self.normals, v, active) for w, v in pairs), mi.Vector3f(0))
+        normal = sum((w * n for w, n in zip(weights, normals, strict=True)), mi.Vector3f(0))
         normal *= dr.rsqrt(dr.maximum(dr.squared_norm(normal), 1e-12)) * dr.select(behind, mi.Float(-1), 1)
         classes = [mi.Float(0)] * self.class_count
-        for w, v in pairs:
+        for w, v in zip(weights, vertices, strict=True):
             row = dr.gather(mi.ArrayXf, self.classes, v, active, shape=(self.class_count, dr.width(v)))
             classes = [total + w * row[k] for k, total in enumerate(classes)]
         colour = [mi.Float(0)] * 3
         if self.texture is not None:
-            uv = sum(
-                (w * dr.gather(mi.Point2f, self.corner_uvs, c, active) for w, c in zip(weights, corners, strict=True)),
-                mi.Point2f(0),
+            uvs = [dr.gather(mi.Point2f, self.corner_uvs, c, active) for c in corners]
+            colour = list(
+                self._lookup(sum((w * uv for w, uv in zip(weights, uvs, strict=True)), mi.Point2f(0)), active)
             )
-            colour = list(self._lookup(uv, active))
         mask = dr.select(active, mi.Float(1), 0)
         return [*colour, normal.x, normal.y, normal.z, mask, *classes]
 

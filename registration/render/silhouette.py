@@ -158,22 +158,21 @@ def _outward(surface: Surface, camera: CameraLanes, face: mi.UInt32, xa: mi.Poin
 def backward(
     scene: TriangleScene,
     surface: Surface,
-    moving: mi.Float,
     edges: EdgeArrays,
     pixels: PixelList,
     adjoint: mi.Float,
     *,
     samples_per_px: float,
     seed: int,
-) -> None:
-    """Add the silhouettes' part of d(adjoint . image)/d(positions) to the gradient of `moving`.
+) -> list[tuple[mi.UInt32, mi.Point3f]]:
+    """The silhouettes' part of d(adjoint . image)/d(positions), as terms: (vertex, gradient) per lane.
 
-    `surface` is detached, `moving` is the same positions with gradients enabled; `adjoint` is (P C) flat.
+    `adjoint` is (P C) flat.
     """
     with dr.suspend_grad():
         found = _find(surface, edges, pixels)
         if found is None:
-            return
+            return []
         samples = int(samples_per_px * float(dr.slice(found.total_px, 0)))
         samples = _SAMPLE_BLOCK * (1 + samples // _SAMPLE_BLOCK)  # few distinct sizes: memory is reused
         which, s = _sample(found, samples, seed)
@@ -200,7 +199,7 @@ def backward(
         is_hit = inside & hit.is_valid()
         seen = inside & ~(is_hit & (hit.t < depth * (1 - _DEPTH_TOLERANCE)))
         face = dr.select(is_hit, hit.prim_index, 0)
-        f_out = surface.shade(face, hit.prim_uv.x, hit.prim_uv.y, direction, is_hit & seen)
+        f_out = surface.shade(surface.load(face, is_hit & seen), hit.prim_uv.x, hit.prim_uv.y, direction, is_hit & seen)
         corners = dr.gather(mi.Point2u, edges.corners, 2 * edge + side, seen)
         perspective = s * za / dr.maximum((1 - s) * zb + s * za, 1e-9)
         f_in = surface.shade_edge(own, ends, corners, perspective, direction, seen)
@@ -208,6 +207,8 @@ def backward(
         jump = sum((g[k] * (f_in[k] - f_out[k]) for k in range(first, channels)), mi.Float(0))
         weight = dr.select(seen, jump, 0) * (found.total_px / dr.opaque(mi.Float, samples))
 
-    a, b = (dr.gather(mi.Point3f, moving, end, seen) for end in (ends.x, ends.y))
+    a, b = (dr.gather(mi.Point3f, surface.positions, end, seen) for end in (ends.x, ends.y))
+    dr.enable_grad(a, b)
     speed = dr.lerp(dr.dot(normal, camera.project(a)[0]), dr.dot(normal, camera.project(b)[0]), s)
-    dr.backward(weight * speed)
+    dr.backward(dr.select(seen, weight * speed, 0))
+    return [(ends.x, dr.grad(a)), (ends.y, dr.grad(b))]
