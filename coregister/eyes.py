@@ -22,7 +22,7 @@ _MEAN_LIMBUS = float(np.arcsin(LIMBUS_RADIUS / SCLERA_RADIUS))  # a polar angle:
 _HALF_BLEND = BLEND_LENGTH / SCLERA_RADIUS / 2
 _STILL = np.radians(65.0)  # behind this polar angle all eyes have the same vertices
 # Polar angles of the mean eye's rings. Both shells share those of the back, so neither can cut through the other.
-_BACK = np.radians([33.0, 43.0, 55.0, 70.0, 90.0, 112.0, 140.0, 180.0])
+_BACK = np.radians([33.0, 44.0, 57.0, 73.0, 90.0, 118.0, 148.0, 180.0])
 _LIMBUS = _MEAN_LIMBUS + np.array([-_HALF_BLEND, 0, _HALF_BLEND])
 _EXTERIOR = np.concatenate([np.radians([0.0, 6.0, 12.0, 18.0]), _LIMBUS, _BACK])
 _IRIS = np.array([0, 1 / 4, 1 / 2, 2 / 3, 5 / 6, 1])  # shares of the iris' radius

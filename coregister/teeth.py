@@ -1,0 +1,465 @@
+"""Procedural teeth: fourteen closed crowns and one gum band per arch, all quads, metres.
+
+Sizes of the permanent teeth: Nelson and Ash, Wheeler's Dental Anatomy, table of measurements (crown length, mesiodistal
+and buccolingual diameters). Inclinations are those of the long axes to the normal of the occlusal plane. Teeth go by
+their FDI numbers: 1x upper right, 2x upper left, 3x lower left, 4x lower right; x = 1 central incisor .. 7 second
+molar.
+
+A tooth's own frame: m runs along the arch from mesial to distal, b outwards (to lip or cheek), h towards the tip, zero
+at the neck.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from coregister.parts import Part
+from registration.errors import InputError
+
+
+@dataclass(frozen=True, kw_only=True)
+class Crown:
+    """The form that teeth of one kind share. Grid: cells of the biting surface along m and along b, both even."""
+
+    cells: tuple[int, int]
+    # From root to rim: height (of the crown's), half width (of half the width), buccal and lingual surface (of half the
+    # depth), and the exponent of the superellipse: 2 is round, more is boxy. The root's height is in metres.
+    rings: tuple[tuple[float, float, float, float, float], ...]
+    falls: tuple[float, float]  # how much lower (of the height) the rim lies at its mesial and distal end
+    # The biting surface inside the rim, b the outer and m the inner index: m (of half the width), b (of half the
+    # depth), height (of the crown's).
+    top: tuple[tuple[float, float, float], ...]
+    taper: float  # how much narrower it is on its lingual side
+    tip: int  # which point of `top` is its landmark
+
+
+@dataclass(frozen=True, kw_only=True)
+class Tooth:
+    """One tooth's size in metres and its stance in the arch."""
+
+    crown: Crown
+    width: float  # mesiodistal
+    height: float  # of the crown
+    depth: float  # buccolingual
+    tilt: float  # degrees by which the tip leans outwards
+    reach: float  # of the tip beyond the occlusal plane, towards the other arch
+    offset: float = 0.0  # outwards from the line on which the teeth touch
+
+
+_INCISOR = Crown(
+    cells=(4, 2),
+    rings=(
+        (-3.0e-3, 0.55, 0.72, -0.72, 2.0),
+        (0.0, 0.74, 0.96, -0.96, 2.2),
+        (0.48, 0.93, 0.86, -0.40, 2.6),
+        (0.92, 1.00, 0.36, -0.16, 3.5),
+    ),
+    falls=(0.02, 0.06),
+    top=((-0.55, 0.12, 0.995), (0.0, 0.12, 1.0), (0.5, 0.12, 0.985)),
+    taper=0.30,
+    tip=1,
+)
+_CANINE = Crown(
+    cells=(4, 2),
+    rings=(
+        (-3.0e-3, 0.60, 0.80, -0.80, 2.0),
+        (0.0, 0.74, 0.96, -0.96, 2.1),
+        (0.45, 0.95, 0.92, -0.55, 2.3),
+        (0.84, 1.00, 0.48, -0.28, 2.6),
+    ),
+    falls=(0.17, 0.24),
+    top=((-0.48, 0.12, 0.87), (0.0, 0.12, 1.0), (0.48, 0.12, 0.83)),
+    taper=0.30,
+    tip=1,
+)
+_PREMOLAR = Crown(
+    cells=(2, 4),
+    rings=(
+        (-3.0e-3, 0.66, 0.72, -0.72, 2.0),
+        (0.0, 0.76, 0.86, -0.86, 2.2),
+        (0.42, 0.98, 1.00, -0.98, 2.4),
+        (0.80, 0.96, 0.78, -0.78, 2.6),
+    ),
+    falls=(0.06, 0.06),
+    top=((0.0, -0.46, 0.93), (0.0, -0.02, 0.74), (0.0, 0.50, 1.0)),
+    taper=0.18,
+    tip=2,
+)
+_MOLAR = Crown(
+    cells=(4, 4),
+    rings=(
+        (-3.0e-3, 0.74, 0.76, -0.76, 2.4),
+        (0.0, 0.82, 0.88, -0.88, 2.6),
+        (0.42, 0.99, 1.00, -1.00, 3.0),
+        (0.80, 0.94, 0.80, -0.80, 3.0),
+    ),
+    falls=(0.0, 0.02),
+    top=(
+        (-0.46, -0.48, 0.98),
+        (0.02, -0.50, 0.80),
+        (0.46, -0.46, 0.92),
+        (-0.55, 0.0, 0.80),
+        (0.0, 0.0, 0.70),
+        (0.52, 0.0, 0.78),
+        (-0.48, 0.50, 1.0),
+        (0.02, 0.54, 0.82),
+        (0.46, 0.50, 0.95),
+    ),
+    taper=0.08,
+    tip=6,
+)
+# From the midline outwards.
+UPPER = (
+    Tooth(crown=_INCISOR, width=8.5e-3, height=10.5e-3, depth=7.0e-3, tilt=24, reach=1.4e-3),
+    Tooth(crown=_INCISOR, width=6.5e-3, height=9.0e-3, depth=6.0e-3, tilt=22, reach=0.9e-3),
+    Tooth(crown=_CANINE, width=7.5e-3, height=10.0e-3, depth=8.0e-3, tilt=12, reach=1.4e-3, offset=0.4e-3),
+    Tooth(crown=_PREMOLAR, width=7.0e-3, height=8.5e-3, depth=9.0e-3, tilt=5, reach=-0.1e-3),
+    Tooth(crown=_PREMOLAR, width=7.0e-3, height=8.5e-3, depth=9.0e-3, tilt=4, reach=-0.1e-3),
+    Tooth(crown=_MOLAR, width=10.0e-3, height=7.5e-3, depth=11.0e-3, tilt=4, reach=-0.1e-3),
+    Tooth(crown=_MOLAR, width=9.0e-3, height=7.0e-3, depth=11.0e-3, tilt=6, reach=-0.1e-3),
+)
+LOWER = (
+    Tooth(crown=_INCISOR, width=5.0e-3, height=9.0e-3, depth=6.0e-3, tilt=14, reach=0.0),
+    Tooth(crown=_INCISOR, width=5.5e-3, height=9.5e-3, depth=6.5e-3, tilt=12, reach=0.0),
+    Tooth(crown=_CANINE, width=7.0e-3, height=11.0e-3, depth=7.5e-3, tilt=4, reach=0.2e-3),
+    Tooth(crown=_PREMOLAR, width=7.0e-3, height=8.5e-3, depth=7.5e-3, tilt=-2, reach=-0.1e-3),
+    Tooth(crown=_PREMOLAR, width=7.0e-3, height=8.0e-3, depth=8.0e-3, tilt=-5, reach=-0.1e-3),
+    Tooth(crown=_MOLAR, width=11.0e-3, height=7.5e-3, depth=10.5e-3, tilt=-8, reach=-0.1e-3),
+    Tooth(crown=_MOLAR, width=10.5e-3, height=7.0e-3, depth=10.0e-3, tilt=-8, reach=-0.1e-3),
+)
+FDI_UPPER = (17, 16, 15, 14, 13, 12, 11, 21, 22, 23, 24, 25, 26, 27)  # from the subject's right to left
+FDI_LOWER = (47, 46, 45, 44, 43, 42, 41, 31, 32, 33, 34, 35, 36, 37)
+
+OVERJET = 2.7e-3  # how far the line of the lower teeth lies inside that of the upper
+_GAP = 0.06e-3  # between neighbours
+_ARCH_EXPONENT = 2.4  # of the superellipse that the arch is in plan view
+_FRONT_INSET, _SIDE_INSET = 3.1e-3, 6.3e-3  # from the guide's outline to the line on which the teeth touch
+_LANDMARK_TEETH = (6, 3, 1)  # first molar, canine, central incisor
+
+
+@dataclass(frozen=True, kw_only=True)
+class Arch:
+    """Where the teeth stand: half a superellipse in the occlusal plane, on which the upper teeth touch each other."""
+
+    half_width: float  # x at the back
+    front: float  # z at the midline
+    back: float  # z where the arch is widest
+    height: float  # y of the occlusal plane at the front
+    slope: float  # by how much the occlusal plane rises per metre towards the back
+
+
+def arch(upper_guide: Float[np.ndarray, "S 3"], lower_guide: Float[np.ndarray, "R 3"]) -> Arch:
+    """The arch that fits coarse horseshoe strips around the upper and the lower teeth.
+
+    The strips' vertices count only as points. The plan is the upper strip's outline, moved inwards so that the teeth
+    keep clear of lips and cheeks; the occlusal plane lies midway between the upper strip's lower edge and the lower
+    strip's upper edge.
+
+    Raises:
+        InputError: a guide is no finite (S, 3) array, or the arch that it leaves has no room.
+    """
+    for name, guide in (("upper_guide", upper_guide), ("lower_guide", lower_guide)):
+        if guide.ndim != 2 or guide.shape[1] != 3 or len(guide) < 3 or not np.isfinite(guide).all():
+            raise InputError(
+                "this guide shows no dental arch",
+                where=name,
+                expected="finite points (S, 3), S >= 3, in metres",
+                got=f"an array of shape {guide.shape}",
+                fix="give the vertices of a strip around the teeth",
+            )
+    front = upper_guide[:, 2].max() - _FRONT_INSET
+    edges = np.array([_edge(upper_guide, -1), _edge(lower_guide, 1)])  # arch, front or back, (z, y)
+    slopes = (edges[:, 1, 1] - edges[:, 0, 1]) / (edges[:, 0, 0] - edges[:, 1, 0])
+    heights = edges[:, 0, 1] + slopes * (edges[:, 0, 0] - front)
+    made = Arch(
+        half_width=float(np.abs(upper_guide[:, 0]).max() - _SIDE_INSET),
+        front=float(front),
+        back=float(upper_guide[:, 2].min()),
+        height=float(heights.mean()),
+        slope=float(slopes.mean()),
+    )
+    if made.half_width < 0.01 or made.front - made.back < 0.02 or not np.isfinite(made.slope):
+        raise InputError(
+            "the guide leaves no room for teeth",
+            where="upper_guide",
+            expected="an arch more than 33 mm wide and 23 mm deep, closed towards +Z",
+            got=f"{made}",
+            fix="check its unit (metres) and its frame (+Y up, +Z out of the face)",
+        )
+    return made
+
+
+def upper(where: Arch, teeth: tuple[Tooth, ...] = UPPER) -> Part:
+    """The upper teeth and gums: 1106 vertices, the teeth in the order of `FDI_UPPER`, then the gums.
+
+    Teeth too wide for the arch are scaled to fit it, all alike. Groups: `teeth`, `gums`, `upper_teeth_and_gums`. In the
+    uv map each tooth is unfolded from its tip into a chart of its own, with its root's end in a corner; the gum is a
+    strip.
+    """
+    return _part(_stand(where, teeth, up=True), "upper_teeth_and_gums")
+
+
+def lower(where: Arch, teeth: tuple[Tooth, ...] = LOWER) -> Part:
+    """The lower teeth and gums, as `upper`, in the order of `FDI_LOWER` and within the upper arch by `OVERJET`."""
+    return _part(_stand(where, teeth, up=False), "lower_teeth_and_gums")
+
+
+def tooth_vertices(part: Part) -> Mapping[int, Int[np.ndarray, "N"]]:
+    """FDI number -> the vertices of that tooth, from the subject's right to left; of a part made with default teeth."""
+    names, teeth = (FDI_UPPER, UPPER) if "upper_teeth_and_gums" in part.groups else (FDI_LOWER, LOWER)
+    sizes = [_crown_size(tooth.crown) for tooth in (*teeth[::-1], *teeth)]
+    ends = np.cumsum(sizes)
+    return {name: np.arange(end - size, end) for name, size, end in zip(names, sizes, ends, strict=True)}
+
+
+def tips(part: Part) -> Mapping[int, int]:
+    """FDI number -> the landmark vertex of six teeth, from the subject's right to left: first molar (its mesiobuccal
+    cusp), canine (its tip), central incisor (the middle of its edge), and the same on the left."""
+    teeth = UPPER if "upper_teeth_and_gums" in part.groups else LOWER
+    found = {}
+    for name, vertices in tooth_vertices(part).items():
+        crown = teeth[name % 10 - 1].crown
+        if name % 10 in _LANDMARK_TEETH:
+            found[name] = int(vertices[4 * _around(crown) + crown.tip])
+    return found
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Stance:
+    """The left half of an arch, T teeth from the midline outwards: a tooth's tip, the axes of its frame, its size."""
+
+    teeth: tuple[Tooth, ...]
+    scale: float  # of all sizes
+    up: bool  # the upper arch, whose tips point down; its frames are right-handed
+    tip: Float[np.ndarray, "T 3"]
+    m: Float[np.ndarray, "T 3"]
+    b: Float[np.ndarray, "T 3"]
+    h: Float[np.ndarray, "T 3"]
+
+
+def _stand(where: Arch, teeth: tuple[Tooth, ...], *, up: bool) -> _Stance:
+    turn = np.linspace(0, np.pi / 2, 2001)
+    line = np.stack([np.sin(turn), np.cos(turn)], 1) ** (2 / _ARCH_EXPONENT)
+    line = line * [where.half_width, where.front - where.back] + [0, where.back]  # (x, z)
+    if not up:
+        along = np.gradient(line, axis=0)
+        along /= np.linalg.norm(along, axis=1, keepdims=True)
+        along[0] = [1, 0]
+        line = line + OVERJET * along[:, ::-1] * [1, -1]
+    length = np.linalg.norm(np.diff(line, axis=0), axis=1).sum()
+    scale = min(1.0, length / sum(tooth.width for tooth in teeth))
+    contacts = [np.array([0, line[0, 1]])]
+    for tooth in teeth:
+        contacts.append(_step(line, contacts[-1], scale * tooth.width))
+    points = np.array([[x, where.height + where.slope * (where.front - z), z] for x, z in contacts])
+    normal = np.array([0, 1, where.slope]) / np.hypot(1, where.slope)
+    m = np.diff(points, axis=0)
+    m /= np.linalg.norm(m, axis=1, keepdims=True)
+    out = np.cross(m, normal)
+    along_h = -normal if up else normal
+    tilt = np.radians([tooth.tilt for tooth in teeth])[:, None]
+    reach, offset = (scale * np.array([getattr(t, name) for t in teeth])[:, None] for name in ("reach", "offset"))
+    return _Stance(
+        teeth=teeth,
+        scale=scale,
+        up=up,
+        tip=(points[1:] + points[:-1]) / 2 + offset * out + reach * along_h,
+        m=m,
+        b=np.cos(tilt) * out - np.sin(tilt) * along_h,
+        h=np.cos(tilt) * along_h + np.sin(tilt) * out,
+    )
+
+
+def _step(line: Float[np.ndarray, "P 2"], start: Float[np.ndarray, "2"], width: float) -> Float[np.ndarray, "2"]:
+    """The next point on a line that is `width` away from `start`; beyond the line's end, straight on."""
+    line = np.concatenate(
+        [line, line[-1:] + 2 * width * (line[-1:] - line[-2:-1]) / np.linalg.norm(line[-1] - line[-2])]
+    )
+    distance = np.linalg.norm(line - start, axis=1)
+    nearest = int(distance.argmin())
+    after = nearest + int(np.argmax(distance[nearest:] >= width))
+    before = line[after - 1] - start
+    along = line[after] - line[after - 1]
+    # |before + t along| = width
+    a, half, c = along @ along, before @ along, before @ before - width**2
+    return line[after - 1] + along * (-half + np.sqrt(half**2 - a * c)) / a
+
+
+def _edge(guide: Float[np.ndarray, "S 3"], sign: int) -> Float[np.ndarray, "2 2"]:
+    """(z, y) of a guide's lowest (sign -1) or highest (1) point, in the front and in the back third of its depth."""
+    share = (guide[:, 2] - guide[:, 2].min()) / np.ptp(guide[:, 2])
+    thirds = [guide[share >= 2 / 3], guide[share <= 1 / 3]]
+    return np.stack([points[np.argmax(sign * points[:, 1]), 2:0:-1] for points in thirds])
+
+
+def _around(crown: Crown) -> int:
+    return 2 * sum(crown.cells)
+
+
+def _crown_size(crown: Crown) -> int:
+    return 4 * _around(crown) + len(crown.top) + 1
+
+
+def _grid(cells: tuple[int, int]) -> tuple[Float[np.ndarray, "N 2"], Float[np.ndarray, "K 2"], Int[np.ndarray, "Q 4"]]:
+    """A square of cells over [-1, 1]^2: its border counter-clockwise from (-1, -1), its inner points, and its quads,
+    whose indices count the border first."""
+    columns, rows = cells
+    i, j = np.arange(columns), np.arange(rows)
+    border = np.concatenate(
+        [
+            np.stack([i, 0 * i], 1),
+            np.stack([0 * j + columns, j], 1),
+            np.stack([columns - i, 0 * i + rows], 1),
+            np.stack([0 * j, rows - j], 1),
+        ]
+    )
+    inner = np.stack(np.meshgrid(i[1:], j[1:]), -1).reshape(-1, 2)
+    points = np.concatenate([border, inner])
+    number = np.empty((columns + 1, rows + 1), int)
+    number[points[:, 0], points[:, 1]] = np.arange(len(points))
+    quads = np.stack([number[:-1, :-1], number[1:, :-1], number[1:, 1:], number[:-1, 1:]], -1).reshape(-1, 4)
+    return 2 * border / cells - 1, 2 * inner / cells - 1, quads
+
+
+def _crown_vertices(tooth: Tooth) -> Float[np.ndarray, "V 3"]:
+    """A tooth in its own frame (m, b, h), the tip at the origin: rings from root to rim, the biting surface's inner
+    points, the root's end."""
+    crown, half_width, half_depth = tooth.crown, tooth.width / 2, tooth.depth / 2
+    border, _, _ = _grid(crown.cells)
+    mesial, distal = crown.falls
+    rings = []
+    for index, (height, width, buccal, lingual, exponent) in enumerate(crown.rings):
+        section = border / (np.abs(border) ** exponent).sum(1, keepdims=True) ** (1 / exponent)
+        m = width * section[:, 0] * (1 + crown.taper * np.minimum(section[:, 1], 0))
+        b = (buccal + lingual) / 2 + (buccal - lingual) / 2 * section[:, 1]
+        h = np.full(len(m), height if index == 0 else height * tooth.height)
+        if index == len(crown.rings) - 1:
+            h -= tooth.height * border[:, 0] ** 2 * np.where(border[:, 0] < 0, mesial, distal)
+        rings.append(np.stack([m * half_width, b * half_depth, h], 1))
+    top = np.array(crown.top) * [half_width, half_depth, tooth.height]
+    end = [[0, 0, rings[0][0, 2] - 0.2 * half_width]]
+    return np.concatenate([*rings, top, end]) - [0, 0, tooth.height]
+
+
+def _crown_quads(crown: Crown) -> Int[np.ndarray, "Q 4"]:
+    """Counter-clockwise seen from outside in a right-handed frame (m, b, h)."""
+    around = _around(crown)
+    k = np.arange(around)
+    after = (k + 1) % around
+    sides = [around * r + np.stack([k, after, around + after, around + k], 1) for r in range(3)]
+    even, end = k[::2], np.full(around // 2, _crown_size(crown) - 1)
+    root = np.stack([end, (even + 2) % around, even + 1, even], 1)
+    return np.concatenate([*sides, 3 * around + _grid(crown.cells)[2], root])
+
+
+def _crown_chart(crown: Crown) -> Float[np.ndarray, "Q 4 2"]:
+    """The uvs of `_crown_quads` in [-0.5, 0.5]^2: a disc about the tip, the root's end in the corner beside it."""
+    border, inner, _ = _grid(crown.cells)
+    directions = border / np.linalg.norm(border, axis=1, keepdims=True)
+    disc = np.concatenate([*(radius * directions for radius in (0.42, 0.37, 0.28, 0.18)), 0.18 * inner, [[0, 0]]])
+    corner = 0.385 + 0.09 * np.concatenate([directions, [[0, 0]]]) * [-1, 1]
+    quads = _crown_quads(crown)
+    uvs = disc[quads]
+    roots = quads[quads[:, 0] == len(disc) - 1]
+    uvs[len(quads) - len(roots) :] = corner[np.where(roots == len(disc) - 1, len(border), roots)]
+    return uvs
+
+
+_SECTION = 10  # vertices around the gum
+# The gum's cross-section from its crest over the buccal side to its base and back: how far out from the middle of the
+# necks (1 = the neck's surface), plus metres outwards, and metres along h. Behind a tooth, and between two.
+_GUM_AT_TOOTH = ((0, 0, -0.5), (0.9, 0, 0.7), (1, 0.5, -0.2), (1, 0.9, -3.2), (0.9, -0.4, -6), (0, 0, -7))
+_GUM_BETWEEN = ((0, 0, 2.8), (0.55, 0, 2.4), (0.9, 0, 0.9), (1, 0.5, -2.8), (0.9, -0.6, -6), (0, 0, -7))
+
+
+def _gum_vertices(stance: _Stance) -> Float[np.ndarray, "G 3"]:
+    """The gum's cross-sections from the subject's right to left: at each tooth, between neighbours and at both ends."""
+    sections = []
+    necks = []  # per tooth: middle of its mesial and distal side and its centre at the neck, half depth there
+    for i, tooth in enumerate(stance.teeth):
+        centre = stance.tip[i] - stance.scale * tooth.height * stance.h[i]
+        half = stance.scale * tooth.width / 2 * stance.m[i]
+        necks.append((centre, half, stance.scale * tooth.depth / 2 * tooth.crown.rings[1][2]))
+    for i in range(len(necks)):
+        centre, half, depth = necks[i]
+        before = necks[i - 1] if i else (centre * [-1, 1, 1], half * [1, -1, -1], depth)
+        b_before, h_before = (stance.b[i - 1], stance.h[i - 1]) if i else (stance.b[0], stance.h[0])
+        middle = (centre - half + before[0] + before[1]) / 2
+        b, h = stance.b[i] + b_before, stance.h[i] + h_before
+        if i == 0:
+            b, h, middle = b * [0, 1, 1], h * [0, 1, 1], middle * [0, 1, 1]
+        b, h = b / np.linalg.norm(b), h / np.linalg.norm(h)
+        sections.append(_gum_section(_GUM_BETWEEN, middle, b, h, (depth + before[2]) / 2))
+        sections.append(_gum_section(_GUM_AT_TOOTH, centre, stance.b[i], stance.h[i], depth))
+    end = centre + half + 1.2e-3 * stance.m[-1]
+    sections.append(_gum_section(_GUM_BETWEEN, end, stance.b[-1], stance.h[-1], 0.8 * depth))
+    left = np.stack(sections)
+    return np.concatenate([left[:0:-1] * [-1, 1, 1], left]).reshape(-1, 3)
+
+
+def _gum_section(
+    rows: tuple[tuple[float, float, float], ...],
+    middle: Float[np.ndarray, "3"],
+    b: Float[np.ndarray, "3"],
+    h: Float[np.ndarray, "3"],
+    depth: float,
+) -> Float[np.ndarray, "N 3"]:
+    share, out, along = (np.array([*rows, *rows[-2:0:-1]]) * [1, 1e-3, 1e-3]).T
+    side = np.where(np.arange(len(share)) < len(rows), 1, -1)
+    return middle + (side * (share * depth + out))[:, None] * b + along[:, None] * h
+
+
+def _gum_quads(stations: int) -> tuple[Int[np.ndarray, "Q 4"], Float[np.ndarray, "Q 4 2"]]:
+    """The band's quads, right-handed as the crowns', and their uvs: a strip below v = 0.3, its two ends above that."""
+    s, k = np.meshgrid(np.arange(stations - 1), np.arange(_SECTION), indexing="ij")
+    after = (k + 1) % _SECTION
+    number = _SECTION * s
+    band = np.stack([number + k, number + _SECTION + k, number + _SECTION + after, number + after], -1).reshape(-1, 4)
+    u = 0.02 + 0.96 * np.stack([s, s + 1, s + 1, s], -1) / (stations - 1)
+    v = 0.02 + 0.28 * np.stack([k, k, k + 1, k + 1], -1) / _SECTION
+    ladder = np.array([[0, 1, 2, 9], [9, 2, 3, 8], [8, 3, 4, 7], [7, 4, 5, 6]])
+    turn = 2 * np.pi * np.arange(_SECTION) / _SECTION
+    circle = 0.03 * np.stack([np.cos(turn), np.sin(turn)], 1)
+    first, last = ladder, ladder[:, ::-1]
+    uvs = [np.stack([u, v], -1).reshape(-1, 4, 2), [0.05, 0.35] + circle[first], [0.15, 0.35] + circle[last] * [-1, 1]]
+    return np.concatenate([band, first, last + _SECTION * (stations - 1)]), np.concatenate(uvs)
+
+
+def _part(stance: _Stance, name: str) -> Part:
+    """Crowns from right to left, then the gum, with everything on the right the exact mirror image of the left."""
+    vertices, quads, uvs, mirror = [], [], [], []
+    count = len(stance.teeth)
+    sizes = [_crown_size(tooth.crown) for tooth in (*stance.teeth[::-1], *stance.teeth)]
+    starts = np.cumsum([0, *sizes])
+    for place in range(2 * count):
+        left = place >= count
+        i = place - count if left else count - 1 - place
+        tooth = stance.teeth[i]
+        local = stance.scale * _crown_vertices(tooth)
+        made = stance.tip[i] + local @ np.stack([stance.m[i], stance.b[i], stance.h[i]])
+        right_handed = left == stance.up
+        vertices.append(made if left else made * [-1, 1, 1])
+        chart = _crown_chart(tooth.crown) * [1 if right_handed else -1, 1]
+        cell = np.array([0.1 + 0.2 * (place % 5), 0.9 - 0.2 * (place // 5)])
+        turn = 1 if right_handed else -1
+        quads.append(starts[place] + _crown_quads(tooth.crown)[:, ::turn])
+        uvs.append(cell + 0.2 * chart[:, ::turn])
+        mirror.append(starts[2 * count - 1 - place] + np.arange(sizes[place]))
+    gum = _gum_vertices(stance)
+    stations = len(gum) // _SECTION
+    gum_quads, gum_uvs = _gum_quads(stations)
+    turn = 1 if stance.up else -1
+    vertices.append(gum)
+    quads.append(starts[-1] + gum_quads[:, ::turn])
+    uvs.append((gum_uvs if stance.up else [0, 0.4] + gum_uvs * [1, -1])[:, ::turn])
+    mirror.append(starts[-1] + np.arange(len(gum)).reshape(stations, _SECTION)[::-1].ravel())
+    is_gum = np.arange(starts[-1] + len(gum)) >= starts[-1]
+    return Part(
+        vertices=np.concatenate(vertices),
+        quads=np.concatenate(quads),
+        quad_uvs=np.concatenate(uvs),
+        groups={"teeth": ~is_gum, "gums": is_gum, name: np.ones(len(is_gum), bool)},
+        mirror=np.concatenate(mirror),
+    )
