@@ -21,11 +21,12 @@ from registration.model.landmarks import LandmarkScheme
 from registration.model.regions import CLASSES, exterior, group, neck_other, vertex_classes
 from registration.render import backend
 from registration.render.studio import Quality, Sensor, distorted_pixels, seen, shoot
+from registration.render.studio_canvas import Canvas, canvas
 from registration.render.studio_eyes import corneas
 from registration.render.studio_light import Sky
 from registration.render.studio_rig import SPREAD_DEG, rig
 from registration.render.studio_scene import StudioScene, StudioSurface, subdivided
-from registration.render.studio_skin import Canvas, Look, canvas, paint
+from registration.render.studio_skin import Look, paint
 from registration.types import Camera
 
 NECK, HAIR, CLOTHES = "neck_other", "hair", "clothes"

@@ -1,4 +1,4 @@
-"""The eyes of a head model as a painter and a photographer need them: axis, radii, and which faces are cornea."""
+"""The eyes of a head model as painter and photographer need them: axis, radii, albedo, and which faces are cornea."""
 
 from dataclasses import dataclass
 
@@ -7,6 +7,8 @@ from jaxtyping import Bool, Float
 
 from registration.model.gnm_npz import GNMData
 from registration.model.regions import group
+from registration.render.solid_noise import SolidNoise
+from registration.render.studio_canvas import smoothstep
 
 SIDES = ("left_eye", "right_eye")
 _INSIDE = 0.5
@@ -71,3 +73,35 @@ def corneas(data: GNMData) -> Bool[np.ndarray, "F"]:
             clear[own] = (height > 0) & (away < _REACH * frame.iris_radius)
     # Any corner: the rim's faces would else hang over the iris. The inner shell's sclera lies right below them.
     return clear[data.triangles].any(1)
+
+
+def paint_eye(
+    frame: EyeFrame, points: Float[np.ndarray, "T 3"], iris: tuple[float, float, float], seed: int
+) -> Float[np.ndarray, "T 3"]:
+    """Linear albedo of points on an eye (template, m), on either shell. A Mitsuba variant must be active."""
+    height, away, angle = frame.polar(points.astype(np.float64))
+    noise = SolidNoise(points)
+    white = np.array([0.78, 0.74, 0.70]) * (1 + 0.03 * noise.smooth(0.004, 100 * seed + 40))[:, None]
+    # Veins: where a noise crosses zero; they thin out towards the iris.
+    crossing = np.abs(noise.smooth(0.0035, 100 * seed + 41, octaves=3))
+    veins = smoothstep(0.16, 0.0, crossing) * smoothstep(1.1, 2.2, away / frame.iris_radius)
+    white *= 1 - veins[:, None] * np.array([0.05, 0.38, 0.36])
+    flush = smoothstep(1.5, 2.6, away / frame.iris_radius)[:, None]
+    white *= 1 - flush * np.array([0.05, 0.16, 0.18])
+
+    t = np.clip((away - frame.pupil_radius) / (frame.iris_radius - frame.pupil_radius), 0, 1)
+    # Fibres run from the pupil to the rim: noise over the angle, drawn out along the radius.
+    ring = np.stack([np.cos(angle), np.sin(angle), 0.35 * t], 1) * 0.02
+    fibres = SolidNoise(ring)
+    pattern = 0.20 * fibres.smooth(0.0022, 100 * seed + 42, octaves=3) + 0.16 * fibres.smooth(0.008, 100 * seed + 43)
+    shade = (1 + pattern) * (1.15 - 0.45 * smoothstep(0.55, 1.0, t)) * (0.75 + 0.25 * smoothstep(0.0, 0.12, t))
+    warm = smoothstep(0.42, 0.12, t + 0.06 * pattern)[:, None] * np.array([0.10, 0.035, -0.03])
+    coloured = np.maximum(np.array(iris) + 0.6 * warm, 0.01) * np.maximum(shade, 0.2)[:, None]
+    limbus = smoothstep(0.80, 1.0, t)[:, None]
+    coloured *= 1 - 0.75 * limbus
+    edge = 0.06 * frame.iris_radius
+    inside = smoothstep(frame.iris_radius + 1.5 * edge, frame.iris_radius - edge, away) * (height > 0)
+    pupil = smoothstep(frame.pupil_radius + edge, frame.pupil_radius - 0.4 * edge, away) * (height > 0)
+    colour = white + inside[:, None] * (coloured - white)
+    colour += pupil[:, None] * (0.006 - colour)
+    return np.clip(colour, 0, 0.95).astype(np.float32)

@@ -1,74 +1,235 @@
-"""A painted head: albedo in the model's atlas, made from solid noise at *template* positions.
+"""A painted head: linear albedo in the model's atlas, made from solid noise at *template* positions.
 
-A solid texture has no seams and sticks to the surface under every identity and expression.
+A solid texture has no seams and sticks to the surface under every identity and expression. Skin takes its colour from
+two pigments, melanin and haemoglobin (after Tsumura et al. 2003), each with its own variation.
 """
 
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float
+from scipy.spatial import cKDTree
 
-from registration.geometry.raster import rasterize
-from registration.model.atlas import texture_atlas
 from registration.model.gnm_npz import GNMData
-from registration.types import Camera
+from registration.model.regions import exterior, group
+from registration.render.solid_noise import SolidNoise
+from registration.render.studio_canvas import Canvas, smoothstep, soft_group, softened, texture_of
+from registration.render.studio_eyes import SIDES, eye_frame, paint_eye
+
+_UNPIGMENTED = np.array([0.86, 0.78, 0.70])
+_MELANIN = np.array([0.42, 0.76, 1.18])  # absorption per unit
+_BLOOD = np.array([0.10, 0.66, 0.60])
+_FLUSHED = {  # groups with more blood, and how much
+    "nose_region": 0.22,
+    "left_cheek_region": 0.12,
+    "right_cheek_region": 0.12,
+    "left_infraorbital_region": 0.22,
+    "right_infraorbital_region": 0.22,
+    "ears": 0.30,
+    "chin_region": 0.10,
+    "left_orbital_region": 0.08,
+    "right_orbital_region": 0.08,
+}
+_STUBBLED = ("chin_region", "upper_lip_region", "lower_lip_region", "left_cheek_region", "right_cheek_region")
+_BROW_M = 0.0048  # half its height where it is fullest
+_BROW_HAIRS, _HAIR_M, _STRAND_M = 420, 0.0075, 0.00020  # number, length, half a hair's width
 
 
 @dataclass(frozen=True, kw_only=True)
 class Look:
-    """What a head is painted with."""
+    """What a head is painted with. Colours are linear albedo."""
 
     seed: int = 0
+    melanin: float = 0.45  # 0.2 very light to 2.2 very dark
+    blood: float = 0.30
+    unevenness: float = 1.0  # of the pigments; 0 is porcelain
+    freckles: float = 0.35  # 0 to 1
+    stubble: float = 0.25  # 0 to 1
+    hair: tuple[float, float, float] = (0.055, 0.032, 0.018)
+    iris: tuple[float, float, float] = (0.16, 0.21, 0.20)
+
+    @classmethod
+    def drawn(cls, seed: int) -> "Look":
+        """One of many people."""
+        rng = np.random.default_rng([seed, 5])
+        melanin = float(rng.uniform(0.25, 2.0))
+        fair = rng.random() < 0.6 * max(0.0, 1 - melanin / 0.8)  # light hair and eyes go with light skin
+        darkness = rng.uniform(0.6, 1.4)
+        hair = np.array([0.16, 0.10, 0.045] if fair else [0.045, 0.027, 0.016]) * darkness
+        brown, light = np.array([0.085, 0.045, 0.02]), np.array([0.16, 0.21, 0.22]) * rng.uniform(0.7, 1.2, 3)
+        return cls(
+            seed=seed,
+            melanin=melanin,
+            blood=float(rng.uniform(0.2, 0.4)),
+            freckles=float(rng.uniform(0, 0.8) * np.exp(-melanin)),
+            stubble=float(max(0.0, rng.uniform(-0.5, 0.8))),
+            hair=(float(hair[0]), float(hair[1]), float(hair[2])),
+            iris=tuple((light if fair or rng.random() < 0.2 else brown * darkness).tolist()),
+        )
 
 
-@dataclass(frozen=True, kw_only=True)
-class Canvas:
-    """Where every texel of an atlas lies on the template. T texels are covered by faces."""
+def scalp(data: GNMData) -> Float[np.ndarray, "V"]:
+    """How far (m) a vertex of the template lies inside the hairline; negative outside it.
 
-    size: int
-    texel: Int[np.ndarray, "T"]  # row * size + column; row 0 is at v = 1
-    corners: Int[np.ndarray, "T 3"]  # vertices
-    weights: Float[np.ndarray, "T 3"]
-
-    def interpolate(self, values: Float[np.ndarray, "V *D"]) -> Float[np.ndarray, "T *D"]:
-        """Vertices' values at the covered texels, float32."""
-        values = values.astype(np.float32)
-        trailing = (1,) * (values.ndim - 1)
-        return sum(self.weights[:, k].reshape(-1, *trailing) * values[self.corners[:, k]] for k in range(3))
-
-    def filled(self, colours: Float[np.ndarray, "T 3"]) -> Float[np.ndarray, "R R 3"]:
-        """A texture of covered texels; the others take the nearest one's colour, so that no lookup meets a gap."""
-        texture = np.zeros((self.size * self.size, 3), np.float32)
-        texture[self.texel] = colours
-        empty = np.ones(self.size * self.size, np.uint8)
-        empty[self.texel] = 0
-        labels = cv2.distanceTransformWithLabels(
-            empty.reshape(self.size, self.size), cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL
-        )[1].ravel()
-        source = np.zeros(labels.max() + 1, np.int64)
-        source[labels[self.texel]] = self.texel
-        return texture[source[labels]].reshape(self.size, self.size, 3)
-
-
-def canvas(data: GNMData, size: int = 2048) -> Canvas:
-    """The canvas of a model's texture atlas."""
-    uvs = texture_atlas(data).astype(np.float64).reshape(-1, 2)
-    # A flat mesh at z = 1 seen by a camera whose pixels are the texels.
-    flat = np.column_stack([uvs[:, 0], 1 - uvs[:, 1], np.ones(len(uvs))])
-    lens = np.diag([size, size, 1.0])
-    page = Camera(width_px=size, height_px=size, intrinsics=lens, T_cam_world=np.eye(4))
-    face, weights = rasterize(flat, np.arange(len(flat)).reshape(-1, 3), page)
-    texel = np.flatnonzero(face.ravel() >= 0)
-    return Canvas(
-        size=size,
-        texel=texel,
-        corners=data.triangles[face.ravel()[texel]].astype(np.int64),
-        weights=weights.reshape(-1, 3)[texel].astype(np.float32),
-    )
+    Hair grows on the outer skin above the ears' lower rim and clear of the face mask and the ears.
+    """
+    points = data.template_vertex_positions.astype(np.float64)
+    face, ears = (group(data, name) > 0.5 for name in ("hockey_mask", "ears"))
+    to_face = cKDTree(points[face]).query(points)[0]
+    to_ears = cKDTree(points[ears]).query(points)[0] if ears.any() else np.full(len(points), np.inf)
+    nape = points[ears, 1].min() if ears.any() else points[face, 1].mean()
+    reach = np.minimum(np.minimum(to_face - 0.002, to_ears - 0.003), points[:, 1] - nape)
+    return np.where(exterior(data) & ~face & ~ears, reach, np.minimum(reach, -0.002))
 
 
 def paint(data: GNMData, page: Canvas, look: Look) -> Float[np.ndarray, "R R 3"]:
-    """The head's linear albedo."""
-    colour = np.tile(np.array([0.6, 0.42, 0.33], np.float32), (len(page.texel), 1))
-    return page.filled(colour)
+    """The head's linear albedo on the canvas of its atlas. A Mitsuba variant must be active."""
+    template = data.template_vertex_positions
+    colours = np.zeros((page.size * page.size, 3), np.float32)
+    names = data.mesh_component_names.tolist()
+    for name in names:
+        part = page.only(group(data, name) > 0.5)
+        points = part.interpolate(template)
+        if name in SIDES:
+            colours[part.texel] = paint_eye(eye_frame(data, name), points, look.iris, look.seed)
+        elif name == "skin":
+            colours[part.texel] = _skin(data, part, points, look)
+        else:
+            colours[part.texel] = _mouth(data, part, points, look.seed)
+    return texture_of(page.size, page.texel, colours[page.texel])
+
+
+def _skin(data: GNMData, page: Canvas, points: Float[np.ndarray, "T 3"], look: Look) -> Float[np.ndarray, "T 3"]:
+    noise, seed, uneven = SolidNoise(points), 100 * look.seed, look.unevenness
+    melanin = 1 + uneven * (
+        0.10 * noise.smooth(0.055, seed + 1)
+        + 0.07 * noise.smooth(0.016, seed + 2, octaves=2)
+        + 0.06 * noise.smooth(0.0035, seed + 3, octaves=2)
+    )
+    blood = 1 + uneven * (
+        0.16 * noise.smooth(0.040, seed + 4)
+        + 0.14 * noise.smooth(0.010, seed + 5, octaves=2)
+        + 0.12 * noise.smooth(0.0028, seed + 6, octaves=2)
+    )
+    melanin = look.melanin * np.clip(melanin, 0.3, 2) + look.freckles * _freckles(noise, seed)
+    melanin += _moles(noise, seed)
+    blood = look.blood * np.clip(blood, 0.2, 2.5)
+    for name, more in _FLUSHED.items():
+        blood += (
+            more * page.interpolate(soft_group(data, name, 14)) * (1 + 0.25 * uneven * noise.smooth(0.012, seed + 7))
+        )
+    lips = _lips(data, page)
+    wrinkles = noise.smooth(0.0011, seed + 8, octaves=2)
+    blood = blood * (1 - lips) + lips * (0.95 + 0.10 * wrinkles)
+    melanin = melanin * (1 - lips) + lips * (0.55 * look.melanin + 0.08)
+    lining = page.interpolate(1.0 * ~exterior(data)) * (1 - page.interpolate(soft_group(data, "eye_sockets", 1)))
+    blood += 0.9 * lining
+    colour = _UNPIGMENTED * np.exp(-melanin[:, None] * _MELANIN - blood[:, None] * _BLOOD)
+    colour *= _pores(noise, seed, uneven * (1 - lips))[:, None]
+    for cover, darkness in (
+        (_stubble(data, page, noise, look), 0.75),
+        (_lashes(data, page, points), 0.85),
+        (_brows(data, page, points, look.seed), 0.94),
+    ):
+        colour += (cover * darkness)[:, None] * (np.array(look.hair) - colour)
+    return colour.astype(np.float32)
+
+
+def _freckles(noise: SolidNoise, seed: int) -> Float[np.ndarray, "T"]:
+    distance, number = noise.dots(0.0062, seed + 20)
+    size = 0.0006 + 0.0012 * number
+    patchy = smoothstep(-0.6, 1.2, noise.smooth(0.035, seed + 21))
+    return 0.55 * smoothstep(1.1, 0.3, distance / size) * (number > 0.35) * patchy
+
+
+def _moles(noise: SolidNoise, seed: int) -> Float[np.ndarray, "T"]:
+    distance, number = noise.dots(0.030, seed + 22)
+    size = 0.0008 + 0.0016 * (number % 0.1) * 10
+    return 1.6 * smoothstep(1.15, 0.75, distance / size) * (number > 0.55)
+
+
+def _pores(noise: SolidNoise, seed: int, strength: Float[np.ndarray, "T"]) -> Float[np.ndarray, "T"]:
+    """What shade is left by pores of half a millimetre and the fine lines between them."""
+    distance, number = noise.dots(0.0014, seed + 23)
+    pore = smoothstep(0.00048, 0.00010, distance) * (0.35 + 0.65 * number)
+    grain = noise.smooth(0.0009, seed + 24, octaves=2)
+    return np.clip(1 - strength * (0.20 * pore + 0.028 * grain), 0.3, 1.2)
+
+
+def _lips(data: GNMData, page: Canvas) -> Float[np.ndarray, "T"]:
+    both = np.maximum(group(data, "upper_lip"), group(data, "lower_lip")).astype(np.float64)
+    # The mouth's lining continues the lips, so that they do not fade where they meet.
+    inner = np.maximum(both, group(data, "mouth_sock"))
+    return smoothstep(0.32, 0.68, page.interpolate(softened(data, inner, 3)))
+
+
+def _stubble(data: GNMData, page: Canvas, noise: SolidNoise, look: Look) -> Float[np.ndarray, "T"]:
+    if look.stubble <= 0:
+        return np.zeros(len(page.texel), np.float32)
+    beard = np.max([soft_group(data, name, 6) for name in _STUBBLED], axis=0)
+    lips = np.max([soft_group(data, name, 2) for name in ("upper_lip", "lower_lip")], axis=0)
+    beard = softened(data, beard * (1 - np.clip(3 * lips, 0, 1)), 4) * (1 - np.clip(3 * lips, 0, 1))
+    distance, number = noise.dots(0.0011, 100 * look.seed + 25)
+    hairs = smoothstep(0.00042, 0.00012, distance) * (0.4 + 0.6 * number)
+    return look.stubble * page.interpolate(beard) * (0.25 + 0.75 * hairs) * 0.8
+
+
+def _lashes(data: GNMData, page: Canvas, points: Float[np.ndarray, "T 3"]) -> Float[np.ndarray, "T"]:
+    """A dark line along the lids' rims, fuller above the eye."""
+    rim = page.interpolate(soft_group(data, "eye_sockets", 1))
+    line = smoothstep(0.12, 0.30, rim) * smoothstep(0.85, 0.55, rim)
+    heights = [eye_frame(data, side).centre[1] for side in SIDES]
+    above = smoothstep(-0.004, 0.002, points[:, 1] - np.float32(np.mean(heights)))
+    return line * (0.25 + 0.75 * above)
+
+
+def _brows(data: GNMData, page: Canvas, points: Float[np.ndarray, "T 3"], seed: int) -> Float[np.ndarray, "T"]:
+    """Short strokes along an arc through each brow region, drawn in the arc's own plane."""
+    cover = np.zeros(len(points), np.float32)
+    template = data.template_vertex_positions.astype(np.float64)
+    for number, (name, sign) in enumerate((("left_brow_region", 1.0), ("right_brow_region", -1.0))):
+        region = template[group(data, name) > 0.5] * (sign, 1, 1)
+        if len(region) < 3:
+            continue
+        degree = min(2, len(np.unique(region[:, 0].round(4))) - 1)
+        arc, depth = np.polyfit(region[:, 0], region[:, 1], degree), np.polyfit(region[:, 0], region[:, 2], degree)
+        x = np.linspace(region[:, 0].min(), region[:, 0].max(), 64)
+        y = np.polyval(arc, x) + 0.12 * np.ptp(region[:, 1])
+        along = np.r_[0, np.cumsum(np.linalg.norm(np.diff([x, y, np.polyval(depth, x)], axis=1), axis=0))]
+        near = np.flatnonzero(page.interpolate(soft_group(data, name, 2)) > 0.02)
+        own = points[near] * (sign, 1, 1)
+        flat = np.stack([np.interp(own[:, 0], x, along), own[:, 1] - np.interp(own[:, 0], x, y)], 1)
+        cover[near] = np.maximum(cover[near], _strokes(flat, along[-1], np.random.default_rng([seed, 6, number])))
+    return cover
+
+
+def _strokes(places: Float[np.ndarray, "N 2"], length: float, rng: np.random.Generator) -> Float[np.ndarray, "N"]:
+    """How much hair covers places along and across a brow of some length (m)."""
+    s = rng.uniform(0.02, 0.93, _BROW_HAIRS)
+    width = _BROW_M * np.sin(np.pi * np.clip(0.18 + 0.82 * s, 0, 1)) ** 0.7 * (1 - 0.45 * s)
+    t = width * rng.uniform(-1, 1, _BROW_HAIRS)
+    # Upwards at the nose, then along the brow, and the upper hairs lean down onto the lower ones.
+    turn = np.radians(62 * (1 - s) ** 1.5 + 6 - 22 * s * (t / _BROW_M) + rng.normal(0, 9, _BROW_HAIRS))
+    reach = _HAIR_M * rng.uniform(0.6, 1.1, _BROW_HAIRS) * np.where(s < 0.1, 0.7, 1)
+    step = np.linspace(0, 1, 40)
+    bend = turn[:, None] - np.radians(18) * step
+    x = (s * length)[:, None] + reach[:, None] * np.cumsum(np.cos(bend), 1) / 40
+    y = (t - 0.25 * width)[:, None] + reach[:, None] * np.cumsum(np.sin(bend), 1) / 40
+    taper = np.tile(1 - 0.75 * step, (_BROW_HAIRS, 1))
+    strands = cKDTree(np.stack([x.ravel(), y.ravel()], 1))
+    distance, which = strands.query(places, distance_upper_bound=0.003)
+    half = _STRAND_M * np.r_[taper.ravel(), 0.0][which]
+    hair = smoothstep(1.0, 0.0, (distance - half) / 0.00030) * (half > 0)
+    shadow = 0.32 * np.exp(-((np.minimum(distance, 0.01) / 0.0009) ** 2))
+    return np.maximum(hair, shadow).astype(np.float32)
+
+
+def _mouth(data: GNMData, page: Canvas, points: Float[np.ndarray, "T 3"], seed: int) -> Float[np.ndarray, "T 3"]:
+    """Teeth, gums and tongue."""
+    noise = SolidNoise(points)
+    teeth = smoothstep(0.4, 0.6, page.interpolate(soft_group(data, "teeth", 0)))[:, None]
+    stained = (1 + 0.05 * noise.smooth(0.006, 100 * seed + 30, octaves=2))[:, None]
+    wet = (1 + 0.12 * noise.smooth(0.004, 100 * seed + 31, octaves=3))[:, None]
+    flesh = np.array([0.46, 0.17, 0.15]) * wet
+    enamel = np.array([0.70, 0.64, 0.52]) * stained
+    return np.clip(flesh + teeth * (enamel - flesh), 0, 0.95).astype(np.float32)
