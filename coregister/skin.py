@@ -1,4 +1,4 @@
-"""The first model's skin: MakeHuman's head and neck, cut on an edge loop, subdivided once, with uvs and vertex groups."""
+"""The skin of the first model: MakeHuman's head and neck, cut on an edge loop, subdivided, unfolded, named."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -15,7 +15,7 @@ from registration.geometry.flat_map import flat_map
 from registration.geometry.quads import Subdivision, beyond_loop, boundary_loops, edge_loop, edges_of, pieces, subdivide
 
 # Vertices of MakeHuman's base mesh: an edge of the loop around the neck's foot, and one vertex of the scalp.
-_NECK_LOOP = (1467, 8154)
+_NECK_LOOP = (1491, 8177)
 _SCALP = 962
 _TIE = 1e-9
 
@@ -60,14 +60,14 @@ def make(source: MakeHuman) -> Skin:
     base, coarse = np.unique(body[kept], return_inverse=True)
     coarse = coarse.reshape(-1, 4)
     mirror = np.searchsorted(base, source.mirror[base])
-    island = _islands(source.uv_quads["body"][kept])
+    island = _islands(source.vertices[base], coarse, source.uv_quads["body"][kept])
     fine = subdivide(coarse, mirror)
     vertices = _symmetric(np.asarray(fine.weights @ source.vertices[base]), fine.mirror)
     edges, _, _ = edges_of(fine.quads)
     part = Part(
         vertices=vertices,
         quads=fine.quads,
-        quad_uvs=_fine_corners(_unfold(source.vertices[base], coarse, mirror, island)),
+        quad_uvs=fine_corners(_unfold(source.vertices[base], coarse, mirror, island)),
         groups=_groups(source, base, fine, vertices, np.repeat(island, 4), edges),
         mirror=fine.mirror,
     )
@@ -79,15 +79,19 @@ def _symmetric(vertices: Float[np.ndarray, "V 3"], mirror: Int[np.ndarray, "V"])
     return (vertices + vertices[mirror] * (-1, 1, 1)) / 2
 
 
-def _islands(uv_quads: Int[np.ndarray, "Q 4"]) -> Int[np.ndarray, "Q"]:
+def _islands(points: Float[np.ndarray, "N 3"], quads: np.ndarray, uv_quads: np.ndarray) -> Int[np.ndarray, "Q"]:
     """0: what is seen from outside; 1: the mouth's lining; 2, 3: the eyes' sockets: MakeHuman's own uv islands."""
     edges, of_quad, _ = edges_of(uv_quads)
     label, number = pieces(of_quad, np.ones(len(edges), bool))
     if number != 5:
         raise ValueError(f"expected face, neck, mouth and two sockets, found {number} uv islands")
-    sizes = np.bincount(label)
-    order = np.argsort(-sizes, kind="stable")  # face, mouth, neck, sockets
-    return np.array([0, 1, 0, 2, 3])[np.argsort(order)][label]
+    middle = np.array([points[quads[label == n]].mean((0, 1)) for n in range(number)])
+    kind = np.zeros(number, int)
+    left, right = middle[:, 0].argmax(), middle[:, 0].argmin()
+    kind[[left, right]] = 2, 3
+    rest = [n for n in range(number) if n not in (left, right, np.bincount(label).argmax())]  # neck and mouth
+    kind[max(rest, key=lambda n: middle[n, 1])] = 1
+    return kind[label]
 
 
 def _unfold(
@@ -151,7 +155,7 @@ def _along(loop: Float[np.ndarray, "N 3"]) -> Float[np.ndarray, "N"]:
     return np.concatenate([[0], np.cumsum(length)[:-1]]) / length.sum()
 
 
-def _fine_corners(corners: Float[np.ndarray, "Q 4 D"]) -> Float[np.ndarray, "4*Q 4 D"]:
+def fine_corners(corners: Float[np.ndarray, "Q 4 D"]) -> Float[np.ndarray, "4*Q 4 D"]:
     """Values per corner for the quads of `subdivide`."""
     middle = (corners + np.roll(corners, -1, 1)) / 2
     centre = np.broadcast_to(corners.mean(1, keepdims=True), corners.shape)

@@ -71,5 +71,14 @@ def schemes_beside(model_path: Path, vertex_count: int) -> dict[str, LandmarkSch
     return {scheme.name: scheme for scheme in (read_scheme(file, vertex_count) for file in files)}
 
 
+def write_scheme(scheme: LandmarkScheme, model_path: Path) -> Path:
+    """Write a scheme as `head_sparse_NAME.txt` beside a model file; returns its path."""
+    rows = zip(scheme.indices.tolist(), scheme.weights.tolist(), strict=True)
+    lines = [" ".join(f"{i} {w:.9g}" for i, w in zip(index, weight, strict=True)) for index, weight in rows]
+    path = Path(model_path).with_name(f"{_PREFIX}{scheme.name}.txt")
+    path.write_text("\n".join(lines) + "\n", "ascii")
+    return path
+
+
 def _wrong(what: str, path: Path, expected: object, got: object) -> InputError:
     return InputError(f"the landmark scheme {what}", where=path, expected=expected, got=got, fix=_FIX)
