@@ -45,20 +45,19 @@ class Tooth:
     depth: float  # buccolingual
     tilt: float  # degrees by which the tip leans outwards
     reach: float  # of the tip beyond the occlusal plane, towards the other arch
-    offset: float = 0.0  # outwards from the line on which the teeth touch
 
 
 _INCISOR = Crown(
     cells=(4, 2),
     rings=(
         (-3.0e-3, 0.55, 0.72, -0.72, 2.0),
-        (0.0, 0.74, 0.96, -0.96, 2.2),
-        (0.48, 0.93, 0.86, -0.40, 2.6),
+        (0.0, 0.75, 0.96, -0.96, 2.2),
+        (0.48, 0.925, 0.86, -0.40, 2.8),
         (0.92, 1.00, 0.36, -0.16, 3.5),
     ),
     falls=(0.02, 0.06),
     top=((-0.55, 0.12, 0.995), (0.0, 0.12, 1.0), (0.5, 0.12, 0.985)),
-    taper=0.30,
+    taper=0.40,
     tip=1,
 )
 _CANINE = Crown(
@@ -66,8 +65,8 @@ _CANINE = Crown(
     rings=(
         (-3.0e-3, 0.60, 0.80, -0.80, 2.0),
         (0.0, 0.74, 0.96, -0.96, 2.1),
-        (0.45, 0.95, 0.92, -0.55, 2.3),
-        (0.84, 1.00, 0.48, -0.28, 2.6),
+        (0.45, 1.00, 0.92, -0.55, 2.5),
+        (0.82, 0.96, 0.52, -0.30, 2.8),
     ),
     falls=(0.17, 0.24),
     top=((-0.48, 0.12, 0.87), (0.0, 0.12, 1.0), (0.48, 0.12, 0.83)),
@@ -78,11 +77,11 @@ _PREMOLAR = Crown(
     cells=(2, 4),
     rings=(
         (-3.0e-3, 0.66, 0.72, -0.72, 2.0),
-        (0.0, 0.76, 0.86, -0.86, 2.2),
-        (0.42, 0.98, 1.00, -0.98, 2.4),
-        (0.80, 0.96, 0.78, -0.78, 2.6),
+        (0.0, 0.80, 0.86, -0.86, 2.4),
+        (0.45, 1.0, 1.00, -0.98, 2.8),
+        (0.80, 0.96, 0.80, -0.80, 3.0),
     ),
-    falls=(0.06, 0.06),
+    falls=(0.04, 0.05),
     top=((0.0, -0.46, 0.93), (0.0, -0.02, 0.74), (0.0, 0.50, 1.0)),
     taper=0.18,
     tip=2,
@@ -92,7 +91,7 @@ _MOLAR = Crown(
     rings=(
         (-3.0e-3, 0.74, 0.76, -0.76, 2.4),
         (0.0, 0.82, 0.88, -0.88, 2.6),
-        (0.42, 0.99, 1.00, -1.00, 3.0),
+        (0.45, 1.0, 1.00, -1.00, 3.0),
         (0.80, 0.94, 0.80, -0.80, 3.0),
     ),
     falls=(0.0, 0.02),
@@ -114,29 +113,34 @@ _MOLAR = Crown(
 UPPER = (
     Tooth(crown=_INCISOR, width=8.5e-3, height=10.5e-3, depth=7.0e-3, tilt=24, reach=1.4e-3),
     Tooth(crown=_INCISOR, width=6.5e-3, height=9.0e-3, depth=6.0e-3, tilt=22, reach=0.9e-3),
-    Tooth(crown=_CANINE, width=7.5e-3, height=10.0e-3, depth=8.0e-3, tilt=12, reach=1.4e-3, offset=0.4e-3),
-    Tooth(crown=_PREMOLAR, width=7.0e-3, height=8.5e-3, depth=9.0e-3, tilt=5, reach=-0.1e-3),
-    Tooth(crown=_PREMOLAR, width=7.0e-3, height=8.5e-3, depth=9.0e-3, tilt=4, reach=-0.1e-3),
-    Tooth(crown=_MOLAR, width=10.0e-3, height=7.5e-3, depth=11.0e-3, tilt=4, reach=-0.1e-3),
-    Tooth(crown=_MOLAR, width=9.0e-3, height=7.0e-3, depth=11.0e-3, tilt=6, reach=-0.1e-3),
+    Tooth(crown=_CANINE, width=7.5e-3, height=10.0e-3, depth=8.0e-3, tilt=19, reach=1.2e-3),
+    Tooth(crown=_PREMOLAR, width=7.0e-3, height=8.5e-3, depth=9.0e-3, tilt=10, reach=0.75e-3),
+    Tooth(crown=_PREMOLAR, width=7.0e-3, height=8.5e-3, depth=9.0e-3, tilt=7, reach=0.75e-3),
+    Tooth(crown=_MOLAR, width=10.0e-3, height=7.5e-3, depth=11.0e-3, tilt=4, reach=0.45e-3),
+    Tooth(crown=_MOLAR, width=9.0e-3, height=7.0e-3, depth=11.0e-3, tilt=6, reach=0.45e-3),
 )
 LOWER = (
     Tooth(crown=_INCISOR, width=5.0e-3, height=9.0e-3, depth=6.0e-3, tilt=14, reach=0.0),
     Tooth(crown=_INCISOR, width=5.5e-3, height=9.5e-3, depth=6.5e-3, tilt=12, reach=0.0),
-    Tooth(crown=_CANINE, width=7.0e-3, height=11.0e-3, depth=7.5e-3, tilt=4, reach=0.2e-3),
-    Tooth(crown=_PREMOLAR, width=7.0e-3, height=8.5e-3, depth=7.5e-3, tilt=-2, reach=-0.1e-3),
-    Tooth(crown=_PREMOLAR, width=7.0e-3, height=8.0e-3, depth=8.0e-3, tilt=-5, reach=-0.1e-3),
-    Tooth(crown=_MOLAR, width=11.0e-3, height=7.5e-3, depth=10.5e-3, tilt=-8, reach=-0.1e-3),
-    Tooth(crown=_MOLAR, width=10.5e-3, height=7.0e-3, depth=10.0e-3, tilt=-8, reach=-0.1e-3),
+    Tooth(crown=_CANINE, width=7.0e-3, height=11.0e-3, depth=7.5e-3, tilt=8, reach=0.2e-3),
+    Tooth(crown=_PREMOLAR, width=7.0e-3, height=8.5e-3, depth=7.5e-3, tilt=2, reach=0.75e-3),
+    Tooth(crown=_PREMOLAR, width=7.0e-3, height=8.0e-3, depth=8.0e-3, tilt=-5, reach=0.7e-3),
+    Tooth(crown=_MOLAR, width=11.0e-3, height=7.5e-3, depth=10.5e-3, tilt=-8, reach=0.45e-3),
+    Tooth(crown=_MOLAR, width=10.5e-3, height=7.0e-3, depth=10.0e-3, tilt=-8, reach=0.45e-3),
 )
 FDI_UPPER = (17, 16, 15, 14, 13, 12, 11, 21, 22, 23, 24, 25, 26, 27)  # from the subject's right to left
 FDI_LOWER = (47, 46, 45, 44, 43, 42, 41, 31, 32, 33, 34, 35, 36, 37)
 
 OVERJET = 2.7e-3  # how far the line of the lower teeth lies inside that of the upper
 _GAP = 0.06e-3  # between neighbours
-_ARCH_EXPONENT = 2.4  # of the superellipse that the arch is in plan view
-_FRONT_INSET, _SIDE_INSET = 3.1e-3, 6.3e-3  # from the guide's outline to the line on which the teeth touch
+_ARCH_EXPONENT = 2.2  # of the superellipse that the arch is in plan view
+_FRONT_INSET, _SIDE_INSET = 3.1e-3, 5.6e-3  # from the guide's outline to the line on which the teeth touch
 _LANDMARK_TEETH = (6, 3, 1)  # first molar, canine, central incisor
+_SECTION = 10  # vertices around the gum
+# The gum's cross-section from its crest over the outer side to its base, the inner side alike: distance from the middle
+# of the neck as a share of the neck's own half depth, plus mm, and mm along h. At a tooth and between two teeth.
+_GUM_AT_TOOTH = ((0, 0, -0.5), (0.9, 0, 0.7), (1, 0.5, -0.2), (1, 0.4, -3.2), (0.9, -1.4, -6), (0, 0, -7))
+_GUM_BETWEEN = ((0, 0, 2.8), (0.55, 0, 2.4), (0.9, 0, 0.9), (1, 0.1, -2.8), (0.9, -1.5, -6), (0, 0, -7))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -169,26 +173,21 @@ def arch(upper_guide: Float[np.ndarray, "S 3"], lower_guide: Float[np.ndarray, "
                 got=f"an array of shape {guide.shape}",
                 fix="give the vertices of a strip around the teeth",
             )
-    front = upper_guide[:, 2].max() - _FRONT_INSET
+    half_width = float(np.abs(upper_guide[:, 0]).max() - _SIDE_INSET)
+    front, back = float(upper_guide[:, 2].max() - _FRONT_INSET), float(upper_guide[:, 2].min())
+    if half_width < 0.01 or front - back < 0.02 or np.ptp(lower_guide[:, 2]) < 0.01:
+        raise InputError(
+            "the guides leave no room for teeth",
+            where="upper_guide, lower_guide",
+            expected="arches more than 32 mm wide and 24 mm deep that open backwards",
+            got=f"{half_width:.4f} m half a width and {front - back:.4f} m depth, less the distance to the lips",
+            fix="check the unit (metres) and the frame (+Y up, +Z out of the face)",
+        )
     edges = np.array([_edge(upper_guide, -1), _edge(lower_guide, 1)])  # arch, front or back, (z, y)
     slopes = (edges[:, 1, 1] - edges[:, 0, 1]) / (edges[:, 0, 0] - edges[:, 1, 0])
     heights = edges[:, 0, 1] + slopes * (edges[:, 0, 0] - front)
-    made = Arch(
-        half_width=float(np.abs(upper_guide[:, 0]).max() - _SIDE_INSET),
-        front=float(front),
-        back=float(upper_guide[:, 2].min()),
-        height=float(heights.mean()),
-        slope=float(slopes.mean()),
-    )
-    if made.half_width < 0.01 or made.front - made.back < 0.02 or not np.isfinite(made.slope):
-        raise InputError(
-            "the guide leaves no room for teeth",
-            where="upper_guide",
-            expected="an arch more than 33 mm wide and 23 mm deep, closed towards +Z",
-            got=f"{made}",
-            fix="check its unit (metres) and its frame (+Y up, +Z out of the face)",
-        )
-    return made
+    height, slope = float(heights.mean()), float(slopes.mean())
+    return Arch(half_width=half_width, front=front, back=back, height=height, slope=slope)
 
 
 def upper(where: Arch, teeth: tuple[Tooth, ...] = UPPER) -> Part:
@@ -242,7 +241,8 @@ class _Stance:
 def _stand(where: Arch, teeth: tuple[Tooth, ...], *, up: bool) -> _Stance:
     turn = np.linspace(0, np.pi / 2, 2001)
     line = np.stack([np.sin(turn), np.cos(turn)], 1) ** (2 / _ARCH_EXPONENT)
-    line = line * [where.half_width, where.front - where.back] + [0, where.back]  # (x, z)
+    stretch = np.hypot(1, where.slope)  # lengths in the inclined plane against those in plan view
+    line = line * [where.half_width, stretch * (where.front - where.back)]  # (x, towards the front), in that plane
     if not up:
         along = np.gradient(line, axis=0)
         along /= np.linalg.norm(along, axis=1, keepdims=True)
@@ -253,19 +253,21 @@ def _stand(where: Arch, teeth: tuple[Tooth, ...], *, up: bool) -> _Stance:
     contacts = [np.array([0, line[0, 1]])]
     for tooth in teeth:
         contacts.append(_step(line, contacts[-1], scale * tooth.width))
-    points = np.array([[x, where.height + where.slope * (where.front - z), z] for x, z in contacts])
-    normal = np.array([0, 1, where.slope]) / np.hypot(1, where.slope)
+    forward = np.array([0, -where.slope, 1]) / stretch
+    normal = np.array([0, 1, where.slope]) / stretch
+    origin = np.array([0, where.height, where.front]) - stretch * (where.front - where.back) * forward
+    points = origin + np.array([[x, 0, 0] + y * forward for x, y in contacts])
     m = np.diff(points, axis=0)
     m /= np.linalg.norm(m, axis=1, keepdims=True)
     out = np.cross(m, normal)
     along_h = -normal if up else normal
     tilt = np.radians([tooth.tilt for tooth in teeth])[:, None]
-    reach, offset = (scale * np.array([getattr(t, name) for t in teeth])[:, None] for name in ("reach", "offset"))
+    reach = scale * np.array([tooth.reach for tooth in teeth])[:, None]
     return _Stance(
         teeth=teeth,
         scale=scale,
         up=up,
-        tip=(points[1:] + points[:-1]) / 2 + offset * out + reach * along_h,
+        tip=(points[1:] + points[:-1]) / 2 + reach * along_h,
         m=m,
         b=np.cos(tilt) * out - np.sin(tilt) * along_h,
         h=np.cos(tilt) * along_h + np.sin(tilt) * out,
@@ -274,9 +276,8 @@ def _stand(where: Arch, teeth: tuple[Tooth, ...], *, up: bool) -> _Stance:
 
 def _step(line: Float[np.ndarray, "P 2"], start: Float[np.ndarray, "2"], width: float) -> Float[np.ndarray, "2"]:
     """The next point on a line that is `width` away from `start`; beyond the line's end, straight on."""
-    line = np.concatenate(
-        [line, line[-1:] + 2 * width * (line[-1:] - line[-2:-1]) / np.linalg.norm(line[-1] - line[-2])]
-    )
+    beyond = line[-1] + 2 * width * (line[-1] - line[-2]) / np.linalg.norm(line[-1] - line[-2])
+    line = np.concatenate([line, beyond[None]])
     distance = np.linalg.norm(line - start, axis=1)
     nearest = int(distance.argmin())
     after = nearest + int(np.argmax(distance[nearest:] >= width))
@@ -307,14 +308,8 @@ def _grid(cells: tuple[int, int]) -> tuple[Float[np.ndarray, "N 2"], Float[np.nd
     whose indices count the border first."""
     columns, rows = cells
     i, j = np.arange(columns), np.arange(rows)
-    border = np.concatenate(
-        [
-            np.stack([i, 0 * i], 1),
-            np.stack([0 * j + columns, j], 1),
-            np.stack([columns - i, 0 * i + rows], 1),
-            np.stack([0 * j, rows - j], 1),
-        ]
-    )
+    sides = [(i, 0 * i), (0 * j + columns, j), (columns - i, 0 * i + rows), (0 * j, rows - j)]
+    border = np.concatenate([np.stack(side, 1) for side in sides])
     inner = np.stack(np.meshgrid(i[1:], j[1:]), -1).reshape(-1, 2)
     points = np.concatenate([border, inner])
     number = np.empty((columns + 1, rows + 1), int)
@@ -326,7 +321,7 @@ def _grid(cells: tuple[int, int]) -> tuple[Float[np.ndarray, "N 2"], Float[np.nd
 def _crown_vertices(tooth: Tooth) -> Float[np.ndarray, "V 3"]:
     """A tooth in its own frame (m, b, h), the tip at the origin: rings from root to rim, the biting surface's inner
     points, the root's end."""
-    crown, half_width, half_depth = tooth.crown, tooth.width / 2, tooth.depth / 2
+    crown, half_width, half_depth = tooth.crown, (tooth.width - _GAP) / 2, tooth.depth / 2
     border, _, _ = _grid(crown.cells)
     mesial, distal = crown.falls
     rings = []
@@ -367,48 +362,37 @@ def _crown_chart(crown: Crown) -> Float[np.ndarray, "Q 4 2"]:
     return uvs
 
 
-_SECTION = 10  # vertices around the gum
-# The gum's cross-section from its crest over the buccal side to its base and back: how far out from the middle of the
-# necks (1 = the neck's surface), plus metres outwards, and metres along h. Behind a tooth, and between two.
-_GUM_AT_TOOTH = ((0, 0, -0.5), (0.9, 0, 0.7), (1, 0.5, -0.2), (1, 0.9, -3.2), (0.9, -0.4, -6), (0, 0, -7))
-_GUM_BETWEEN = ((0, 0, 2.8), (0.55, 0, 2.4), (0.9, 0, 0.9), (1, 0.5, -2.8), (0.9, -0.6, -6), (0, 0, -7))
-
-
 def _gum_vertices(stance: _Stance) -> Float[np.ndarray, "G 3"]:
     """The gum's cross-sections from the subject's right to left: at each tooth, between neighbours and at both ends."""
-    sections = []
-    necks = []  # per tooth: middle of its mesial and distal side and its centre at the neck, half depth there
-    for i, tooth in enumerate(stance.teeth):
-        centre = stance.tip[i] - stance.scale * tooth.height * stance.h[i]
-        half = stance.scale * tooth.width / 2 * stance.m[i]
-        necks.append((centre, half, stance.scale * tooth.depth / 2 * tooth.crown.rings[1][2]))
-    for i in range(len(necks)):
-        centre, half, depth = necks[i]
-        before = necks[i - 1] if i else (centre * [-1, 1, 1], half * [1, -1, -1], depth)
-        b_before, h_before = (stance.b[i - 1], stance.h[i - 1]) if i else (stance.b[0], stance.h[0])
-        middle = (centre - half + before[0] + before[1]) / 2
-        b, h = stance.b[i] + b_before, stance.h[i] + h_before
-        if i == 0:
-            b, h, middle = b * [0, 1, 1], h * [0, 1, 1], middle * [0, 1, 1]
-        b, h = b / np.linalg.norm(b), h / np.linalg.norm(h)
-        sections.append(_gum_section(_GUM_BETWEEN, middle, b, h, (depth + before[2]) / 2))
-        sections.append(_gum_section(_GUM_AT_TOOTH, centre, stance.b[i], stance.h[i], depth))
-    end = centre + half + 1.2e-3 * stance.m[-1]
-    sections.append(_gum_section(_GUM_BETWEEN, end, stance.b[-1], stance.h[-1], 0.8 * depth))
-    left = np.stack(sections)
-    return np.concatenate([left[:0:-1] * [-1, 1, 1], left]).reshape(-1, 3)
+    teeth = stance.teeth
+    sizes = stance.scale * np.array([[t.width / 2, t.height, t.depth / 2 * t.crown.rings[1][2]] for t in teeth])
+    necks, depth = stance.tip - sizes[:, 1:2] * stance.h, sizes[:, 2]
+    at_teeth = _gum_sections(_GUM_AT_TOOTH, necks, stance.b, stance.h, depth)
+    # Between two teeth lies the mean of both; the first one's neighbour is its mirror image, the last one's itself.
+    distal, mesial = necks + sizes[:, :1] * stance.m, necks - sizes[:, :1] * stance.m
+    flip = [-1, 1, 1]
+    middle, b, h = (
+        np.concatenate([before[:1] * flip + before[:1], before[1:] + after[:-1], 2 * after[-1:]]) / 2
+        for before, after in ((mesial, distal), (stance.b, stance.b), (stance.h, stance.h))
+    )
+    middle[-1] += 1.2e-3 * stance.m[-1]
+    b, h = (axis / np.linalg.norm(axis, axis=1, keepdims=True) for axis in (b, h))
+    between = _gum_sections(_GUM_BETWEEN, middle, b, h, np.convolve(np.pad(depth, 1, mode="edge"), [0.5, 0.5], "valid"))
+    left = np.concatenate([np.stack([between[:-1], at_teeth], 1).reshape(-1, _SECTION, 3), between[-1:]])
+    return np.concatenate([left[:0:-1] * flip, left]).reshape(-1, 3)
 
 
-def _gum_section(
+def _gum_sections(
     rows: tuple[tuple[float, float, float], ...],
-    middle: Float[np.ndarray, "3"],
-    b: Float[np.ndarray, "3"],
-    h: Float[np.ndarray, "3"],
-    depth: float,
-) -> Float[np.ndarray, "N 3"]:
+    middle: Float[np.ndarray, "N 3"],
+    b: Float[np.ndarray, "N 3"],
+    h: Float[np.ndarray, "N 3"],
+    depth: Float[np.ndarray, "N"],
+) -> Float[np.ndarray, "N S 3"]:
     share, out, along = (np.array([*rows, *rows[-2:0:-1]]) * [1, 1e-3, 1e-3]).T
     side = np.where(np.arange(len(share)) < len(rows), 1, -1)
-    return middle + (side * (share * depth + out))[:, None] * b + along[:, None] * h
+    outwards = side * (share * depth[:, None] + out)
+    return middle[:, None] + outwards[..., None] * b[:, None] + along[:, None] * h[:, None]
 
 
 def _gum_quads(stations: int) -> tuple[Int[np.ndarray, "Q 4"], Float[np.ndarray, "Q 4 2"]]:
@@ -431,29 +415,26 @@ def _part(stance: _Stance, name: str) -> Part:
     """Crowns from right to left, then the gum, with everything on the right the exact mirror image of the left."""
     vertices, quads, uvs, mirror = [], [], [], []
     count = len(stance.teeth)
-    sizes = [_crown_size(tooth.crown) for tooth in (*stance.teeth[::-1], *stance.teeth)]
+    order = [*reversed(range(count)), *range(count)]
+    sizes = [_crown_size(stance.teeth[i].crown) for i in order]
     starts = np.cumsum([0, *sizes])
-    for place in range(2 * count):
+    for place, i in enumerate(order):
         left = place >= count
-        i = place - count if left else count - 1 - place
-        tooth = stance.teeth[i]
-        local = stance.scale * _crown_vertices(tooth)
-        made = stance.tip[i] + local @ np.stack([stance.m[i], stance.b[i], stance.h[i]])
-        right_handed = left == stance.up
-        vertices.append(made if left else made * [-1, 1, 1])
-        chart = _crown_chart(tooth.crown) * [1 if right_handed else -1, 1]
-        cell = np.array([0.1 + 0.2 * (place % 5), 0.9 - 0.2 * (place // 5)])
-        turn = 1 if right_handed else -1
-        quads.append(starts[place] + _crown_quads(tooth.crown)[:, ::turn])
-        uvs.append(cell + 0.2 * chart[:, ::turn])
+        turn = 1 if left == stance.up else -1  # the frames of the others are left-handed
+        crown = stance.teeth[i].crown
+        local = stance.scale * _crown_vertices(stance.teeth[i])
+        placed = stance.tip[i] + local @ np.stack([stance.m[i], stance.b[i], stance.h[i]])
+        cell = [0.1 + 0.2 * (place % 5), 0.9 - 0.2 * (place // 5)]
+        vertices.append(placed if left else placed * [-1, 1, 1])
+        quads.append(starts[place] + _crown_quads(crown)[:, ::turn])
+        uvs.append(cell + 0.2 * _crown_chart(crown)[:, ::turn] * [turn, 1])
         mirror.append(starts[2 * count - 1 - place] + np.arange(sizes[place]))
     gum = _gum_vertices(stance)
     stations = len(gum) // _SECTION
     gum_quads, gum_uvs = _gum_quads(stations)
-    turn = 1 if stance.up else -1
     vertices.append(gum)
-    quads.append(starts[-1] + gum_quads[:, ::turn])
-    uvs.append((gum_uvs if stance.up else [0, 0.4] + gum_uvs * [1, -1])[:, ::turn])
+    quads.append(starts[-1] + gum_quads if stance.up else starts[-1] + gum_quads[:, ::-1])
+    uvs.append(gum_uvs if stance.up else [0, 0.4] + gum_uvs[:, ::-1] * [1, -1])
     mirror.append(starts[-1] + np.arange(len(gum)).reshape(stations, _SECTION)[::-1].ravel())
     is_gum = np.arange(starts[-1] + len(gum)) >= starts[-1]
     return Part(
