@@ -28,9 +28,7 @@ _EXTERIOR = np.concatenate([np.radians([0.0, 6.0, 12.0, 18.0]), _LIMBUS, _BACK])
 _IRIS = np.array([0, 1 / 4, 1 / 2, 2 / 3, 5 / 6, 1])  # shares of the iris' radius
 _PUPIL_EDGE = 2  # in `_IRIS`
 _INTERIOR = np.concatenate([_IRIS * _MEAN_LIMBUS, _BACK])  # of the uv map alone: there the iris lies on the sphere
-_POLYLINE = np.concatenate(
-    [np.linspace(0, _MEAN_LIMBUS, 61), np.linspace(_MEAN_LIMBUS, _STILL, 61)[1:], np.linspace(_STILL, np.pi, 31)[1:]]
-)
+_POLYLINE = np.concatenate([np.linspace(0, _MEAN_LIMBUS, 49), np.linspace(_MEAN_LIMBUS, _STILL, 49)[1:]])
 _UV_RADIUS = 0.24  # of a chart that shows half a shell
 
 
