@@ -30,8 +30,8 @@ _LEFT_OUT = re.compile(
     r"ears/.-ear-(shape-(pointed|square|triangle))|head/head-(trans|square|rectangular|diamond|triangular|angle)"
     r"|head/head-invertedtriangular|mouth/mouth-trans-(in|out)|nose/nose-trans-(in|out)|neck/neck-trans-(in|out)"
 )
-_SPREAD = 0.28  # standard deviation of a slider, whose ends at 1 are caricatures
-_ASYMMETRY = 0.45
+_SPREAD = 0.2  # standard deviation of a slider, whose ends at 1 are caricatures
+_ASYMMETRY = 0.18
 
 
 @dataclass(frozen=True, kw_only=True)

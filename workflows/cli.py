@@ -105,6 +105,48 @@ def check_capture(capture: CaptureFolder, /, out: Annotated[Path | None, arg(met
     return 0
 
 
+def synth_capture(
+    out: Positional[Annotated[Path, arg(metavar="DIR")]],
+    /,
+    seed: Annotated[int, arg(metavar="S")] = 0,
+    expression: Annotated[str, arg(metavar="NAME")] = "neutral",
+    spanned: bool = False,
+    target: Annotated[tuple[str, ...], arg(metavar="NAME=WEIGHT")] = (),
+    views: Annotated[int, arg(metavar="N")] = 22,
+    size: Annotated[tuple[int, int], arg(metavar="W H")] = (480, 720),
+    distortion: bool = False,
+    noise: bool = False,
+    hair: bool = False,
+    shirt: bool = False,
+) -> int:
+    """Photograph a synthetic subject in a synthetic studio: a capture whose truth is known.
+
+    Args:
+        out: The capture folder to write; it must not exist.
+        seed: The subject: one seed is one person with one skin, and one rig of cameras.
+        expression: One of the named expressions, such as neutral, jaw_open, smile, gaze_left, tongue_out.
+        spanned: Draw a person that the first model spans; otherwise asymmetry, age and build go beyond it.
+        target: Weight of a MakeHuman target, such as nose/nose-hump-incr=0.5.
+        views: The number of cameras.
+        size: Width and height of the images in pixels.
+        distortion: Give the lenses distortion.
+        noise: Add sensor noise, and differences of exposure and colour between the cameras.
+        hair: Put hair on the head, with its own label.
+        shirt: Put a shirt on the shoulders, with its own label.
+    """
+    targets = _target_weights(target)
+    from coregister.subjects import capture
+    from coregister.synth import Studio
+    from registration.render.studio import Sensor
+
+    sensor = Sensor(shot_noise=0.01, read_noise=0.002, exposure_spread=0.05, colour_spread=0.03) if noise else Sensor()
+    studio = Studio(
+        cameras=views, size_px=size, distortion=distortion, seed=seed, sensor=sensor, hair=hair, shirt=shirt
+    )
+    print(capture(out, seed=seed, expression=expression, spanned=spanned, targets=targets, studio=studio))
+    return 0
+
+
 def describe_model(
     file: Positional[Annotated[Path, arg(metavar="NPZ")]], /, out: Annotated[Path | None, arg(metavar="PNG")] = None
 ) -> int:
@@ -128,14 +170,29 @@ def fetch_model() -> int:
     return 0
 
 
+def bootstrap_model(out: Annotated[Path | None, arg(metavar="NPZ")] = None) -> int:
+    """Make the first model from MakeHuman's CC0 head and print where it lies. Made once, then found in the cache.
+
+    Args:
+        out: Where to put a copy of the model file; its landmark schemes go beside it.
+    """
+    from coregister.bootstrap import bootstrap
+
+    print(bootstrap(out))
+    return 0
+
+
 Command = Callable[..., int]
 Group = tuple[str, Mapping[str, Command]]  # what the group is about, its commands
 
 COMMANDS: Mapping[str, Command | Group] = {
     "register": register,
     "evaluate": evaluate,
-    "capture": ("Look at captures.", {"check": check_capture}),
-    "model": ("Look at head models and get them.", {"info": describe_model, "fetch": fetch_model}),
+    "capture": ("Look at captures and make synthetic ones.", {"check": check_capture, "synth": synth_capture}),
+    "model": (
+        "Look at head models, make the first one, get the official one.",
+        {"info": describe_model, "bootstrap": bootstrap_model, "fetch": fetch_model},
+    ),
 }
 
 
@@ -164,6 +221,26 @@ def _choice(commands: Mapping[str, Command | Group]) -> Any:
         else:
             choices.append(Annotated[Any, subcommand(name, constructor=command)])
     return Union[tuple(choices)]  # noqa: UP007  a union of types that only exist at run time
+
+
+def _target_weights(pairs: Sequence[str]) -> dict[str, float]:
+    """`NAME=WEIGHT` arguments as a mapping."""
+    weights = {}
+    for pair in pairs:
+        name, _, weight = pair.rpartition("=")
+        try:
+            weights[name] = float(weight)
+        except ValueError:
+            name = ""
+        if not name:
+            raise InputError(
+                "Cannot read a target's weight",
+                where="--target",
+                expected="NAME=WEIGHT, e.g. nose/nose-hump-incr=0.5",
+                got=pair,
+                fix="write the target's name, an equals sign and a number",
+            )
+    return weights
 
 
 def _landmark_files(pairs: Sequence[str]) -> dict[str, Path]:
