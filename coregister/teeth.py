@@ -44,6 +44,7 @@ class Tooth:
     height: float  # of the crown
     depth: float  # buccolingual
     tilt: float  # degrees by which the tip leans outwards
+    lean: float = 0.0  # degrees by which the tip leans towards the midline
     reach: float  # of the tip beyond the occlusal plane, towards the other arch
 
 
@@ -52,7 +53,7 @@ _INCISOR = Crown(
     rings=(
         (-3.0e-3, 0.55, 0.72, -0.72, 2.0),
         (0.0, 0.75, 0.96, -0.96, 2.2),
-        (0.48, 0.925, 0.86, -0.40, 2.8),
+        (0.48, 0.95, 0.86, -0.40, 2.8),
         (0.92, 1.00, 0.36, -0.16, 3.5),
     ),
     falls=(0.02, 0.06),
@@ -111,20 +112,20 @@ _MOLAR = Crown(
 )
 # From the midline outwards.
 UPPER = (
-    Tooth(crown=_INCISOR, width=8.5e-3, height=10.5e-3, depth=7.0e-3, tilt=24, reach=1.4e-3),
-    Tooth(crown=_INCISOR, width=6.5e-3, height=9.0e-3, depth=6.0e-3, tilt=22, reach=0.9e-3),
-    Tooth(crown=_CANINE, width=7.5e-3, height=10.0e-3, depth=8.0e-3, tilt=19, reach=1.2e-3),
-    Tooth(crown=_PREMOLAR, width=7.0e-3, height=8.5e-3, depth=9.0e-3, tilt=10, reach=0.75e-3),
-    Tooth(crown=_PREMOLAR, width=7.0e-3, height=8.5e-3, depth=9.0e-3, tilt=7, reach=0.75e-3),
-    Tooth(crown=_MOLAR, width=10.0e-3, height=7.5e-3, depth=11.0e-3, tilt=4, reach=0.45e-3),
+    Tooth(crown=_INCISOR, width=8.5e-3, height=10.5e-3, depth=7.0e-3, tilt=24, lean=2, reach=1.4e-3),
+    Tooth(crown=_INCISOR, width=6.5e-3, height=9.0e-3, depth=6.0e-3, tilt=22, lean=3, reach=0.9e-3),
+    Tooth(crown=_CANINE, width=7.5e-3, height=10.0e-3, depth=8.0e-3, tilt=19, lean=3, reach=1.2e-3),
+    Tooth(crown=_PREMOLAR, width=7.0e-3, height=8.5e-3, depth=9.0e-3, tilt=10, lean=3, reach=0.75e-3),
+    Tooth(crown=_PREMOLAR, width=7.0e-3, height=8.5e-3, depth=9.0e-3, tilt=7, lean=2, reach=0.75e-3),
+    Tooth(crown=_MOLAR, width=10.0e-3, height=7.5e-3, depth=11.0e-3, tilt=4, lean=1, reach=0.45e-3),
     Tooth(crown=_MOLAR, width=9.0e-3, height=7.0e-3, depth=11.0e-3, tilt=6, reach=0.45e-3),
 )
 LOWER = (
-    Tooth(crown=_INCISOR, width=5.0e-3, height=9.0e-3, depth=6.0e-3, tilt=14, reach=0.0),
-    Tooth(crown=_INCISOR, width=5.5e-3, height=9.5e-3, depth=6.5e-3, tilt=12, reach=0.0),
-    Tooth(crown=_CANINE, width=7.0e-3, height=11.0e-3, depth=7.5e-3, tilt=8, reach=0.2e-3),
-    Tooth(crown=_PREMOLAR, width=7.0e-3, height=8.5e-3, depth=7.5e-3, tilt=2, reach=0.75e-3),
-    Tooth(crown=_PREMOLAR, width=7.0e-3, height=8.0e-3, depth=8.0e-3, tilt=-5, reach=0.7e-3),
+    Tooth(crown=_INCISOR, width=5.0e-3, height=9.0e-3, depth=6.0e-3, tilt=14, lean=1, reach=0.0),
+    Tooth(crown=_INCISOR, width=5.5e-3, height=9.5e-3, depth=6.5e-3, tilt=12, lean=1.5, reach=0.0),
+    Tooth(crown=_CANINE, width=7.0e-3, height=11.0e-3, depth=7.5e-3, tilt=8, lean=1, reach=0.2e-3),
+    Tooth(crown=_PREMOLAR, width=7.0e-3, height=8.5e-3, depth=7.5e-3, tilt=2, lean=2, reach=0.75e-3),
+    Tooth(crown=_PREMOLAR, width=7.0e-3, height=8.0e-3, depth=8.0e-3, tilt=-5, lean=1, reach=0.7e-3),
     Tooth(crown=_MOLAR, width=11.0e-3, height=7.5e-3, depth=10.5e-3, tilt=-8, reach=0.45e-3),
     Tooth(crown=_MOLAR, width=10.5e-3, height=7.0e-3, depth=10.0e-3, tilt=-8, reach=0.45e-3),
 )
@@ -162,15 +163,15 @@ def arch(upper_guide: Float[np.ndarray, "S 3"], lower_guide: Float[np.ndarray, "
     strip's upper edge.
 
     Raises:
-        InputError: a guide is no finite (S, 3) array, or the arch that it leaves has no room.
+        InputError: a guide has fewer than three points or one that is not finite, or the arch has no room for teeth.
     """
     for name, guide in (("upper_guide", upper_guide), ("lower_guide", lower_guide)):
-        if guide.ndim != 2 or guide.shape[1] != 3 or len(guide) < 3 or not np.isfinite(guide).all():
+        if len(guide) < 3 or not np.isfinite(guide).all():
             raise InputError(
                 "this guide shows no dental arch",
                 where=name,
-                expected="finite points (S, 3), S >= 3, in metres",
-                got=f"an array of shape {guide.shape}",
+                expected="at least three finite points, in metres",
+                got=f"{len(guide)} points, {int((~np.isfinite(guide)).any(1).sum())} of them not finite",
                 fix="give the vertices of a strip around the teeth",
             )
     half_width = float(np.abs(upper_guide[:, 0]).max() - _SIDE_INSET)
@@ -261,16 +262,17 @@ def _stand(where: Arch, teeth: tuple[Tooth, ...], *, up: bool) -> _Stance:
     m /= np.linalg.norm(m, axis=1, keepdims=True)
     out = np.cross(m, normal)
     along_h = -normal if up else normal
-    tilt = np.radians([tooth.tilt for tooth in teeth])[:, None]
+    tilt, lean = np.radians([[tooth.tilt, tooth.lean] for tooth in teeth]).T[..., None]
     reach = scale * np.array([tooth.reach for tooth in teeth])[:, None]
+    tilted = np.cos(tilt) * along_h + np.sin(tilt) * out
     return _Stance(
         teeth=teeth,
         scale=scale,
         up=up,
         tip=(points[1:] + points[:-1]) / 2 + reach * along_h,
-        m=m,
+        m=np.cos(lean) * m + np.sin(lean) * tilted,
         b=np.cos(tilt) * out - np.sin(tilt) * along_h,
-        h=np.cos(tilt) * along_h + np.sin(tilt) * out,
+        h=np.cos(lean) * tilted - np.sin(lean) * m,
     )
 
 
@@ -377,7 +379,8 @@ def _gum_vertices(stance: _Stance) -> Float[np.ndarray, "G 3"]:
     )
     middle[-1] += 1.2e-3 * stance.m[-1]
     b, h = (axis / np.linalg.norm(axis, axis=1, keepdims=True) for axis in (b, h))
-    between = _gum_sections(_GUM_BETWEEN, middle, b, h, np.convolve(np.pad(depth, 1, mode="edge"), [0.5, 0.5], "valid"))
+    depths = np.convolve([depth[0], *depth, 0.5 * depth[-1]], [0.5, 0.5], "valid")
+    between = _gum_sections(_GUM_BETWEEN, middle, b, h, depths)
     left = np.concatenate([np.stack([between[:-1], at_teeth], 1).reshape(-1, _SECTION, 3), between[-1:]])
     return np.concatenate([left[:0:-1] * flip, left]).reshape(-1, 3)
 
