@@ -96,8 +96,11 @@ def _build_into(path: Path) -> None:
 def build(source: MakeHuman) -> tuple[GNMData, dict[str, LandmarkScheme]]:
     """The model and its landmark schemes."""
     made = anatomy.make(source, population.mean_person())
-    template, template_joints = made.template, made.joints
+    template = made.template
     identity, joint_identity = _identity_basis(made)
+    # As in the official file, joints are what the regressor makes of the vertices, for every identity.
+    regressor = _joint_regressor(made, identity["head"], joint_identity["head"])
+    joint_identity["head"] = np.einsum("jv,kvd->kjd", regressor, identity["head"], optimize=True)
     basis = _expression_basis(made)
     groups = _groups(made)
     quads = np.concatenate([part.quads + made.slices[name].start for name, part in made.parts.items()])
@@ -107,7 +110,7 @@ def build(source: MakeHuman) -> tuple[GNMData, dict[str, LandmarkScheme]]:
         version=np.array("3.0"),
         variant=np.array("head"),
         template_vertex_positions=template.astype(np.float32),
-        template_joint_positions=template_joints.astype(np.float32),
+        template_joint_positions=(regressor @ template).astype(np.float32),
         vertex_identity_basis=np.concatenate(list(identity.values())).astype(np.float32),
         joint_identity_basis=np.concatenate(list(joint_identity.values())).astype(np.float32),
         expression_basis=np.concatenate(list(basis.values())).astype(np.float32),
@@ -122,7 +125,7 @@ def build(source: MakeHuman) -> tuple[GNMData, dict[str, LandmarkScheme]]:
         triangle_uvs=corner_triangles(quad_uvs).astype(np.float32),
         mesh_component_names=np.array(COMPONENTS),
         mirror_indices=made.mirror.astype(np.int32),
-        joint_regressor=_joint_regressor(made, identity["head"], joint_identity["head"]).astype(np.float32),
+        joint_regressor=regressor.astype(np.float32),
         pose_correctives_regressor=np.zeros((9 * J, 3 * V), np.float16),
         bone_aligned_template_joint_orientations=np.tile(np.eye(3, dtype=np.float32), (J, 1, 1)),
         vertex_groups=np.stack([groups[name] for name in GROUPS]).astype(np.float32),
