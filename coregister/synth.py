@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float
 
+from coregister.studio_wear import hair, shirt
 from registration.capture.native_writer import write
 from registration.capture.scan import Scan
 from registration.errors import InputError
@@ -81,7 +82,7 @@ def write_capture(
     cameras = _rig(data, vertices, studio)
     backend.activate("llvm")
     head = _head(data, vertices, studio)
-    surfaces = [head]
+    surfaces = [head, *_worn(data, head, studio)]
     views = shoot(
         surfaces,
         cameras,
@@ -190,6 +191,16 @@ def _head(data: GNMData, vertices: Float[np.ndarray, "V 3"], studio: Studio) -> 
         classes=label_shares(data),
         clear=corneas(data),
     )
+
+
+def _worn(data: GNMData, head: StudioSurface, studio: Studio) -> list[StudioSurface]:
+    shares = np.eye(len(LABELS) - 1, dtype=np.float32)
+    worn = []
+    if studio.hair:
+        worn.append(hair(data, head, shares[LABELS.index(HAIR) - 1], studio.look, studio.look.seed))
+    if studio.shirt:
+        worn.append(shirt(data, head, shares[LABELS.index(CLOTHES) - 1], studio.look.seed))
+    return worn
 
 
 def _scan(data: GNMData, head: StudioSurface, surfaces: list[StudioSurface], cameras: tuple[Camera, ...]) -> Scan:

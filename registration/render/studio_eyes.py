@@ -12,7 +12,7 @@ from registration.render.studio_canvas import smoothstep
 
 SIDES = ("left_eye", "right_eye")
 _INSIDE = 0.5
-_REACH = 1.25  # the cornea, in radii of the iris
+_FRONT = 0.1  # in radii of the eyeball: the outer shell before this height is clear
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -57,9 +57,10 @@ def eye_frame(data: GNMData, side: str) -> EyeFrame:
 
 
 def corneas(data: GNMData) -> Bool[np.ndarray, "F"]:
-    """The faces that light passes: those of an eye's outer shell in front of an iris that lies on an inner shell.
+    """The faces that light passes: the front of an eye's outer shell, where an inner shell carries sclera and iris.
 
-    None for eyes of one shell, which carries the iris itself.
+    All of the front, because a rim near the iris would shade the inner shell right below it. None for eyes of one
+    shell, which carries the iris itself.
     """
     points = data.template_vertex_positions.astype(np.float64)
     painted = np.max([group(data, name) for name in ("irises", "pupils", "scleras")], axis=0) > _INSIDE
@@ -69,9 +70,7 @@ def corneas(data: GNMData) -> Bool[np.ndarray, "F"]:
         own = np.flatnonzero(outer & (group(data, side) > _INSIDE))
         if len(own):
             frame = eye_frame(data, side)
-            height, away, _ = frame.polar(points[own])
-            clear[own] = (height > 0) & (away < _REACH * frame.iris_radius)
-    # Any corner: the rim's faces would else hang over the iris. The inner shell's sclera lies right below them.
+            clear[own] = frame.polar(points[own])[0] > _FRONT * frame.radius
     return clear[data.triangles].any(1)
 
 
@@ -81,7 +80,7 @@ def paint_eye(
     """Linear albedo of points on an eye (template, m), on either shell. A Mitsuba variant must be active."""
     height, away, angle = frame.polar(points.astype(np.float64))
     noise = SolidNoise(points)
-    white = np.array([0.78, 0.74, 0.70]) * (1 + 0.03 * noise.smooth(0.004, 100 * seed + 40))[:, None]
+    white = np.array([0.66, 0.62, 0.58]) * (1 + 0.03 * noise.smooth(0.004, 100 * seed + 40))[:, None]
     # Veins: where a noise crosses zero; they thin out towards the iris.
     crossing = np.abs(noise.smooth(0.0035, 100 * seed + 41, octaves=3))
     veins = smoothstep(0.16, 0.0, crossing) * smoothstep(1.1, 2.2, away / frame.iris_radius)

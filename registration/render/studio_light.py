@@ -24,10 +24,10 @@ _OFFSET_M = 2e-5  # rays start this far above their surface
 
 @dataclass(frozen=True, kw_only=True)
 class Sky:
-    """An environment whose radiance grows linearly along one direction of the world; 1 in the mean."""
+    """An environment whose radiance grows linearly along one direction of the world."""
 
-    brightness: float = 1.0  # mean radiance; a white surface under an even sky of 1 is 1
-    contrast: float = 0.5  # the brightest radiance is (1 + contrast) times the mean, the darkest (1 - contrast)
+    brightness: float = 0.9  # mean radiance; a white surface under an even sky of 1 is 1
+    contrast: float = 0.75  # the brightest radiance is (1 + contrast) times the mean, the darkest (1 - contrast)
     towards: tuple[float, float, float] = (0.35, 0.75, 0.55)  # of the brightest point, world; any length
     tint: tuple[float, float, float] = (1.0, 1.0, 1.0)
 

@@ -19,6 +19,7 @@ from registration.render.studio_eyes import SIDES, eye_frame, paint_eye
 _UNPIGMENTED = np.array([0.86, 0.78, 0.70])
 _MELANIN = np.array([0.42, 0.76, 1.18])  # absorption per unit
 _BLOOD = np.array([0.10, 0.66, 0.60])
+_LIPS = np.array([0.80, 0.66, 0.80])  # what their thinner skin takes from the light besides
 _FLUSHED = {  # groups with more blood, and how much
     "nose_region": 0.22,
     "left_cheek_region": 0.12,
@@ -31,8 +32,9 @@ _FLUSHED = {  # groups with more blood, and how much
     "right_orbital_region": 0.08,
 }
 _STUBBLED = ("chin_region", "upper_lip_region", "lower_lip_region", "left_cheek_region", "right_cheek_region")
-_BROW_M = 0.0048  # half its height where it is fullest
-_BROW_HAIRS, _HAIR_M, _STRAND_M = 420, 0.0075, 0.00020  # number, length, half a hair's width
+_LASHES_M = (0.0026, 0.0016)  # from the eyeball: where lids begin to be dark, and are
+_BROW_M = 0.0042  # half its height where it is fullest
+_BROW_HAIRS, _HAIR_M, _STRAND_M = 380, 0.0070, 0.00016  # number, length, half a hair's width
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -40,7 +42,7 @@ class Look:
     """What a head is painted with. Colours are linear albedo."""
 
     seed: int = 0
-    melanin: float = 0.45  # 0.2 very light to 2.2 very dark
+    melanin: float = 0.6  # 0.2 very light to 2.2 very dark
     blood: float = 0.30
     unevenness: float = 1.0  # of the pigments; 0 is porcelain
     freckles: float = 0.35  # 0 to 1
@@ -71,14 +73,17 @@ class Look:
 def scalp(data: GNMData) -> Float[np.ndarray, "V"]:
     """How far (m) a vertex of the template lies inside the hairline; negative outside it.
 
-    Hair grows on the outer skin above the ears' lower rim and clear of the face mask and the ears.
+    Hair grows on the outer skin clear of the face mask and the ears: above the ears' lower rim behind them, above their
+    upper rim before them.
     """
     points = data.template_vertex_positions.astype(np.float64)
     face, ears = (group(data, name) > 0.5 for name in ("hockey_mask", "ears"))
-    to_face = cKDTree(points[face]).query(points)[0]
-    to_ears = cKDTree(points[ears]).query(points)[0] if ears.any() else np.full(len(points), np.inf)
-    nape = points[ears, 1].min() if ears.any() else points[face, 1].mean()
-    reach = np.minimum(np.minimum(to_face - 0.002, to_ears - 0.003), points[:, 1] - nape)
+    reach = cKDTree(points[face]).query(points)[0] - 0.002
+    if ears.any():
+        reach = np.minimum(reach, cKDTree(points[ears]).query(points)[0] - 0.006)
+        low, high = points[ears].min(0), points[ears].max(0)
+        sideburn = smoothstep((low[2] + high[2]) / 2, high[2], points[:, 2])
+        reach = np.minimum(reach, points[:, 1] - low[1] - sideburn * (0.8 * (high[1] - low[1])))
     return np.where(exterior(data) & ~face & ~ears, reach, np.minimum(reach, -0.002))
 
 
@@ -107,8 +112,8 @@ def _skin(data: GNMData, page: Canvas, points: Float[np.ndarray, "T 3"], look: L
         + 0.06 * noise.smooth(0.0035, seed + 3, octaves=2)
     )
     blood = 1 + uneven * (
-        0.16 * noise.smooth(0.040, seed + 4)
-        + 0.14 * noise.smooth(0.010, seed + 5, octaves=2)
+        0.10 * noise.smooth(0.040, seed + 4)
+        + 0.11 * noise.smooth(0.010, seed + 5, octaves=2)
         + 0.12 * noise.smooth(0.0028, seed + 6, octaves=2)
     )
     melanin = look.melanin * np.clip(melanin, 0.3, 2) + look.freckles * _freckles(noise, seed)
@@ -120,16 +125,17 @@ def _skin(data: GNMData, page: Canvas, points: Float[np.ndarray, "T 3"], look: L
         )
     lips = _lips(data, page)
     wrinkles = noise.smooth(0.0011, seed + 8, octaves=2)
-    blood = blood * (1 - lips) + lips * (0.95 + 0.10 * wrinkles)
-    melanin = melanin * (1 - lips) + lips * (0.55 * look.melanin + 0.08)
+    blood = blood * (1 - lips) + lips * (1.05 + 0.12 * wrinkles)
+    melanin = melanin * (1 - lips) + lips * (0.6 * look.melanin + 0.25)
     lining = page.interpolate(1.0 * ~exterior(data)) * (1 - page.interpolate(soft_group(data, "eye_sockets", 1)))
     blood += 0.9 * lining
     colour = _UNPIGMENTED * np.exp(-melanin[:, None] * _MELANIN - blood[:, None] * _BLOOD)
+    colour *= 1 - lips[:, None] * (1 - _LIPS)
     colour *= _pores(noise, seed, uneven * (1 - lips))[:, None]
     for cover, darkness in (
         (_stubble(data, page, noise, look), 0.75),
-        (_lashes(data, page, points), 0.85),
-        (_brows(data, page, points, look.seed), 0.94),
+        (_lashes(data, points), 0.85),
+        (_brows(data, page, points, look.seed), 0.9),
     ):
         colour += (cover * darkness)[:, None] * (np.array(look.hair) - colour)
     return colour.astype(np.float32)
@@ -144,8 +150,8 @@ def _freckles(noise: SolidNoise, seed: int) -> Float[np.ndarray, "T"]:
 
 def _moles(noise: SolidNoise, seed: int) -> Float[np.ndarray, "T"]:
     distance, number = noise.dots(0.030, seed + 22)
-    size = 0.0008 + 0.0016 * (number % 0.1) * 10
-    return 1.6 * smoothstep(1.15, 0.75, distance / size) * (number > 0.55)
+    size = 0.0006 + 0.0010 * (number % 0.1) * 10
+    return 2.2 * smoothstep(1.15, 0.75, distance / size) * (number > 0.55)
 
 
 def _pores(noise: SolidNoise, seed: int, strength: Float[np.ndarray, "T"]) -> Float[np.ndarray, "T"]:
@@ -174,13 +180,17 @@ def _stubble(data: GNMData, page: Canvas, noise: SolidNoise, look: Look) -> Floa
     return look.stubble * page.interpolate(beard) * (0.25 + 0.75 * hairs) * 0.8
 
 
-def _lashes(data: GNMData, page: Canvas, points: Float[np.ndarray, "T 3"]) -> Float[np.ndarray, "T"]:
-    """A dark line along the lids' rims, fuller above the eye."""
-    rim = page.interpolate(soft_group(data, "eye_sockets", 1))
-    line = smoothstep(0.12, 0.30, rim) * smoothstep(0.85, 0.55, rim)
-    heights = [eye_frame(data, side).centre[1] for side in SIDES]
-    above = smoothstep(-0.004, 0.002, points[:, 1] - np.float32(np.mean(heights)))
-    return line * (0.25 + 0.75 * above)
+def _lashes(data: GNMData, points: Float[np.ndarray, "T 3"]) -> Float[np.ndarray, "T"]:
+    """A dark line on the lids where they near the eyeball, fuller above the eye."""
+    cover = np.zeros(len(points), np.float32)
+    for side in SIDES:
+        frame = eye_frame(data, side)
+        height, _, angle = frame.polar(points.astype(np.float64))
+        gap = np.linalg.norm(points - frame.centre, axis=1) - frame.radius
+        above = smoothstep(-0.1, 0.35, np.sin(angle))
+        line = smoothstep(*_LASHES_M, gap) * (height > 0)
+        cover = np.maximum(cover, line * (0.25 + 0.75 * above))
+    return cover
 
 
 def _brows(data: GNMData, page: Canvas, points: Float[np.ndarray, "T 3"], seed: int) -> Float[np.ndarray, "T"]:
@@ -193,13 +203,16 @@ def _brows(data: GNMData, page: Canvas, points: Float[np.ndarray, "T 3"], seed: 
             continue
         degree = min(2, len(np.unique(region[:, 0].round(4))) - 1)
         arc, depth = np.polyfit(region[:, 0], region[:, 1], degree), np.polyfit(region[:, 0], region[:, 2], degree)
-        x = np.linspace(region[:, 0].min(), region[:, 0].max(), 64)
+        low, high = np.percentile(region[:, 0], (4, 80))  # the region reaches farther out than the hairs
+        x = np.linspace(low - _HAIR_M, high + _HAIR_M, 96)
         y = np.polyval(arc, x) + 0.12 * np.ptp(region[:, 1])
         along = np.r_[0, np.cumsum(np.linalg.norm(np.diff([x, y, np.polyval(depth, x)], axis=1), axis=0))]
+        along -= np.interp(low, x, along)
         near = np.flatnonzero(page.interpolate(soft_group(data, name, 2)) > 0.02)
         own = points[near] * (sign, 1, 1)
         flat = np.stack([np.interp(own[:, 0], x, along), own[:, 1] - np.interp(own[:, 0], x, y)], 1)
-        cover[near] = np.maximum(cover[near], _strokes(flat, along[-1], np.random.default_rng([seed, 6, number])))
+        strokes = _strokes(flat, np.interp(high, x, along), np.random.default_rng([seed, 6, number]))
+        cover[near] = np.maximum(cover[near], strokes * ((own[:, 0] > x[0]) & (own[:, 0] < x[-1])))
     return cover
 
 
