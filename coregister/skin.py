@@ -167,7 +167,7 @@ def _groups(
     base: np.ndarray,
     fine: Subdivision,
     vertices: Float[np.ndarray, "V 3"],
-    island: Int[np.ndarray, "4*Q"],
+    island: Int[np.ndarray, "F"],
     edges: Int[np.ndarray, "E 2"],
 ) -> dict[str, Bool[np.ndarray, "V"]]:
     count = len(vertices)
@@ -240,7 +240,7 @@ def _face_regions(
     graph = sp.csr_matrix((length, (inner[:, 0], inner[:, 1])), (len(vertices),) * 2)
     names, reach = [], []
     for name, points in _REGIONS.items():
-        left = front_points(vertices, face & (vertices[:, 0] > -1e-4), np.array(points))
+        left = front_points(vertices, face & (vertices[:, 0] > -1e-4), np.array(points, float))
         far = dijkstra(graph, directed=False, indices=left, min_only=True)
         if name in _SINGLE:
             names.append(f"{name}_region")

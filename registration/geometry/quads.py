@@ -93,7 +93,7 @@ class Subdivision:
 
     weights: sp.csr_matrix  # (V, B): fine = weights @ coarse; rows sum to one
     linear: sp.csr_matrix  # (V, B): the same vertices without smoothing, for values that must not shrink
-    quads: Int[np.ndarray, "4*Q 4"]
+    quads: Int[np.ndarray, "F 4"]  # F = 4 Q, those of a coarse quad one after another
     mirror: Int[np.ndarray, "V"]
 
 
