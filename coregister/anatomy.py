@@ -17,6 +17,7 @@ from coregister.makehuman import MakeHuman
 from coregister.parts import Part
 from coregister.population import Person
 from coregister.skin import Skin
+from coregister.teeth import Arch
 from registration.geometry.quads import Subdivision, subdivide
 
 COMPONENTS = ("skin", "left_eye", "right_eye", "upper_teeth_and_gums", "lower_teeth_and_gums", "tongue")
@@ -24,6 +25,7 @@ JOINTS = ("neck", "head", "left_eye", "right_eye")
 _LID_GAP = 0.15e-3  # metres between an eyeball and the skin that lies on it
 _LID_REACH = 2.0e-3  # skin this near to an eyeball's front rests on it
 _SETBACK = 0.6e-3  # the eye's front behind that of MakeHuman's larger ball, so that the cornea does not lift the lids
+_TONGUE_ROOM = 8.2e-3  # metres from the line on which the teeth stand to the tongue's sides and tip
 _HELPER_SHARE = 0.02  # weight of MakeHuman's own eye against one lid vertex, in placing an eye
 
 
@@ -181,7 +183,7 @@ def make(source: MakeHuman, person: Person) -> Anatomy:
     surface = off_eyes((surface + surface[made.part.mirror] * (-1, 1, 1)) / 2, centres)
     ball = eyes.eyeball()
     where = teeth.arch(base[source.group("helper-upper-teeth")], base[source.group("helper-lower-teeth")])
-    tongue, subdivision = _tongue_part(source, base)
+    tongue, subdivision = _tongue_part(source, base, where)
     parts = {
         "skin": _moved(made.part, surface),
         "left_eye": _moved(ball, ball.vertices + centres[0], "left_eye"),
@@ -217,15 +219,18 @@ def off_eyes(vertices: Float[np.ndarray, "V 3"], centres: Float[np.ndarray, "2 3
     return result
 
 
-def _tongue_part(source: MakeHuman, base: Float[np.ndarray, "B 3"]) -> tuple[Part, Subdivision]:
-    """MakeHuman's tongue, subdivided, attached to nothing; its own uvs."""
+def _tongue_part(source: MakeHuman, base: Float[np.ndarray, "B 3"], where: Arch) -> tuple[Part, Subdivision]:
+    """MakeHuman's tongue, subdivided, attached to nothing, made to lie within the teeth; its own uvs."""
     rows, coarse = np.unique(source.quads["helper-tongue"], return_inverse=True)
     fine = subdivide(coarse.reshape(-1, 4), np.searchsorted(rows, source.mirror[rows]))
     corners = source.uvs[source.uv_quads["helper-tongue"]]
     low, high = corners.min((0, 1)), corners.max((0, 1))
     vertices = np.asarray(fine.weights @ base[rows])
+    vertices = (vertices + vertices[fine.mirror] * (-1, 1, 1)) / 2
+    root, tip = vertices.min(0) * (0, 1, 1), vertices.max(0)
+    share = (np.array([where.half_width, 0, where.front]) - _TONGUE_ROOM - root) / (tip - root)
     part = Part(
-        vertices=(vertices + vertices[fine.mirror] * (-1, 1, 1)) / 2,
+        vertices=root + (vertices - root) * (min(1.0, share[0]), 1, min(1.0, share[2])),
         quads=fine.quads,
         quad_uvs=skin.fine_corners((corners - low) / (high - low)),
         groups={"tongue": np.ones(len(vertices), bool)},

@@ -36,8 +36,8 @@ def eyeball(limbus_radius: float = LIMBUS_RADIUS, cornea_radius: float = CORNEA_
     """One eye about the origin, 604 vertices: the exterior's first, then the interior's, each from front to back.
 
     The interior is the sclera, a little smaller, up to a flat iris in the plane of its front rim. Groups:
-    `eye_exteriors`, `eye_interiors` and, without overlap within the interior, `pupils` (the pupil's edge and all
-    inside it), `irises` (outside that edge, the rim included) and `scleras`. The eye is its own mirror image in x, so
+    `eye_exteriors`; `eye_interiors`, which `irises` (up to the rim, the pupil included) and `scleras` share without
+    overlap; and `pupils` (the pupil's edge and all inside it). The eye is its own mirror image in x, so
     `mirror` is the vertex at (-x, y, z), which is also the vertex of the other eye. In the uv map the exterior has the
     left half and the interior the right, each with its front above its back.
 
@@ -69,7 +69,7 @@ def eyeball(limbus_radius: float = LIMBUS_RADIUS, cornea_radius: float = CORNEA_
             "eye_exteriors": level < 0,
             "eye_interiors": level >= 0,
             "pupils": (level >= 0) & (level <= _PUPIL_EDGE),
-            "irises": (level > _PUPIL_EDGE) & (level < len(_IRIS)),
+            "irises": (level >= 0) & (level < len(_IRIS)),
             "scleras": level >= len(_IRIS),
         },
         mirror=np.arange(len(ring)) + mirrored,
@@ -82,7 +82,7 @@ def pupil_displacement(part: Part) -> Float[np.ndarray, "V 3"]:
     The pupil's radius is r_iris (1/2 + c/6): a point at -3, half the iris at rest, the whole iris at +3. The iris
     between pupil and rim is stretched or compressed linearly, the pupil inside its edge too.
     """
-    planar = part.vertices * [1, 1, 0] * (part.groups["irises"] | part.groups["pupils"])[:, None]
+    planar = part.vertices * [1, 1, 0] * part.groups["irises"][:, None]
     radius = np.linalg.norm(planar, axis=1, keepdims=True)
     moved = np.minimum(radius, radius.max() - radius) / 3
     return planar * np.divide(moved, radius, out=np.zeros_like(radius), where=radius > 0)

@@ -82,15 +82,16 @@ def test_the_interior_stays_inside(limbus: float, cornea: float) -> None:
 def test_groups_and_rings(eye: Part) -> None:
     groups = eye.groups
     assert set(groups) == {"eye_exteriors", "eye_interiors", "scleras", "irises", "pupils"}
-    parts = [groups[name].astype(int) for name in ("eye_exteriors", "scleras", "irises", "pupils")]
+    parts = [groups[name].astype(int) for name in ("eye_exteriors", "scleras", "irises")]
     assert (sum(parts) == 1).all()
+    assert (groups["pupils"] <= groups["irises"]).all()
     assert (groups["eye_interiors"] == ~groups["eye_exteriors"]).all()
     radius = np.hypot(*eye.vertices.T[:2])
     iris = radius[groups["irises"]].max()
     assert iris == pytest.approx(6e-3, rel=0.011)
     assert np.isclose(radius[groups["pupils"]], iris / 2, rtol=1e-12).sum() == eyes.SEGMENTS
     assert radius[groups["pupils"]].max() == pytest.approx(iris / 2, rel=1e-12)
-    assert np.ptp(eye.vertices[groups["irises"] | groups["pupils"]][:, 2]) < 1e-15  # flat
+    assert np.ptp(eye.vertices[groups["irises"]][:, 2]) < 1e-15  # flat
 
 
 def test_mirror(eye: Part) -> None:
@@ -110,7 +111,7 @@ def test_uv_charts(eye: Part) -> None:
     outside = eye.groups["eye_exteriors"][eye.quads].all(1)
     assert uvs[outside][..., 0].max() < 0.5 < uvs[~outside][..., 0].min()
     assert coverage(uvs).max() == 1
-    iris = (eye.groups["irises"] | eye.groups["pupils"])[eye.quads].all(1)
+    iris = eye.groups["irises"][eye.quads].all(1)
     offset = uvs[iris] - [0.75, 0.75]
     share = np.linalg.norm(offset, axis=-1) / np.linalg.norm(eye.vertices[eye.quads[iris]][..., :2], axis=-1).clip(1e-9)
     assert np.ptp(share[share > 0]) < 1e-9 * share.max()  # the iris is round and to scale
@@ -136,7 +137,8 @@ def coverage(uvs: np.ndarray, size: int = 512) -> np.ndarray:
 
 def test_pupil_end_points(eye: Part) -> None:
     basis = eyes.pupil_displacement(eye)
-    pupil, iris = eye.groups["pupils"], eye.groups["irises"]
+    pupil = eye.groups["pupils"]
+    iris = eye.groups["irises"] & ~pupil  # the visible ring
     assert (basis[~(pupil | iris)] == 0).all()
     rest = np.hypot(*eye.vertices.T[:2])
     limbus = rest[iris].max()
