@@ -25,7 +25,7 @@ JOINTS = ("neck", "head", "left_eye", "right_eye")
 _LID_GAP = 0.15e-3  # metres between an eyeball and the skin that lies on it
 _LID_REACH = 2.0e-3  # skin this near to an eyeball's front rests on it
 _SETBACK = 0.6e-3  # the eye's front behind that of MakeHuman's larger ball, so that the cornea does not lift the lids
-_TONGUE_ROOM = 8.2e-3  # metres from the line on which the teeth stand to the tongue's sides and tip
+_TONGUE_ROOM = np.array([8.2e-3, 0, 10.7e-3])  # metres from the line on which the teeth stand to its sides and tip
 _HELPER_SHARE = 0.02  # weight of MakeHuman's own eye against one lid vertex, in placing an eye
 
 
