@@ -220,4 +220,4 @@ def _scan(data: GNMData, head: StudioSurface, surfaces: list[StudioSurface], cam
 
 def _inside(camera: Camera, points: Float[np.ndarray, "P 3"]) -> Bool[np.ndarray, "P"]:
     xy = distorted_pixels(camera, points)
-    return (xy >= 0).all(1) & (xy <= (camera.width_px, camera.height_px)).all(1)
+    return np.logical_and(xy >= 0, xy <= (camera.width_px, camera.height_px)).all(1)

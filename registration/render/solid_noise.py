@@ -1,4 +1,4 @@
-"""Noise in space: a value for every point (m), whatever surface it lies on. Equal points and seeds give equal values."""
+"""Noise in space: a value for every point (m), whatever surface it lies on; equal for equal points and seeds."""
 
 from __future__ import annotations  # mi.Float exists only once a variant is chosen
 

@@ -1,4 +1,4 @@
-"""The photographer: lit pictures of surfaces by cameras with lenses and sensors, and what a lab would extract from them.
+"""The photographer: lit pictures of surfaces by cameras with lenses and sensors, and what a lab extracts from them.
 
 Light is baked to vertices once (`studio_light.py`); a picture is then texture times light, averaged over jittered rays.
 """

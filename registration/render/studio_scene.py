@@ -6,7 +6,7 @@ Some faces may be clear, as corneas are: pictures look through them, masks, norm
 from __future__ import annotations  # mi.Float exists only once a variant is chosen
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import drjit as dr
 import mitsuba as mi
@@ -16,7 +16,6 @@ from jaxtyping import Bool, Float, Int
 
 from registration.geometry.topology import edges, vertex_normals
 from registration.render.scene import TriangleScene
-from registration.render.shading import texel_footprint
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -29,12 +28,12 @@ class StudioSurface:
     texture: Float[np.ndarray, "R R 3"]  # linear albedo
     classes: Float[np.ndarray, "V K"]  # shares of the studio's classes
     clear: Bool[np.ndarray, "F"] | None = None  # faces that pictures look through
-    normals: Float[np.ndarray, "V 3"] = field(default_factory=lambda: np.zeros((0, 3)))  # unit; if empty, of the mesh
+    normals: Float[np.ndarray, "V 3"] | None = None  # unit; if not given, the mesh's, weighted by area
 
 
 def with_normals(surface: StudioSurface) -> Float[np.ndarray, "V 3"]:
     """The surface's own normals, or those of its mesh weighted by area."""
-    if len(surface.normals):
+    if surface.normals is not None:
         return surface.normals
     triangles = torch.as_tensor(surface.triangles.astype(np.int64))
     return vertex_normals(torch.as_tensor(surface.vertices.astype(np.float64)), triangles).numpy()
@@ -157,8 +156,9 @@ class StudioScene:
         uv = sum((w * corner for w, corner in zip(hit.weights, corners, strict=True)), mi.Point2f(0))
         size = dr.gather(mi.UInt32, self._texture_size, hit.face, hit.valid)
         start = dr.gather(mi.UInt32, self._texture_start, hit.face, hit.valid)
-        index, fx, fy = texel_footprint(uv, size)
-        index += start
+        x, y = (dr.clip(place * mi.Float(size) - 0.5, 0, mi.Float(size) - 1.001) for place in (uv.x, 1 - uv.y))
+        column, row = mi.UInt32(x), mi.UInt32(y)
+        index, fx, fy = start + row * size + column, x - mi.Float(column), y - mi.Float(row)
 
         def texel(index: mi.UInt32) -> mi.Color3f:
             return dr.gather(mi.Color3f, self._texels, index, hit.valid)
