@@ -10,6 +10,7 @@ from functools import cached_property
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
+from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from coregister import eyes, skin, teeth
@@ -23,6 +24,7 @@ from registration.geometry.quads import Subdivision, subdivide
 COMPONENTS = ("skin", "left_eye", "right_eye", "upper_teeth_and_gums", "lower_teeth_and_gums", "tongue")
 JOINTS = ("neck", "head", "left_eye", "right_eye")
 _LID_GAP = 0.15e-3  # metres between an eyeball and the skin that lies on it
+_LID_FADE = 7e-3  # metres along which a lid follows its rim
 _LID_REACH = 2.0e-3  # skin this near to an eyeball's front rests on it
 _SETBACK = 0.6e-3  # the eye's front behind that of MakeHuman's larger ball, so that the cornea does not lift the lids
 _TONGUE_ROOM = np.array([8.2e-3, 0, 10.7e-3])  # metres from the line on which the teeth stand to its sides and tip
@@ -119,7 +121,8 @@ class Anatomy:
         base = self.source.vertices + sum(weight * moves[name] for name, weight in person.weights.items())
         moved, moved_joints = self.identity(base - self.base)
         vertices, joints = self.template + moved, self.joints + moved_joints
-        vertices[self.slices["skin"]] = off_eyes(vertices[self.slices["skin"]], joints[2:])
+        skin = self.slices["skin"]
+        vertices[skin] = off_eyes(self._lids_closed(vertices[skin], joints[2:]), joints[2:])
         return self.aligned(vertices, joints)
 
     @cached_property
@@ -138,6 +141,28 @@ class Anatomy:
             near = np.linalg.norm(away, axis=1) < eyes.SCLERA_RADIUS + _LID_REACH
             found.append(np.flatnonzero(near & (away[:, 2] > 0) & self.parts["skin"].groups["skin_exterior"]))
         return found
+
+    def _lids_closed(
+        self, vertices: Float[np.ndarray, "N 3"], centres: Float[np.ndarray, "2 3"]
+    ) -> Float[np.ndarray, "N 3"]:
+        """The skin with the rims of the lids on the eyeballs, whose size is the same for everyone, and the lids after.
+
+        Along the rays from the eye's centre; what a rim is moved by fades out within `_LID_FADE`.
+        """
+        result = vertices.copy()
+        rest = self.parts["skin"].vertices
+        for side, centre in enumerate(centres):
+            lids = self._lids[side]
+            gap = _above_eye(rest[lids] - self.eye_centres[side])
+            rim = lids[gap < 2 * _LID_GAP]
+            distance, nearest = cKDTree(rest[rim]).query(rest)
+            moved = np.flatnonzero(distance < _LID_FADE)
+            away = vertices - centre
+            lift = _LID_GAP - _above_eye(away[rim])
+            share = (1 - (distance[moved] / _LID_FADE) ** 2) ** 2
+            outward = away[moved] / np.linalg.norm(away[moved], axis=1, keepdims=True)
+            result[moved] += (share * lift[nearest[moved]])[:, None] * outward
+        return result
 
     def _lids_shift(
         self, side: int, moved_skin: Float[np.ndarray, "N 3"], delta: Float[np.ndarray, "B 3"]
@@ -210,13 +235,16 @@ def off_eyes(vertices: Float[np.ndarray, "V 3"], centres: Float[np.ndarray, "2 3
     result = vertices.copy()
     for centre in centres:
         away = result - centre
-        distance = np.linalg.norm(away, axis=1)
-        angle = np.arccos(np.clip(away[:, 2] / np.maximum(distance, 1e-9), -1, 1))
-        limbus, cornea = np.array(eyes.LIMBUS_RADIUS), np.array(eyes.CORNEA_RADIUS)
-        least = eyes.radius_at(angle, limbus, cornea) + _LID_GAP
-        inside = distance < least
-        result[inside] = centre + away[inside] * (least / np.maximum(distance, 1e-9))[inside, None]
+        lack = np.maximum(_LID_GAP - _above_eye(away), 0)
+        result += away * (lack / np.maximum(np.linalg.norm(away, axis=1), 1e-9))[:, None]
     return result
+
+
+def _above_eye(away: Float[np.ndarray, "N 3"]) -> Float[np.ndarray, "N"]:
+    """How far points, relative to an eye's centre, lie outside the ball that looks along +Z; metres, along the ray."""
+    distance = np.linalg.norm(away, axis=1)
+    angle = np.arccos(np.clip(away[:, 2] / np.maximum(distance, 1e-9), -1, 1))
+    return distance - eyes.radius_at(angle, np.array(eyes.LIMBUS_RADIUS), np.array(eyes.CORNEA_RADIUS))
 
 
 def _tongue_part(source: MakeHuman, base: Float[np.ndarray, "B 3"], where: Arch) -> tuple[Part, Subdivision]:
