@@ -1,4 +1,5 @@
 # make setup   makes .venv with exactly the versions of constraints.txt, and finds or installs what the system must have
+# make demo    sets up, makes a head model and a capture from nothing, and registers it: about five minutes
 # make check   sets up, then style, types and import directions
 # make test    sets up, checks and runs the tests
 #
@@ -9,6 +10,7 @@ SHELL := /bin/bash
 .ONESHELL:
 
 BIN := .venv/bin
+DEMO := build/demo
 PYTHONS := $(or $(PYTHON),python3.13 python3.12 python3.11 python3)
 INSTALLED := .venv/installed-$(shell cat pyproject.toml constraints.txt | sha256sum | cut -c1-16)
 IN_RANGE := import sys; sys.exit(not (3, 11) <= sys.version_info[:2] <= (3, 13))
@@ -18,10 +20,20 @@ PIP := $(BIN)/python -m pip --disable-pip-version-check install --constraint con
 packages = { [ "$$(id -u)" = 0 ] && command -v apt-get >/dev/null && apt-get update -q \
 	&& DEBIAN_FRONTEND=noninteractive apt-get install -y -q --no-install-recommends $(1); }
 
-.PHONY: setup check test
+.PHONY: setup demo check test
 
 setup: $(INSTALLED)
 	@$(BIN)/python -m registration.render.llvm --install
+
+demo: setup
+	@rm -rf $(DEMO)
+	set -x
+	$(BIN)/gnmreg model bootstrap --out $(DEMO)/model/gnm_head_first.npz
+	$(BIN)/gnmreg capture synth $(DEMO)/capture --seed 8 --shirt
+	$(BIN)/gnmreg register $(DEMO)/capture --model $(DEMO)/model/gnm_head_first.npz --recipe draft --out $(DEMO)/registration
+	$(BIN)/gnmreg evaluate $(DEMO)/registration --capture $(DEMO)/capture
+	{ set +x; } 2>/dev/null
+	echo "Look at $(DEMO)/registration/report.html"
 
 check: setup
 	$(BIN)/ruff check .
