@@ -24,7 +24,8 @@ SHIRT_M = 0.005
 _UNDER_M = -0.0025  # the rim's depth under the skin
 _HAIR_TEXELS, _SHIRT_TEXELS = 1024, 512
 _OVERLAP = 1.1  # turns that the shirt's map spans: faces across its seam need no cut
-_HEM = ((0.012, 0.010), (0.030, 0.045), (0.036, 0.110))  # rings below the skin's rim: outwards and down, metres
+_HEM = ((0.012, 0.1), (0.028, 0.4), (0.036, 1.0))  # rings below the skin's rim: outwards (m), share of the way down
+_DEPTH_M = 0.15  # of the hem below the lowest point of the skin's rim: no camera sees the inside
 
 
 def hair(
@@ -92,7 +93,7 @@ class _Worn:
 
         posed = fine(head.vertices, reach[:, None])
         template = fine(data.template_vertex_positions.astype(np.float64), reach[:, None]).vertices
-        return cls(posed=posed, template=template, normals=posed.normals, reach=posed.classes[:, 0])
+        return cls(posed=posed, template=template, normals=with_normals(posed), reach=posed.classes[:, 0])
 
     def surface(
         self,
@@ -164,12 +165,13 @@ def _hemmed(data: GNMData, head: StudioSurface, worn: StudioSurface, neck: Float
     loop = _lower_rim(worn, local)
     vertices, triangles = [local], [worn.triangles]
     above = loop
-    for number, (out, down) in enumerate(_HEM):
+    floor = local[loop, 1].min() - _DEPTH_M
+    for number, (out, share) in enumerate(_HEM):
         away = local[loop, ::2] - neck[::2]
         away /= np.maximum(np.linalg.norm(away, axis=1, keepdims=True), 1e-9)
         ring = local[loop].copy()
         ring[:, ::2] += out * away * (1.0, 0.5)  # a body is wider than it is deep
-        ring[:, 1] -= down
+        ring[:, 1] += share * (floor - ring[:, 1])
         below = len(local) + number * len(loop) + np.arange(len(loop))
         vertices.append(ring)
         a, b = above, np.roll(above, -1)

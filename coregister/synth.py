@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float
 
-from coregister.studio_wear import hair, shirt
+from coregister.studio_wear import HAIR_M, hair, shirt
 from registration.capture.native_writer import write
 from registration.capture.scan import Scan
 from registration.errors import InputError
@@ -151,7 +151,7 @@ def _rig(data: GNMData, vertices: Float[np.ndarray, "V 3"], studio: Studio) -> t
         studio.distortion,
         centre=rotation @ ((low + high) / 2) + translation,
         R_world_head=rotation,
-        head_height_m=float(high[1] - low[1]),
+        head_height_m=float(high[1] - low[1]) + (2 * HAIR_M if studio.hair else 0),
         spread_deg=studio.spread_deg,
     )
 
@@ -220,4 +220,5 @@ def _scan(data: GNMData, head: StudioSurface, surfaces: list[StudioSurface], cam
 
 def _inside(camera: Camera, points: Float[np.ndarray, "P 3"]) -> Bool[np.ndarray, "P"]:
     xy = distorted_pixels(camera, points)
-    return np.logical_and(xy >= 0, xy <= (camera.width_px, camera.height_px)).all(1)
+    inside: Bool[np.ndarray, "P 2"] = (xy >= 0) & (xy <= (camera.width_px, camera.height_px))
+    return np.all(inside, axis=1)

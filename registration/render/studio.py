@@ -40,7 +40,7 @@ class Quality:
     """What a picture may cost."""
 
     pixel_samples: int = 3  # rays along each side of a pixel
-    light_rays: int = 256  # a vertex
+    light_rays: int = 160  # a vertex
     subdivisions: int = 1  # of the surfaces, for the light that their vertices carry
 
 

@@ -16,7 +16,7 @@ from jaxtyping import Float
 
 from registration.render.studio_scene import StudioScene
 
-BOUNCE_RAYS = 32  # a vertex, for the light that reaches it over two and more surfaces
+BOUNCE_RAYS = 24  # a vertex, for the light that reaches it over two and more surfaces
 BOUNCES = 3
 _LANES = 1 << 20  # rays at a time: about 200 MB
 _OFFSET_M = 2e-5  # rays start this far above their surface
@@ -43,7 +43,7 @@ class Sky:
         return mi.Color3f(*(share * channel for channel in self.tint))
 
 
-def bake(scene: StudioScene, sky: Sky, *, rays: int = 256, seed: int = 0) -> Float[np.ndarray, "V 3"]:
+def bake(scene: StudioScene, sky: Sky, *, rays: int = 160, seed: int = 0) -> Float[np.ndarray, "V 3"]:
     """Irradiance over pi of every vertex, linear RGB: times albedo it is the radiance that the surface sends out."""
     albedo = scene.vertex_albedo()
     turns = np.random.default_rng([seed, 2]).random((len(scene.vertices), 2), np.float32)

@@ -119,10 +119,11 @@ def _skin(data: GNMData, page: Canvas, points: Float[np.ndarray, "T 3"], look: L
     melanin = look.melanin * np.clip(melanin, 0.3, 2) + look.freckles * _freckles(noise, seed)
     melanin += _moles(noise, seed)
     blood = look.blood * np.clip(blood, 0.2, 2.5)
-    for name, more in _FLUSHED.items():
-        blood += (
-            more * page.interpolate(soft_group(data, name, 14)) * (1 + 0.25 * uneven * noise.smooth(0.012, seed + 7))
-        )
+    flush = sum(
+        (more * soft_group(data, name, 14) for name, more in _FLUSHED.items()),
+        np.zeros(len(data.template_vertex_positions)),
+    )
+    blood += page.interpolate(flush) * (1 + 0.25 * uneven * noise.smooth(0.012, seed + 7))
     lips = _lips(data, page)
     wrinkles = noise.smooth(0.0011, seed + 8, octaves=2)
     blood = blood * (1 - lips) + lips * (1.05 + 0.12 * wrinkles)

@@ -108,7 +108,7 @@ def test_the_scan_lies_in_the_masks(capture) -> None:
 
 
 def test_the_scan_is_the_heads_visible_outside(capture) -> None:
-    scan, truth = read_scan(capture.scan), vertices()
+    scan = read_scan(capture.scan)
     face = on_the_head(scan.vertices)
     assert len(np.unique(scan.triangles)) == len(scan.vertices) > 1.5 * exterior(TINY).sum()
     inner = (group(TINY, "teeth") + group(TINY, "tongue") + group(TINY, "gums"))[TINY.triangles].max(1) > 0.5
