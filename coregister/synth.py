@@ -26,6 +26,7 @@ from registration.render.studio_canvas import Canvas, canvas
 from registration.render.studio_eyes import corneas
 from registration.render.studio_light import Sky
 from registration.render.studio_rig import SPREAD_DEG, rig
+from registration.render.studio_rig import check as check_rig
 from registration.render.studio_scene import StudioScene, StudioSurface, subdivided
 from registration.render.studio_skin import Look, paint
 from registration.types import Camera
@@ -77,7 +78,8 @@ def write_capture(
     """
     studio = studio or Studio()
     root = Path(root)
-    _check(root, data, vertices, studio)
+    check(root, studio)
+    _check_vertices(data, vertices)
     vertices = np.asarray(vertices, np.float64)
     cameras = _rig(data, vertices, studio)
     backend.activate("llvm")
@@ -116,13 +118,13 @@ def pose(data: GNMData, vertices: Float[np.ndarray, "V 3"]) -> tuple[Float[np.nd
     return rotation, target.mean(0) - rotation @ source.mean(0)
 
 
-def _check(root: Path, data: GNMData, vertices: Float[np.ndarray, "V 3"], studio: Studio) -> None:
-    count = len(data.template_vertex_positions)
-    if root.exists():
+def check(root: Path, studio: Studio) -> None:
+    """Raises InputError for a folder that exists and for settings out of range; for callers with much to do before."""
+    if Path(root).exists():
         raise _wrong("The capture folder exists already", root, "a path that is free", "a file or folder")
-    if len(vertices) != count or not np.isfinite(vertices).all():
-        got = f"{len(vertices)}, {int(np.isfinite(vertices).all(1).sum())} of them finite"
-        raise _wrong("The vertices are not the model's", "vertices", f"{count} finite positions in metres", got)
+    check_rig(studio.cameras, studio.size_px, spread_deg=studio.spread_deg)
+    if studio.seed < 0:
+        raise _wrong("The seed is out of range", "studio.seed", "a whole number from 0", studio.seed)
     pixels = studio.cameras * studio.size_px[0] * studio.size_px[1]
     if pixels > MOST_PIXELS:
         raise _wrong("The images are too many and too large", "studio", f"{MOST_PIXELS} pixels in all", pixels)
@@ -134,6 +136,13 @@ def _check(root: Path, data: GNMData, vertices: Float[np.ndarray, "V 3"], studio
         raise _wrong("The quality is out of range", "studio.quality", expected, quality)
     if studio.bits not in (8, 16):
         raise _wrong("The images have a wrong depth", "studio.bits", "8 or 16", studio.bits)
+
+
+def _check_vertices(data: GNMData, vertices: Float[np.ndarray, "V 3"]) -> None:
+    count = len(data.template_vertex_positions)
+    if len(vertices) != count or not np.isfinite(vertices).all():
+        got = f"{len(vertices)}, {int(np.isfinite(vertices).all(1).sum())} of them finite"
+        raise _wrong("The vertices are not the model's", "vertices", f"{count} finite positions in metres", got)
 
 
 def _wrong(what: str, where: object, expected: object, got: object) -> InputError:
@@ -151,7 +160,7 @@ def _rig(data: GNMData, vertices: Float[np.ndarray, "V 3"], studio: Studio) -> t
         studio.distortion,
         centre=rotation @ ((low + high) / 2) + translation,
         R_world_head=rotation,
-        head_height_m=float(high[1] - low[1]) + (2 * HAIR_M if studio.hair else 0),
+        head_height_m=float(high[1] - low[1]) + 2 * HAIR_M,  # room for hair, worn or not: it moves no camera
         spread_deg=studio.spread_deg,
     )
 

@@ -11,7 +11,7 @@ LARGEST_PX = 8192  # a side of an image
 MOST_CAMERAS = 512
 SPREAD_DEG = (150.0, 60.0)  # horizontally, vertically
 DISTANCE_M = 1.2
-FILL = 0.86  # share of the image's height that the head's takes, from the front
+FILL = 0.9  # share of the image's height that the head's takes, from the front
 _LEVEL_DEG = 2.0  # the rig's middle row is this much above the head's centre
 _TURN_DEG, _ROLL_DEG, _AIM_M, _DISTANCE_SHARE, _FOCAL_SHARE, _CENTRE_SHARE = 2.0, 2.0, 0.006, 0.04, 0.03, 0.02
 
@@ -42,7 +42,7 @@ def rig(
     Raises:
         InputError: no cameras, or images of no size or beyond LARGEST_PX a side.
     """
-    _check(count, size_px, head_height_m, spread_deg)
+    check(count, size_px, head_height_m=head_height_m, spread_deg=spread_deg)
     rng = np.random.default_rng([seed, count])
     centre = np.zeros(3) if centre is None else np.asarray(centre, np.float64)
     turn = np.eye(3) if R_world_head is None else np.asarray(R_world_head, np.float64)
@@ -52,7 +52,10 @@ def rig(
     )
 
 
-def _check(count: int, size_px: tuple[int, int], head_height_m: float, spread_deg: tuple[float, float]) -> None:
+def check(
+    count: int, size_px: tuple[int, int], *, head_height_m: float = 0.3, spread_deg: tuple[float, float] = SPREAD_DEG
+) -> None:
+    """Raises InputError for what `rig` cannot make."""
     if not 1 <= count <= MOST_CAMERAS:
         raise _wrong("number of cameras", f"1 to {MOST_CAMERAS}", count)
     if len(size_px) != 2 or not all(isinstance(side, int) and 1 <= side <= LARGEST_PX for side in size_px):

@@ -17,7 +17,7 @@ from registration.render.studio_canvas import Canvas, smoothstep, soft_group, so
 from registration.render.studio_eyes import SIDES, eye_frame, paint_eye
 
 _UNPIGMENTED = np.array([0.86, 0.78, 0.70])
-_MELANIN = np.array([0.42, 0.76, 1.18])  # absorption per unit
+_MELANIN = np.array([0.46, 0.76, 1.08])  # absorption per unit
 _BLOOD = np.array([0.10, 0.66, 0.60])
 _LIPS = np.array([0.80, 0.66, 0.80])  # what their thinner skin takes from the light besides
 _FLUSHED = {  # groups with more blood, and how much
@@ -116,7 +116,9 @@ def _skin(data: GNMData, page: Canvas, points: Float[np.ndarray, "T 3"], look: L
         + 0.11 * noise.smooth(0.010, seed + 5, octaves=2)
         + 0.12 * noise.smooth(0.0028, seed + 6, octaves=2)
     )
-    melanin = look.melanin * np.clip(melanin, 0.3, 2) + look.freckles * _freckles(noise, seed)
+    melanin = (
+        look.melanin + min(look.melanin, 0.6) * np.clip(melanin - 1, -0.7, 1) + look.freckles * _freckles(noise, seed)
+    )
     melanin += _moles(noise, seed)
     blood = look.blood * np.clip(blood, 0.2, 2.5)
     flush = sum(

@@ -14,7 +14,11 @@ HEAVY = {"torch", "mitsuba", "drjit", "numpy", "scipy", "cv2", "pycolmap", "korn
 
 
 @pytest.mark.parametrize(
-    "command", ["", "register", "evaluate", "capture", "capture check", "model", "model info", "model fetch"]
+    "command",
+    [
+        *("", "register", "evaluate", "capture", "capture check", "capture synth"),
+        *("model", "model info", "model fetch", "model bootstrap"),
+    ],
 )
 def test_every_command_explains_itself(command: str, capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as stop:
@@ -53,6 +57,45 @@ def test_input_error_is_told_without_a_traceback(pair: str, tmp_path: Path, caps
     assert "SCHEME=FILE" in error and pair in error and "fix:" in error
     assert "Traceback" not in error
     assert not out.exists()
+
+
+@pytest.mark.parametrize(
+    "flags, what",
+    [
+        ("--views 0", "number of cameras"),
+        ("--size 480 20000", "image size"),
+        ("--size 0 10", "image size"),
+        ("--views 500 --size 8000 8000", "too many and too large"),
+        ("--seed -1", "seed"),
+        ("--expression grin", "no such expression"),
+        ("--target nose", "NAME=WEIGHT"),
+        ("--target nose/nose-hump-incr=much", "NAME=WEIGHT"),
+        ("--target nose/nose-hump-incr=nan", "weight is out of range"),
+    ],
+)
+def test_bad_studios_are_told_before_any_work(
+    flags: str, what: str, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "empty"))
+    monkeypatch.setenv("PIP_NO_INDEX", "1")  # neither model nor population can be had: they must not be asked for
+    assert main(["capture", "synth", str(tmp_path / "capture"), *flags.split()]) == 2
+    error = capsys.readouterr().err
+    assert what in error and "fix:" in error and "Traceback" not in error
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_synthetic_capture_replaces_nothing(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "mine").write_text("mine")
+    assert main(["capture", "synth", str(tmp_path)]) == 2
+    assert "exists already" in capsys.readouterr().err
+    assert (tmp_path / "mine").read_text() == "mine"
+
+
+def test_a_seed_is_a_number(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as stop:
+        main(["capture", "synth", str(tmp_path / "capture"), "--seed", "abc"])
+    assert stop.value.code == 2
+    assert "--seed" in capsys.readouterr().err
 
 
 def test_model_info_tells_and_draws(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
