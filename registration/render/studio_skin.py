@@ -42,7 +42,7 @@ class Look:
     """What a head is painted with. Colours are linear albedo."""
 
     seed: int = 0
-    melanin: float = 0.6  # 0.2 very light to 2.2 very dark
+    melanin: float = 0.7  # 0.2 very light to 2.2 very dark
     blood: float = 0.30
     unevenness: float = 1.0  # of the pigments; 0 is porcelain
     freckles: float = 0.35  # 0 to 1
@@ -129,7 +129,7 @@ def _skin(data: GNMData, page: Canvas, points: Float[np.ndarray, "T 3"], look: L
     lips = _lips(data, page)
     wrinkles = noise.smooth(0.0011, seed + 8, octaves=2)
     blood = blood * (1 - lips) + lips * (1.05 + 0.12 * wrinkles)
-    melanin = melanin * (1 - lips) + lips * (0.6 * look.melanin + 0.25)
+    melanin = melanin * (1 - lips) + lips * (0.9 * look.melanin + 0.10)
     lining = page.interpolate(1.0 * ~exterior(data)) * (1 - page.interpolate(soft_group(data, "eye_sockets", 1)))
     blood += 0.9 * lining
     colour = _UNPIGMENTED * np.exp(-melanin[:, None] * _MELANIN - blood[:, None] * _BLOOD)

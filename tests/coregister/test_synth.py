@@ -136,8 +136,12 @@ def test_labels_are_those_of_the_vertices(capture) -> None:
         value, inside = at(labels, pixels_of(view.camera, truth[chosen]))
         expected = np.array([LABELS.index(names[k]) for k in own[chosen[inside]]])
         value = np.where(value == LABELS.index("neck_other"), LABELS.index("skin"), value)
-        # A pixel is 2 mm: beside an eye's or an ear's rim its centre may show the other side.
-        assert len(value) > 100 and (value == expected).mean() > 0.95
+        assert len(value) > 100 and (value == expected).mean() > 0.93
+        # A pixel is 2 mm: beside an eye's or an ear's rim its centre may show the other side, but no more than that.
+        xy = pixels_of(view.camera, truth[chosen[inside]])
+        merged = np.where(labels == LABELS.index("neck_other"), LABELS.index("skin"), labels)
+        around = [at(np.pad(merged, 1), xy + (1 + x, 1 + y))[0] for x in (-1, 0, 1) for y in (-1, 0, 1)]
+        assert (np.stack(around) == expected).any(0).mean() > 0.99
         seen_classes |= set(np.unique(value).tolist())
     assert {LABELS.index(name) for name in ("skin", "left_eye", "right_eye", "ears")} <= seen_classes
 
