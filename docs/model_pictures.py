@@ -48,7 +48,7 @@ UNITS = ("browInnerUp", "browDownLeft", "eyeBlinkLeft", "eyeWideRight", "noseSne
 # Towards the light from the camera: x right, y down, z forward.
 KEY, FILL = np.array([-0.45, -0.6, -0.66]), np.array([0.8, -0.1, -0.59])
 FRONT, SIDE = (0.0, 0.0, 1.0), (1.0, 0.0, 0.0)
-HEAD, MOUTH = (0.0, 0.26, 0.03), (0.0, 0.232, 0.10)
+HEAD = (0.0, 0.26, 0.03)
 Picture = UInt8[np.ndarray, "H W 3"]
 
 
@@ -237,7 +237,7 @@ def _normals(vertices: Float[np.ndarray, "V 3"], triangles: Int[np.ndarray, "F 3
 def maps(data: GNMData) -> Picture:
     """The texture maps of skin, left eye, upper teeth and tongue: quads, the skin's in its regions' colours."""
     hues = np.linspace(0, 179, len(REGIONS), endpoint=False)[np.argsort(np.arange(len(REGIONS)) * 7 % len(REGIONS))]
-    region = [cv2.cvtColor(np.uint8([[[hue, 70, 235]]]), cv2.COLOR_HSV2RGB)[0, 0] for hue in hues]
+    region = [cv2.cvtColor(np.array([[[hue, 70, 235]]], np.uint8), cv2.COLOR_HSV2RGB)[0, 0] for hue in hues]
     colours = colours_of(data)
     for name, colour in zip(REGIONS, region, strict=True):
         colours[group(data, f"{name}_region") > 0.5] = colour
