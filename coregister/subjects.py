@@ -15,7 +15,7 @@ from coregister.synth import Studio, check, write_capture
 from registration.errors import InputError
 from registration.model import gnm_npz
 from registration.model.landmarks import schemes_beside
-from registration.render.studio_skin import Look
+from registration.render.studio.skin import Look
 
 _TURN_DEG = 4.0  # standard deviation of a subject's head in the studio, about each axis
 _SHIFT = 8e-3  # metres

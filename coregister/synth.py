@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float
 
-from coregister.studio_wear import HAIR_M, hair, shirt
+from coregister.wear import HAIR_M, hair, shirt
 from registration.capture.native_writer import write
 from registration.capture.scan import Scan
 from registration.errors import InputError
@@ -21,14 +21,14 @@ from registration.model.gnm_npz import GNMData
 from registration.model.landmarks import LandmarkScheme
 from registration.model.regions import CLASSES, exterior, group, neck_other, vertex_classes
 from registration.render import backend
-from registration.render.studio import Quality, Sensor, distorted_pixels, seen, shoot
-from registration.render.studio_canvas import Canvas, canvas
-from registration.render.studio_eyes import corneas
-from registration.render.studio_light import Sky
-from registration.render.studio_rig import SPREAD_DEG, rig
-from registration.render.studio_rig import check as check_rig
-from registration.render.studio_scene import StudioScene, StudioSurface, subdivided
-from registration.render.studio_skin import Look, paint
+from registration.render.studio.canvas import Canvas, canvas
+from registration.render.studio.eyes import corneas
+from registration.render.studio.light import Sky
+from registration.render.studio.rig import SPREAD_DEG, rig
+from registration.render.studio.rig import check as check_rig
+from registration.render.studio.scene import StudioScene, StudioSurface, subdivided
+from registration.render.studio.shoot import Quality, Sensor, distorted_pixels, seen, shoot
+from registration.render.studio.skin import Look, paint
 from registration.types import Camera
 
 NECK, HAIR, CLOTHES = "neck_other", "hair", "clothes"

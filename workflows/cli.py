@@ -137,7 +137,7 @@ def synth_capture(
     targets = _target_weights(target)
     from coregister.subjects import capture
     from coregister.synth import Studio
-    from registration.render.studio import Sensor
+    from registration.render.studio.shoot import Sensor
 
     sensor = Sensor(shot_noise=0.01, read_noise=0.002, exposure_spread=0.05, colour_spread=0.03) if noise else Sensor()
     studio = Studio(

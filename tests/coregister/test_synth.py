@@ -23,7 +23,7 @@ from registration.model import gnm_npz
 from registration.model.gnm_numpy import evaluate
 from registration.model.landmarks import read_scheme
 from registration.model.regions import exterior, group, vertex_classes
-from registration.render.studio import Quality, Sensor
+from registration.render.studio.shoot import Quality, Sensor
 
 FIXTURES = Path(__file__).resolve().parents[1] / "fixtures"
 TINY = gnm_npz.read(FIXTURES / "tiny_gnm.npz")

@@ -16,14 +16,14 @@ from registration.model import gnm_npz
 from registration.model.atlas import texture_atlas
 from registration.model.regions import group, vertex_classes
 from registration.render import backend
-from registration.render.solid_noise import SolidNoise
-from registration.render.studio import HIDDEN, Quality, Sensor, distorted_pixels, shoot
-from registration.render.studio_canvas import canvas, smoothstep, texture_of
-from registration.render.studio_eyes import corneas, eye_frame
-from registration.render.studio_light import Sky, bake
-from registration.render.studio_rig import FILL, LARGEST_PX, SPREAD_DEG, rig
-from registration.render.studio_scene import StudioScene, StudioSurface, subdivided, with_normals
-from registration.render.studio_skin import Look, paint, scalp
+from registration.render.studio.canvas import canvas, smoothstep, texture_of
+from registration.render.studio.eyes import corneas, eye_frame
+from registration.render.studio.light import Sky, bake
+from registration.render.studio.noise import SolidNoise
+from registration.render.studio.rig import FILL, LARGEST_PX, SPREAD_DEG, rig
+from registration.render.studio.scene import StudioScene, StudioSurface, subdivided, with_normals
+from registration.render.studio.shoot import HIDDEN, Quality, Sensor, distorted_pixels, shoot
+from registration.render.studio.skin import Look, paint, scalp
 from registration.types import Camera
 from tests.conftest import SHARED, needs_shared
 
@@ -447,5 +447,5 @@ def test_canvas_covers_every_face_and_fills_the_rest():
 
 
 def test_the_rig_needs_no_renderer():
-    code = "import sys, registration.render.studio_rig; assert 'mitsuba' not in sys.modules"
+    code = "import sys, registration.render.studio.rig; assert 'mitsuba' not in sys.modules"
     subprocess.run([sys.executable, "-c", code], check=True)

@@ -7,8 +7,8 @@ from jaxtyping import Bool, Float
 
 from registration.model.gnm_npz import GNMData
 from registration.model.regions import group
-from registration.render.solid_noise import SolidNoise
-from registration.render.studio_canvas import smoothstep
+from registration.render.studio.canvas import smoothstep
+from registration.render.studio.noise import SolidNoise
 
 SIDES = ("left_eye", "right_eye")
 _INSIDE = 0.5

@@ -14,10 +14,10 @@ from scipy.sparse.csgraph import connected_components
 from registration.geometry.topology import edges
 from registration.model.gnm_npz import GNMData
 from registration.model.regions import exterior, group
-from registration.render.solid_noise import SolidNoise
-from registration.render.studio_canvas import canvas, smoothstep, softened, texture_of
-from registration.render.studio_scene import StudioSurface, subdivided, with_normals
-from registration.render.studio_skin import Look, scalp
+from registration.render.studio.canvas import canvas, smoothstep, softened, texture_of
+from registration.render.studio.noise import SolidNoise
+from registration.render.studio.scene import StudioSurface, subdivided, with_normals
+from registration.render.studio.skin import Look, scalp
 
 HAIR_M = 0.012  # thickness where it is full
 SHIRT_M = 0.005

@@ -1,6 +1,6 @@
 """The photographer: lit pictures of surfaces by cameras with lenses and sensors, and what a lab extracts from them.
 
-Light is baked to vertices once (`studio_light.py`); a picture is then texture times light, averaged over jittered rays.
+Light is baked to vertices once (`light.py`); a picture is then texture times light, averaged over jittered rays.
 """
 
 from __future__ import annotations  # mi.Float exists only once a variant is chosen
@@ -15,8 +15,8 @@ import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
 from registration.capture.native_writer import PlainView
-from registration.render.studio_light import Sky, bake
-from registration.render.studio_scene import Hit, StudioScene, StudioSurface, subdivided
+from registration.render.studio.light import Sky, bake
+from registration.render.studio.scene import Hit, StudioScene, StudioSurface, subdivided
 from registration.types import Camera
 
 HIDDEN = 0.2  # confidence of a landmark that something hides, or that is outside the image

@@ -12,9 +12,9 @@ from scipy.spatial import cKDTree
 
 from registration.model.gnm_npz import GNMData
 from registration.model.regions import exterior, group
-from registration.render.solid_noise import SolidNoise
-from registration.render.studio_canvas import Canvas, smoothstep, soft_group, softened, texture_of
-from registration.render.studio_eyes import SIDES, eye_frame, paint_eye
+from registration.render.studio.canvas import Canvas, smoothstep, soft_group, softened, texture_of
+from registration.render.studio.eyes import SIDES, eye_frame, paint_eye
+from registration.render.studio.noise import SolidNoise
 
 _UNPIGMENTED = np.array([0.86, 0.78, 0.70])
 _MELANIN = np.array([0.46, 0.76, 1.08])  # absorption per unit

@@ -14,7 +14,7 @@ import mitsuba as mi
 import numpy as np
 from jaxtyping import Float
 
-from registration.render.studio_scene import StudioScene
+from registration.render.studio.scene import StudioScene
 
 BOUNCE_RAYS = 24  # a vertex, for the light that reaches it over two and more surfaces
 BOUNCES = 3
