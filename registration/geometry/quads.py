@@ -98,7 +98,10 @@ class Subdivision:
 
 
 def subdivide(quads: Int[np.ndarray, "Q 4"], mirror: Int[np.ndarray, "B"]) -> Subdivision:
-    """Catmull-Clark with smooth boundary curves (Catmull and Clark 1978; boundary rules of DeRose et al. 1998)."""
+    """Catmull-Clark with smooth boundary curves (Catmull and Clark 1978; boundary rules of DeRose et al. 1998).
+
+    Every one of the B vertices must belong to a quad.
+    """
     edges, of_quad, count = edges_of(quads)
     B, E, Q = len(mirror), len(edges), len(quads)
     quad_corner = _matrix(np.repeat(np.arange(Q), 4), quads.ravel(), 0.25, (Q, B))

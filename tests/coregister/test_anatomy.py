@@ -113,7 +113,7 @@ def test_blinking_closes_the_eyes(model, template, expressed):
         print(f"{unit}: {left[0]} px of {rest[side]} seen, {left[1]} by the basis, lids {1e3 * deepest:.2f} mm over it")
         assert max(left) < 0.05 * rest[side] and deepest > -0.2e-3
         other = seen_of_eyes(model, template + moved)[1 - side]
-        assert abs(other - rest[1 - side]) <= 0.02 * rest[1 - side]
+        assert abs(other - rest[1 - side]) <= 0.05 * rest[1 - side]
 
 
 def test_the_pupil_goes_from_a_point_to_the_whole_iris(model, template):

@@ -1,4 +1,4 @@
-"""From nothing: a subject that the first model does not span, photographed and registered; figures against the truth."""
+"""From nothing: a subject beyond the first model's span, photographed and registered; figures against the truth."""
 
 from pathlib import Path
 
