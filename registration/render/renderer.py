@@ -144,6 +144,32 @@ class Renderer:
         dr.backward(value * (1 / len(self._pixel_offsets)))
         return corners
 
+    def _interior_gradients(
+        self,
+        surface: Surface,
+        pixels: PixelList,
+        seen: list[mi.UInt32],
+        adjoint: mi.Float,
+        positions: Tensor,
+        normals: Tensor,
+    ) -> tuple[Tensor, Tensor]:
+        """Add what the inside of the faces gives to the two gradients; the texture's stays with the surface."""
+        for offset, faces in zip(self._pixel_offsets, seen, strict=True):
+            corners = self._interior(surface, pixels, offset, faces, adjoint)
+            if corners is not None:
+                _add(positions, zip(corners.vertices, map(dr.grad, corners.positions), strict=True))
+                _add(normals, zip(corners.vertices, map(dr.grad, corners.normals), strict=True))
+        return positions, normals
+
+    def _edge_gradients(self, surface: Surface, pixels: PixelList, adjoint: mi.Float, positions: Tensor) -> Tensor:
+        """Add what the silhouettes give to the gradient of positions."""
+        self._seed += 1
+        terms = silhouette.backward(
+            self._scene, surface, self._edges, pixels, adjoint, samples_per_px=self._edge_samples, seed=self._seed
+        )
+        _add(positions, terms)
+        return positions
+
     def _splat(self, surface: Surface, pixels: PixelList, values: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:
         size, depth = surface.texture_size, values.shape[-1]
         with dr.suspend_grad():
@@ -194,27 +220,16 @@ class _Draw(torch.autograd.Function):
         surface = renderer._surface(positions, normals, texture)
         if ctx.needs_input_grad[2]:
             dr.enable_grad(surface.texture)
-        position_gradient, normal_gradient = torch.zeros_like(positions), torch.zeros_like(normals)
-        for offset, seen in zip(renderer._pixel_offsets, ctx.seen, strict=True):
-            corners = renderer._interior(surface, ctx.pixels, offset, seen, adjoint)
-            if corners is not None:
-                _add(position_gradient, zip(corners.vertices, map(dr.grad, corners.positions), strict=True))
-                _add(normal_gradient, zip(corners.vertices, map(dr.grad, corners.normals), strict=True))
+        position_gradient, normal_gradient = renderer._interior_gradients(
+            surface, ctx.pixels, ctx.seen, adjoint, torch.zeros_like(positions), torch.zeros_like(normals)
+        )
         texture_gradient = None
         if texture is not None and ctx.needs_input_grad[2]:
             texture_gradient = dr.grad(surface.texture).torch().reshape(texture.shape).clone()
         if ctx.needs_input_grad[0]:
-            renderer._seed += 1
-            terms = silhouette.backward(
-                renderer._scene,
-                renderer._surface(positions, normals, texture),
-                renderer._edges,
-                ctx.pixels,
-                adjoint,
-                samples_per_px=renderer._edge_samples,
-                seed=renderer._seed,
+            renderer._edge_gradients(
+                renderer._surface(positions, normals, texture), ctx.pixels, adjoint, position_gradient
             )
-            _add(position_gradient, terms)
         return position_gradient, normal_gradient, texture_gradient, None, None
 
 

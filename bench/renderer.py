@@ -1,0 +1,217 @@
+"""What one step of the renderer costs, as a ratio to the bare ray cast of every pixel of every view.
+
+    python bench/renderer.py --case 22x512 --case 8x512 --case 8x256 [--variant llvm|cuda] [--memory]
+
+A case is VIEWSxSIDE. The scene is the first model's head and the studio's rig; the head moves in every iteration. The
+floor is one coherent cast of *all* pixels with the BVH built; what the renderer draws is what a fit compares, the
+pixels in and near the head. Stages are medians over interleaved repeats. `misses` counts kernels that had to be
+compiled after the second iteration; `memory_growth` is the process' size at iteration 1,000 over that at 100, minus 1.
+"""
+
+import argparse
+import os
+import statistics
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import cv2
+import numpy as np
+import torch
+from rich.console import Console
+from rich.table import Table
+
+from coregister.bootstrap import bootstrap
+from coregister.synth import label_shares
+from registration.model import gnm_npz
+from registration.model.atlas import texture_atlas
+from registration.render import backend
+from registration.render.studio.rig import rig
+from registration.types import Pixels
+
+REPEATS = 7
+CLASSES = 9  # 16 channels: colour, normal, mask and these
+TEXTURE_PX = 1024
+NEAR = 0.08  # of the image's height: how far around the head a fit compares pixels
+MOTION = 1e-4  # metres, standard deviation, of every vertex in every iteration
+CAST, MOVE, FORWARD, INTERIOR, EDGES, WHOLE = (
+    "bare ray cast of all pixels (the floor)",
+    "vertex update and BVH",
+    "forward, 16 channels",
+    "interior adjoint, with texture",
+    "silhouettes",
+    "whole iteration",
+)
+
+
+class Case:
+    """One scene on the device, ready to be timed."""
+
+    def __init__(self, views: int, side: int, device: torch.device):
+        from registration.render.renderer import Renderer
+
+        data = gnm_npz.read(bootstrap())
+        head = data.template_vertex_positions.astype(np.float64)
+        centre = (head.min(0) + head.max(0)) / 2
+        cameras = rig(views, (side, side), 0, centre=centre, head_height_m=float(np.ptp(head[:, 1])))
+        triangles = data.triangles.astype(np.int64)
+        shares = label_shares(data)[:, :CLASSES]
+        self.renderer = Renderer(triangles, texture_atlas(data), shares.astype(np.float32))
+        self.all = Pixels.all_of(cameras, device)
+        self.rest = torch.as_tensor(head, dtype=torch.float32, device=device)
+        generator = torch.Generator().manual_seed(0)
+        self.texture = torch.rand(TEXTURE_PX, TEXTURE_PX, 3, generator=generator).to(device).requires_grad_()
+        with torch.no_grad():
+            mask = self.all.image(self.renderer(self.rest, None, self.all).mask[:, None])[..., 0] > 0
+        self.hits = float(mask.float().mean())
+        kernel = np.ones((2 * int(NEAR * side) + 1,) * 2, np.uint8)
+        near = np.stack([cv2.dilate(m, kernel) for m in mask.cpu().numpy().astype(np.uint8)]) > 0
+        self.pixels = Pixels.of(cameras, torch.as_tensor(near, device=device))
+        self.adjoint = torch.rand(len(self.pixels.view), 7 + CLASSES, generator=generator).to(device)
+        self._steps = torch.Generator().manual_seed(1)
+
+    def moved(self) -> torch.Tensor:
+        """The head a little elsewhere: a BVH that is not rebuilt would not count."""
+        step = MOTION * torch.randn(self.rest.shape, generator=self._steps)
+        return (self.rest + step.to(self.rest.device)).requires_grad_()
+
+    def iterate(self) -> None:
+        vertices = self.moved()
+        drawn = self.renderer(vertices, self.texture, self.pixels)
+        image = torch.cat([drawn.rgb, drawn.normals, drawn.mask[:, None], drawn.classes], 1)
+        torch.autograd.grad(image, (vertices, self.texture), self.adjoint)
+
+
+@dataclass
+class Clock:
+    """Wraps the renderer's stages and adds up the seconds spent in each until asked."""
+
+    seconds: dict[str, float]
+
+    def around(self, owner: Any, name: str, stage: str) -> None:
+        import drjit as dr
+
+        inner: Callable[..., Any] = getattr(owner, name)
+
+        def timed(*args: Any, **kwargs: Any) -> Any:
+            dr.sync_thread()
+            begun = time.perf_counter()
+            result = inner(*args, **kwargs)
+            dr.sync_thread()
+            self.seconds[stage] = self.seconds.get(stage, 0.0) + time.perf_counter() - begun
+            return result
+
+        setattr(owner, name, timed)
+
+    def take(self) -> dict[str, float]:
+        taken, self.seconds = self.seconds, {}
+        return taken
+
+
+def floor(case: Case) -> Callable[[], None]:
+    """The cast of all pixels, on the BVH as it stands."""
+    import drjit as dr
+    import mitsuba as mi
+
+    from registration.render.cameras import upload
+
+    pixels = upload(case.all)
+    origin, direction = pixels.rays((0.5, 0.5))
+    dr.eval(origin, direction)
+    dr.sync_thread()
+
+    def cast() -> None:
+        hit = case.renderer._scene.cast(origin, direction, mi.Bool(True), coherent=True)
+        dr.eval(hit.t, hit.prim_index, hit.prim_uv)
+        dr.sync_thread()
+
+    return cast
+
+
+def timed(call: Callable[[], None]) -> float:
+    begun = time.perf_counter()
+    call()
+    return time.perf_counter() - begun
+
+
+def measure(case: Case) -> dict[str, float]:
+    """Median seconds of every stage."""
+    from registration.render.renderer import Renderer
+    from registration.render.scene import TriangleScene
+
+    cast = floor(case)
+    for _ in range(3):
+        case.iterate()
+        cast()
+    clock = Clock({})
+    originals = [(owner, name, getattr(owner, name)) for owner, name in _stages(Renderer, TriangleScene)]
+    found: dict[str, list[float]] = {}
+    for _ in range(REPEATS):
+        found.setdefault(CAST, []).append(timed(cast))
+        found.setdefault(WHOLE, []).append(timed(case.iterate))
+        for (owner, name, _original), stage in zip(originals, (MOVE, FORWARD, INTERIOR, EDGES), strict=True):
+            clock.around(owner, name, stage)
+        case.iterate()
+        for owner, name, original in originals:
+            setattr(owner, name, original)
+        for stage, seconds in clock.take().items():
+            found.setdefault(stage, []).append(seconds)
+    return {stage: statistics.median(seconds) for stage, seconds in found.items()}
+
+
+def _stages(renderer: type, scene: type) -> list[tuple[type, str]]:
+    return [(scene, "move"), (renderer, "_forward"), (renderer, "_interior_gradients"), (renderer, "_edge_gradients")]
+
+
+def misses(case: Case, iterations: int = 5) -> int:
+    """Kernels compiled in some more iterations."""
+    import drjit as dr
+
+    with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
+        dr.kernel_history_clear()
+        for _ in range(iterations):
+            case.iterate()
+        return sum(not entry["cache_hit"] for entry in dr.kernel_history() if "cache_hit" in entry)
+
+
+def resident_bytes() -> int:
+    with open("/proc/self/statm") as file:
+        return int(file.read().split()[1]) * os.sysconf("SC_PAGE_SIZE")
+
+
+def memory_growth(device: torch.device) -> float:
+    case = Case(8, 128, device)
+    for iteration in range(1, 1001):
+        case.iterate()
+        if iteration == 100:
+            early = resident_bytes()
+    return resident_bytes() / early - 1
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--case", action="append", default=[], metavar="VIEWSxSIDE")
+    parser.add_argument("--variant", choices=("llvm", "cuda"), default="llvm")
+    parser.add_argument("--memory", action="store_true")
+    options = parser.parse_args()
+    device = backend.activate(options.variant)
+    lines, missed = [], 0
+    for name in options.case:
+        views, side = map(int, name.split("x"))
+        case = Case(views, side, device)
+        seconds = measure(case)
+        missed += misses(case)
+        title = f"{name}: {len(case.all.view):,} rays, {case.hits:.0%} hit, {len(case.pixels.view):,} pixels compared"
+        table = Table("stage", "ms", "x the floor", title=title, title_justify="left")
+        for stage in (CAST, MOVE, FORWARD, INTERIOR, EDGES, WHOLE):
+            table.add_row(stage, f"{1000 * seconds[stage]:.1f}", f"{seconds[stage] / seconds[CAST]:.2f}")
+        Console(width=110).print(table)
+        lines.append(f"ratio {name} {seconds[WHOLE] / seconds[CAST]:.2f}")
+    print(*lines, f"misses {missed}", sep="\n")
+    if options.memory:
+        print(f"memory_growth {memory_growth(device):.4f}")
+
+
+if __name__ == "__main__":
+    main()
