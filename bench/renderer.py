@@ -68,7 +68,9 @@ class Case:
         kernel = np.ones((2 * int(NEAR * side) + 1,) * 2, np.uint8)
         near = np.stack([cv2.dilate(m, kernel) for m in mask.cpu().numpy().astype(np.uint8)]) > 0
         self.pixels = Pixels.of(cameras, torch.as_tensor(near, device=device))
-        self.adjoint = torch.rand(len(self.pixels.view), 7 + CLASSES, generator=generator).to(device)
+        count = len(self.pixels.view)
+        shapes = ((count, 3), (count, 3), (count,), (count, CLASSES))
+        self.adjoint = [torch.rand(shape, generator=generator).to(device) for shape in shapes]
         self._steps = torch.Generator().manual_seed(1)
 
     def moved(self) -> torch.Tensor:
@@ -79,7 +81,7 @@ class Case:
     def iterate(self) -> None:
         vertices = self.moved()
         drawn = self.renderer(vertices, self.texture, self.pixels)
-        image = torch.cat([drawn.rgb, drawn.normals, drawn.mask[:, None], drawn.classes], 1)
+        image = (drawn.rgb, drawn.normals, drawn.mask, drawn.classes)
         torch.autograd.grad(image, (vertices, self.texture), self.adjoint)
 
 

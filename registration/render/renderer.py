@@ -7,7 +7,6 @@ there is no shading, no film and no filter; a pixel is a box.
 
 from __future__ import annotations  # mi.Float exists only once a variant is chosen
 
-from collections.abc import Iterable
 from typing import Any
 
 import drjit as dr
@@ -19,9 +18,10 @@ from torch import Tensor
 
 from registration.geometry.topology import edges, vertex_normals
 from registration.render import silhouette
+from registration.render.adjoint import Adjoint, VertexSum
 from registration.render.cameras import PixelList, upload
 from registration.render.scene import TriangleScene
-from registration.render.shading import CLASSES, MASK, NORMAL, RGB, Corners, Surface, texel_footprint
+from registration.render.shading import GROUPS, MASK, Corners, Surface, texel_footprint
 from registration.types import Pixels, Rendered
 
 _MISS = 0xFFFFFFFF
@@ -74,10 +74,8 @@ class Renderer:
         """
         self._triangles = self._triangles.to(vertices.device)
         normals = vertex_normals(vertices, self._triangles)
-        image = _Draw.apply(vertices, normals, texture, self, upload(pixels))
-        return Rendered(
-            rgb=image[..., RGB], normals=image[..., NORMAL], mask=image[..., MASK], classes=image[..., CLASSES:]
-        )
+        rgb, normal, mask, classes = _Draw.apply(vertices, normals, texture, self, upload(pixels))
+        return Rendered(rgb=rgb, normals=normal, mask=mask, classes=classes)
 
     def unwrap(
         self,
@@ -109,9 +107,9 @@ class Renderer:
             texture_size=texture_size if texture is None else texture.shape[0],
         )
 
-    def _forward(self, surface: Surface, pixels: PixelList) -> tuple[mi.Float, list[mi.UInt32]]:
-        """The channels of every pixel, (P C) flat, and for each ray of a pixel the face it meets, or _MISS."""
-        image, seen = mi.Float(0), []
+    def _forward(self, surface: Surface, pixels: PixelList) -> tuple[list[mi.Float], list[mi.UInt32]]:
+        """The groups of channels of every pixel, each flat, and for each ray of a pixel the face it meets, or _MISS."""
+        image, seen = [mi.Float(0)] * len(GROUPS), []
         with dr.suspend_grad():
             for offset in self._pixel_offsets:
                 origin, direction = pixels.rays(offset)
@@ -120,55 +118,56 @@ class Renderer:
                 face = dr.select(is_hit, hit.prim_index, 0)
                 corners = surface.load(face, is_hit)
                 channels = surface.shade(corners, hit.prim_uv.x, hit.prim_uv.y, direction, is_hit)
-                image += dr.ravel(mi.ArrayXf(channels)) * (1 / len(self._pixel_offsets))
+                share = 1 / len(self._pixel_offsets)
+                image = [
+                    total + share * dr.ravel(mi.ArrayXf(channels[group]))
+                    for total, group in zip(image, GROUPS, strict=True)
+                ]
                 seen.append(dr.select(is_hit, hit.prim_index, _MISS))
                 dr.eval(image, seen)
             dr.sync_thread()
         return image, seen
 
     def _interior(
-        self, surface: Surface, pixels: PixelList, offset: tuple[float, float], seen: mi.UInt32, adjoint: mi.Float
+        self, surface: Surface, pixels: PixelList, offset: tuple[float, float], seen: mi.UInt32, adjoint: Adjoint
     ) -> Corners | None:
         """Fill the gradients of the corners that were hit: the part that needs no visibility change."""
         pixel = dr.compress(seen != _MISS)
-        if dr.width(pixel) == 0:
+        if dr.width(pixel) == 0 or not adjoint.moves_inside:
             return None
         corners = surface.load(dr.gather(mi.UInt32, seen, pixel))
         dr.enable_grad(corners.positions, corners.normals)
         origin, direction = pixels.rays(offset, pixel)
         b1, b2 = corners.barycentrics(origin, direction)
         channels = surface.shade(corners, b1, b2, direction, mi.Bool(True))
-        g = dr.gather(mi.ArrayXf, adjoint, pixel, shape=(surface.channel_count, dr.width(pixel)))
-        first = 0 if surface.texture is not None else NORMAL.start
-        value = sum((g[k] * channels[k] for k in range(first, len(channels)) if k != MASK), mi.Float(0))
+        value = adjoint.times(channels, pixel, without=MASK)
         dr.backward(value * (1 / len(self._pixel_offsets)))
         return corners
 
     def _interior_gradients(
-        self,
-        surface: Surface,
-        pixels: PixelList,
-        seen: list[mi.UInt32],
-        adjoint: mi.Float,
-        positions: Tensor,
-        normals: Tensor,
+        self, surface: Surface, pixels: PixelList, seen: list[mi.UInt32], adjoint: Adjoint
     ) -> tuple[Tensor, Tensor]:
-        """Add what the inside of the faces gives to the two gradients; the texture's stays with the surface."""
+        """What the inside of the faces gives to positions and normals; the texture's stays with the surface."""
+        positions, normals = VertexSum(surface.vertex_count, adjoint), VertexSum(surface.vertex_count, adjoint)
         for offset, faces in zip(self._pixel_offsets, seen, strict=True):
             corners = self._interior(surface, pixels, offset, faces, adjoint)
             if corners is not None:
-                _add(positions, zip(corners.vertices, map(dr.grad, corners.positions), strict=True))
-                _add(normals, zip(corners.vertices, map(dr.grad, corners.normals), strict=True))
-        return positions, normals
+                for vertex, position, normal in zip(corners.vertices, corners.positions, corners.normals, strict=True):
+                    positions.add(vertex, dr.grad(position))
+                    normals.add(vertex, dr.grad(normal))
+                dr.eval(positions.total, normals.total)
+        return positions.tensor(), normals.tensor()
 
-    def _edge_gradients(self, surface: Surface, pixels: PixelList, adjoint: mi.Float, positions: Tensor) -> Tensor:
-        """Add what the silhouettes give to the gradient of positions."""
+    def _edge_gradients(self, surface: Surface, pixels: PixelList, adjoint: Adjoint) -> Tensor:
+        """What the silhouettes give to the gradient of positions."""
         self._seed += 1
         terms = silhouette.backward(
             self._scene, surface, self._edges, pixels, adjoint, samples_per_px=self._edge_samples, seed=self._seed
         )
-        _add(positions, terms)
-        return positions
+        positions = VertexSum(surface.vertex_count, adjoint)
+        for vertex, gradient in terms:
+            positions.add(vertex, gradient)
+        return positions.tensor()
 
     def _splat(self, surface: Surface, pixels: PixelList, values: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:
         size, depth = surface.texture_size, values.shape[-1]
@@ -202,46 +201,35 @@ class _Draw(torch.autograd.Function):
     @staticmethod
     def forward(
         ctx: Any, positions: Tensor, normals: Tensor, texture: Tensor | None, renderer: Renderer, pixels: PixelList
-    ) -> Tensor:
+    ) -> tuple[Tensor, ...]:
         renderer._scene.move(positions)
         surface = renderer._surface(positions, normals, texture)
         image, ctx.seen = renderer._forward(surface, pixels)
         ctx.renderer, ctx.pixels = renderer, pixels
         ctx.save_for_backward(positions, normals, *(() if texture is None else (texture,)))
-        return image.torch().view(pixels.count, surface.channel_count)
+        ctx.set_materialize_grads(False)
+        normal, mask, classes = (values.torch() for values in image[1:])
+        rgb = normal.new_zeros(3 * pixels.count) if texture is None else image[0].torch()
+        return rgb.view(-1, 3), normal.view(-1, 3), mask, classes.view(pixels.count, surface.class_count)
 
     @staticmethod
-    def backward(ctx: Any, *grad_outputs: Tensor) -> tuple[Tensor | None, ...]:
+    def backward(ctx: Any, *grad_outputs: Tensor | None) -> tuple[Tensor | None, ...]:
         positions, normals, *rest = ctx.saved_tensors
         texture = rest[0] if rest else None
         renderer: Renderer = ctx.renderer
         renderer._scene.move(positions)
-        adjoint = _upload(grad_outputs[0])
         surface = renderer._surface(positions, normals, texture)
+        adjoint = Adjoint.of(grad_outputs, surface)
         if ctx.needs_input_grad[2]:
             dr.enable_grad(surface.texture)
-        position_gradient, normal_gradient = renderer._interior_gradients(
-            surface, ctx.pixels, ctx.seen, adjoint, torch.zeros_like(positions), torch.zeros_like(normals)
-        )
+        position_gradient, normal_gradient = renderer._interior_gradients(surface, ctx.pixels, ctx.seen, adjoint)
         texture_gradient = None
         if texture is not None and ctx.needs_input_grad[2]:
             texture_gradient = dr.grad(surface.texture).torch().reshape(texture.shape).clone()
         if ctx.needs_input_grad[0]:
-            renderer._edge_gradients(
-                renderer._surface(positions, normals, texture), ctx.pixels, adjoint, position_gradient
-            )
+            surface = renderer._surface(positions, normals, texture)
+            position_gradient += renderer._edge_gradients(surface, ctx.pixels, adjoint)
         return position_gradient, normal_gradient, texture_gradient, None, None
-
-
-def _add(total: Tensor, terms: Iterable[tuple[mi.UInt32, mi.Vector3f]]) -> None:
-    """Sum lanes to vertices one after the other: parallel sums of floats would differ from run to run."""
-    terms = list(terms)
-    dr.eval(terms)
-    dr.sync_thread()
-    flat, axis = total.view(-1), torch.arange(3, device=total.device)
-    for vertex, gradient in terms:
-        place = vertex.torch().long()[:, None] * 3 + axis
-        flat.index_add_(0, place.view(-1), dr.ravel(gradient).torch())
 
 
 def _upload(tensor: Tensor) -> mi.Float:

@@ -10,7 +10,8 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
-RGB, NORMAL, MASK, CLASSES = slice(0, 3), slice(3, 6), 6, 7  # channels of an image; classes run to its end
+MASK = 6  # the channel of coverage
+GROUPS = (slice(0, 3), slice(3, 6), slice(MASK, 7), slice(7, None))  # channels: colour, normal, mask, classes
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -51,8 +52,8 @@ class Surface:
     texture_size: int
 
     @property
-    def channel_count(self) -> int:
-        return CLASSES + self.class_count
+    def vertex_count(self) -> int:
+        return dr.width(self.positions) // 3
 
     def corners(self, face: mi.UInt32, active: mi.Bool | bool = True) -> mi.Point3u:
         return dr.gather(mi.Point3u, self.faces, face, active)

@@ -20,9 +20,10 @@ import numpy as np
 from jaxtyping import Float
 
 from registration.geometry.topology import Edges
+from registration.render.adjoint import Adjoint
 from registration.render.cameras import CameraLanes, PixelList
 from registration.render.scene import TriangleScene
-from registration.render.shading import MASK, Surface
+from registration.render.shading import Surface
 
 # How far beyond the edge the outside ray goes, in focal lengths (px). Larger biases, smaller meets float32.
 _STEP = 1e-6
@@ -160,15 +161,12 @@ def backward(
     surface: Surface,
     edges: EdgeArrays,
     pixels: PixelList,
-    adjoint: mi.Float,
+    adjoint: Adjoint,
     *,
     samples_per_px: float,
     seed: int,
 ) -> list[tuple[mi.UInt32, mi.Point3f]]:
-    """The silhouettes' part of d(adjoint . image)/d(positions), as terms: (vertex, gradient) per lane.
-
-    `adjoint` is (P C) flat.
-    """
+    """The silhouettes' part of d(adjoint . image)/d(positions), as terms: (vertex, gradient) per lane."""
     with dr.suspend_grad():
         found = _find(surface, edges, pixels)
         if found is None:
@@ -190,9 +188,6 @@ def backward(
         x = dr.lerp(xa, xb, s)
         depth = dr.rcp((1 - s) / za + s / zb)
         pixel, inside = pixels.at(view, x, (za > 0) & (zb > 0))
-        channels = surface.channel_count
-        g = dr.gather(mi.ArrayXf, adjoint, pixel, inside, shape=(channels, samples))
-
         beyond = x + normal * (_STEP * camera.fx)
         direction = camera.direction(beyond.x, beyond.y)
         hit = scene.cast(camera.centre, direction, inside, coherent=False)
@@ -203,8 +198,7 @@ def backward(
         corners = dr.gather(mi.Point2u, edges.corners, 2 * edge + side, seen)
         perspective = s * za / dr.maximum((1 - s) * zb + s * za, 1e-9)
         f_in = surface.shade_edge(own, ends, corners, perspective, direction, seen)
-        first = 0 if surface.texture is not None else MASK - 3
-        jump = sum((g[k] * (f_in[k] - f_out[k]) for k in range(first, channels)), mi.Float(0))
+        jump = adjoint.times([inner - outer for inner, outer in zip(f_in, f_out, strict=True)], pixel, inside)
         weight = dr.select(seen, jump, 0) * (found.total_px / dr.opaque(mi.Float, samples))
 
     a, b = (dr.gather(mi.Point3f, surface.positions, end, seen) for end in (ends.x, ends.y))
