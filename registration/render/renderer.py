@@ -63,6 +63,8 @@ class Renderer:
         self._pixel_offsets = _pixel_offsets(pixel_samples)
         self._edge_samples = edge_samples
         self._seed = seed
+        self._drawn: Pixels | None = None  # the pixels drawn last, and the faces they met
+        self._seen: list[mi.UInt32] = []
         dr.eval(self._faces, self._corner_uvs, self._classes)
 
     def __call__(
@@ -75,6 +77,7 @@ class Renderer:
         self._triangles = self._triangles.to(vertices.device)
         normals = vertex_normals(vertices, self._triangles)
         rgb, normal, mask, classes = _Draw.apply(vertices, normals, texture, self, upload(pixels))
+        self._drawn = pixels
         return Rendered(rgb=rgb, normals=normal, mask=mask, classes=classes)
 
     def unwrap(
@@ -92,8 +95,12 @@ class Renderer:
         with torch.no_grad():
             self._triangles = self._triangles.to(vertices.device)
             surface = self._surface(vertices, vertex_normals(vertices, self._triangles), None, texture_size)
-            self._scene.move(vertices)
-            return self._splat(surface, upload(pixels), values, weights)
+            if self._scene.move(vertices) or self._drawn is not pixels or len(self._pixel_offsets) > 1:
+                self._drawn, uploaded = None, upload(pixels)
+                seen = self._faces_at(uploaded, _CENTRE)
+            else:  # just drawn: a fit looks, then carries back what it saw
+                uploaded, seen = upload(pixels), self._seen[0]
+            return self._splat(surface, uploaded, seen, values, weights)
 
     def _surface(self, positions: Tensor, normals: Tensor, texture: Tensor | None, texture_size: int = 0) -> Surface:
         return Surface(
@@ -169,18 +176,22 @@ class Renderer:
             positions.add(vertex, gradient)
         return positions.tensor()
 
-    def _splat(self, surface: Surface, pixels: PixelList, values: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:
+    def _faces_at(self, pixels: PixelList, offset: tuple[float, float]) -> mi.UInt32:
+        with dr.suspend_grad():
+            hit = self._scene.cast(*pixels.rays(offset), mi.Bool(True), coherent=True)
+            return dr.select(hit.is_valid(), hit.prim_index, _MISS)
+
+    def _splat(
+        self, surface: Surface, pixels: PixelList, seen: mi.UInt32, values: Tensor, weights: Tensor
+    ) -> tuple[Tensor, Tensor]:
         size, depth = surface.texture_size, values.shape[-1]
         with dr.suspend_grad():
-            origin, direction = pixels.rays(_CENTRE)
-            hit = self._scene.cast(origin, direction, mi.Bool(True), coherent=True)
-            active = hit.is_valid()
-            face = dr.select(active, hit.prim_index, 0)
-            b = [1 - hit.prim_uv.x - hit.prim_uv.y, hit.prim_uv.x, hit.prim_uv.y]
-            uvs = [dr.gather(mi.Point2f, surface.corner_uvs, 3 * face + k, active) for k in range(3)]
-            index, fx, fy = texel_footprint(b[0] * uvs[0] + b[1] * uvs[1] + b[2] * uvs[2], size)
             weight = _upload(weights)
-            active &= weight > 0
+            active = (seen != _MISS) & (weight > 0)
+            corners = surface.load(dr.select(active, seen, 0), active)
+            b1, b2 = corners.barycentrics(*pixels.rays(_CENTRE))
+            uvs = [dr.gather(mi.Point2f, surface.corner_uvs, 3 * corners.face + k, active) for k in range(3)]
+            index, fx, fy = texel_footprint((1 - b1 - b2) * uvs[0] + b1 * uvs[1] + b2 * uvs[2], size)
             shares = [(1 - fx) * (1 - fy), fx * (1 - fy), (1 - fx) * fy, fx * fy]
             shares = [dr.select(active, share * weight, 0) for share in shares]
             index = dr.select(active, index, 0)
@@ -205,6 +216,7 @@ class _Draw(torch.autograd.Function):
         renderer._scene.move(positions)
         surface = renderer._surface(positions, normals, texture)
         image, ctx.seen = renderer._forward(surface, pixels)
+        renderer._seen = ctx.seen
         ctx.renderer, ctx.pixels = renderer, pixels
         ctx.save_for_backward(positions, normals, *(() if texture is None else (texture,)))
         ctx.set_materialize_grads(False)

@@ -27,13 +27,14 @@ class TriangleScene:
         self._key = next(key for key in self._params.keys() if key.endswith("vertex_positions"))
         self._now: Tensor | None = None
 
-    def move(self, vertices: Float[Tensor, "V 3"]) -> None:
-        """Put the vertices (metres, world) here and rebuild the BVH, unless they are already here."""
+    def move(self, vertices: Float[Tensor, "V 3"]) -> bool:
+        """Put the vertices (metres, world) here and rebuild the BVH, unless they are already here; whether it did."""
         if self._now is not None and torch.equal(self._now, vertices):
-            return
+            return False
         self._now = vertices.detach().clone()
         self._params[self._key] = mi.Float(self._now.reshape(-1))
         self._params.update()
+        return True
 
     def cast(
         self, origin: mi.Point3f, direction: mi.Vector3f, active: mi.Bool, *, coherent: bool

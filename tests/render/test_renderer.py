@@ -221,6 +221,20 @@ def test_unwrap_is_the_transpose_of_the_look_up():
     torch.testing.assert_close(attached.grad, total, atol=1e-4, rtol=1e-4)
 
 
+def test_unwrap_reuses_what_was_just_drawn_and_nothing_else():
+    """The same result whether faces are remembered or met again; other vertices or pixels are never taken for them."""
+    renderer, vertices, pixels = tiny()
+    fewer = Pixels.all_of(pixels.cameras[:1])
+    generator = torch.Generator().manual_seed(3)
+    values = torch.rand(len(pixels.view), 3, generator=generator)
+    weights = torch.rand(len(pixels.view), generator=generator)
+    fresh = renderer.unwrap(vertices, values, weights, pixels, 32)
+    for drawn, where in ((vertices, pixels), (vertices * 1.05, pixels), (vertices, fewer)):
+        renderer(drawn, None, where)
+        again = renderer.unwrap(vertices, values, weights, pixels, 32)
+        torch.testing.assert_close(again, fresh, atol=1e-4, rtol=1e-4)
+
+
 def test_another_forward_between_forward_and_backward():
     """A drawing's gradient belongs to its own vertices, texture and pixels."""
     texture = random_texture(64)
