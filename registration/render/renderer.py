@@ -95,12 +95,17 @@ class Renderer:
         with torch.no_grad():
             self._triangles = self._triangles.to(vertices.device)
             surface = self._surface(vertices, vertex_normals(vertices, self._triangles), None, texture_size)
-            if self._scene.move(vertices) or self._drawn is not pixels or len(self._pixel_offsets) > 1:
-                self._drawn, uploaded = None, upload(pixels)
-                seen = self._faces_at(uploaded, _CENTRE)
-            else:  # just drawn: a fit looks, then carries back what it saw
-                uploaded, seen = upload(pixels), self._seen[0]
+            self._move(vertices)
+            uploaded = upload(pixels)
+            # A fit looks, then carries back what it saw.
+            remembered = self._drawn is pixels and len(self._pixel_offsets) == 1
+            seen = self._seen[0] if remembered else self._faces_at(uploaded, _CENTRE)
             return self._splat(surface, uploaded, seen, values, weights)
+
+    def _move(self, vertices: Tensor) -> None:
+        """Put the vertices here; what was seen of others is forgotten."""
+        if self._scene.move(vertices):
+            self._drawn = None
 
     def _surface(self, positions: Tensor, normals: Tensor, texture: Tensor | None, texture_size: int = 0) -> Surface:
         return Surface(
@@ -213,7 +218,7 @@ class _Draw(torch.autograd.Function):
     def forward(
         ctx: Any, positions: Tensor, normals: Tensor, texture: Tensor | None, renderer: Renderer, pixels: PixelList
     ) -> tuple[Tensor, ...]:
-        renderer._scene.move(positions)
+        renderer._move(positions)
         surface = renderer._surface(positions, normals, texture)
         image, ctx.seen = renderer._forward(surface, pixels)
         renderer._seen = ctx.seen
@@ -229,7 +234,7 @@ class _Draw(torch.autograd.Function):
         positions, normals, *rest = ctx.saved_tensors
         texture = rest[0] if rest else None
         renderer: Renderer = ctx.renderer
-        renderer._scene.move(positions)
+        renderer._move(positions)
         surface = renderer._surface(positions, normals, texture)
         adjoint = Adjoint.of(grad_outputs, surface)
         if ctx.needs_input_grad[2]:

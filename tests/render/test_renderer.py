@@ -233,6 +233,12 @@ def test_unwrap_reuses_what_was_just_drawn_and_nothing_else():
         renderer(drawn, None, where)
         again = renderer.unwrap(vertices, values, weights, pixels, 32)
         torch.testing.assert_close(again, fresh, atol=1e-4, rtol=1e-4)
+    # The adjoint of an older picture moves the mesh back under the faces of the newer.
+    older = renderer(vertices.clone().requires_grad_(), None, fewer)
+    renderer(vertices * 1.05, None, pixels)
+    older.mask.sum().backward()
+    again = renderer.unwrap(vertices, values, weights, pixels, 32)
+    torch.testing.assert_close(again, fresh, atol=1e-4, rtol=1e-4)
 
 
 def test_another_forward_between_forward_and_backward():
