@@ -9,11 +9,12 @@ compiled after the second iteration; `memory_growth` is the process' size at ite
 """
 
 import argparse
+import itertools
 import os
 import statistics
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import cv2
@@ -32,7 +33,7 @@ from registration.types import Pixels
 
 REPEATS = 7
 CLASSES = 9  # 16 channels: colour, normal, mask and these
-TEXTURE_PX = 1024
+TEXTURE_PX = 512
 NEAR = 0.08  # of the image's height: how far around the head a fit compares pixels
 MOTION = 1e-4  # metres, standard deviation, of every vertex in every iteration
 CAST, MOVE, FORWARD, INTERIOR, EDGES, WHOLE = (
@@ -55,7 +56,7 @@ class Case:
         head = data.template_vertex_positions.astype(np.float64)
         centre = (head.min(0) + head.max(0)) / 2
         cameras = rig(views, (side, side), 0, centre=centre, head_height_m=float(np.ptp(head[:, 1])))
-        triangles = data.triangles.astype(np.int64)
+        self.triangles = triangles = data.triangles.astype(np.int64)
         shares = label_shares(data)[:, :CLASSES]
         self.renderer = Renderer(triangles, texture_atlas(data), shares.astype(np.float32))
         self.all = Pixels.all_of(cameras, device)
@@ -71,12 +72,12 @@ class Case:
         count = len(self.pixels.view)
         shapes = ((count, 3), (count, 3), (count,), (count, CLASSES))
         self.adjoint = [torch.rand(shape, generator=generator).to(device) for shape in shapes]
-        self._steps = torch.Generator().manual_seed(1)
+        moves = MOTION * torch.randn((8, *self.rest.shape), generator=generator).to(device)
+        self._moved = itertools.cycle([(self.rest + move).requires_grad_() for move in moves])
 
     def moved(self) -> torch.Tensor:
         """The head a little elsewhere: a BVH that is not rebuilt would not count."""
-        step = MOTION * torch.randn(self.rest.shape, generator=self._steps)
-        return (self.rest + step.to(self.rest.device)).requires_grad_()
+        return next(self._moved)
 
     def iterate(self) -> None:
         vertices = self.moved()
@@ -112,19 +113,26 @@ class Clock:
 
 
 def floor(case: Case) -> Callable[[], None]:
-    """The cast of all pixels, on the BVH as it stands."""
+    """The cast of all pixels, row by row, on the BVH that Mitsuba builds of the mesh by itself."""
     import drjit as dr
     import mitsuba as mi
 
     from registration.render.cameras import upload
 
-    pixels = upload(case.all)
-    origin, direction = pixels.rays((0.5, 0.5))
+    mesh = mi.Mesh("head", len(case.rest), len(case.triangles))
+    params = mi.traverse(mesh)
+    params["vertex_positions"] = mi.Float(case.rest.reshape(-1))
+    params["faces"] = mi.UInt32(case.triangles.astype(np.uint32).ravel())
+    params.update()
+    scene = mi.load_dict({"type": "scene", "mesh": mesh})
+    pixels = case.all
+    view, y, x = (a.to(torch.int32) for a in (pixels.index >= 0).nonzero(as_tuple=True))
+    origin, direction = upload(replace(pixels, view=view, x=x, y=y)).rays((0.5, 0.5))
     dr.eval(origin, direction)
     dr.sync_thread()
 
     def cast() -> None:
-        hit = case.renderer._scene.cast(origin, direction, mi.Bool(True), coherent=True)
+        hit = scene.ray_intersect_preliminary(mi.Ray3f(origin, direction), coherent=True, active=mi.Bool(True))
         dr.eval(hit.t, hit.prim_index, hit.prim_uv)
         dr.sync_thread()
 
@@ -163,7 +171,7 @@ def measure(case: Case) -> dict[str, float]:
 
 
 def _stages(renderer: type, scene: type) -> list[tuple[type, str]]:
-    return [(scene, "move"), (renderer, "_forward"), (renderer, "_interior_gradients"), (renderer, "_edge_gradients")]
+    return [(scene, "move"), (renderer, "_draw"), (renderer, "_interior_gradients"), (renderer, "_edge_gradients")]
 
 
 def misses(case: Case, iterations: int = 5) -> int:

@@ -8,7 +8,7 @@ from typing import Any, Literal
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Int, Shaped
 from torch import Tensor
 
 Status = Literal["converged", "stopped", "failed"]
@@ -86,11 +86,15 @@ class ViewPixels:
     valid: Float[np.ndarray, "H W"]  # share of the pixel for which undistortion found a source
 
 
+_BLOCK = 4  # pixels, either way, of a list's order
+
+
 @dataclass(frozen=True, kw_only=True)
 class Pixels:
     """The P pixels of some views that take part in a step: a list, and the way back from an image to it.
 
-    All cameras have one image size and no distortion. Arrays of pixels are ordered by view.
+    All cameras have one image size and no distortion. Arrays of pixels are ordered by view, within a view by blocks of
+    4 x 4 pixels: rays are cast sixteen at a time, and those of a block meet the same few faces.
     """
 
     cameras: tuple[Camera, ...]
@@ -102,9 +106,14 @@ class Pixels:
     @classmethod
     def of(cls, cameras: Sequence[Camera], chosen: Bool[Tensor, "N H W"]) -> "Pixels":
         """The list of the chosen pixels."""
-        view, y, x = (axis.to(torch.int32) for axis in chosen.nonzero(as_tuple=True))
+        views, height, width = chosen.shape
+        padded = torch.nn.functional.pad(chosen, (0, -width % _BLOCK, 0, -height % _BLOCK))
+        blocks = padded.view(views, -(-height // _BLOCK), _BLOCK, -(-width // _BLOCK), _BLOCK).transpose(2, 3)
+        view, row, column, y, x = blocks.nonzero(as_tuple=True)
+        view, y, x = view, _BLOCK * row + y, _BLOCK * column + x
         index = torch.full(chosen.shape, -1, dtype=torch.int32, device=chosen.device)
-        index[chosen] = torch.arange(len(view), dtype=torch.int32, device=chosen.device)
+        index[view, y, x] = torch.arange(len(view), dtype=torch.int32, device=chosen.device)
+        view, y, x = (axis.to(torch.int32) for axis in (view, y, x))
         return cls(cameras=tuple(cameras), view=view, x=x, y=y, index=index)
 
     @classmethod
@@ -117,6 +126,10 @@ class Pixels:
         """Values of listed pixels laid out as images; differentiable."""
         image = values.new_full((*self.index.shape, values.shape[-1]), background)
         return image.index_put((self.view.long(), self.y.long(), self.x.long()), values)
+
+    def of_image(self, image: Shaped[Tensor, "N H W *D"]) -> Shaped[Tensor, "P *D"]:
+        """What an image holds at the listed pixels."""
+        return image[self.view.long(), self.y.long(), self.x.long()]
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -1,4 +1,4 @@
-"""The way back from pixels to vertices: the adjoint image, and sums over lanes that do not depend on their order."""
+"""The way back from pixels to vertices and texels: the adjoint image, and sums over lanes."""
 
 from __future__ import annotations  # mi.Float exists only once a variant is chosen
 
@@ -7,14 +7,14 @@ from dataclasses import dataclass
 
 import drjit as dr
 import mitsuba as mi
-import torch
 from torch import Tensor
 
 from registration.render.shading import GROUPS, MASK, Surface
 
-_SAMPLED = 61  # every so-many-th value tells how large adjoints are
+_SAMPLED = 1 << 12  # values of a tensor tell how large it is
 _UNIT = 2.0**-22  # of a sum, in the largest adjoint sampled (per metre): integers below count such units
 _MOST = 2.0**42  # units of one lane: a million such lanes still fit
+_COPIES_BYTES = 1 << 29  # that threads may hold to sum apart
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -23,7 +23,7 @@ class Adjoint:
 
     groups: list[mi.Float | None]  # in the order of GROUPS, each (P D) flat
     widths: list[int]
-    unit: mi.Float  # see `VertexSum`
+    unit: mi.Float  # see `RowSum`
 
     @classmethod
     def of(cls, gradients: Sequence[Tensor | None], surface: Surface) -> Adjoint:
@@ -31,13 +31,10 @@ class Adjoint:
         known = [None if g is None else g.detach().contiguous().reshape(-1) for g in gradients]
         if surface.texture is None:
             known[0] = None
-        largest = [g[::_SAMPLED].abs().max() for g in known if g is not None and len(g)]
-        device = next((g.device for g in known if g is not None), torch.device("cpu"))
-        scale = torch.stack(largest).max() if largest else torch.zeros((), device=device)
         return cls(
             groups=[None if g is None else mi.Float(g) for g in known],
             widths=[3, 3, 1, surface.class_count],
-            unit=mi.Float((scale.clamp(min=1e-30) * _UNIT).reshape(1).contiguous()),
+            unit=unit_of([g for g in known if g is not None]),
         )
 
     @property
@@ -45,39 +42,64 @@ class Adjoint:
         """Whether the loss looks at anything that varies inside a face: the mask does not."""
         return any(g is not None and group.start != MASK for g, group in zip(self.groups, GROUPS, strict=True))
 
-    def times(
-        self,
-        channels: Sequence[mi.Float],
-        pixel: mi.UInt32,
-        active: mi.Bool | bool = True,
-        without: int | None = None,
-    ) -> mi.Float:
-        """Sum over the channels (but one) of adjoint times value, in the lanes' pixels; 0 where not active."""
+    def colour(self, pixel: mi.UInt32) -> mi.Vector3f | None:
+        """Of the lanes' pixels, as the next two."""
+        return None if self.groups[0] is None else dr.gather(mi.Vector3f, self.groups[0], pixel)
+
+    def normal(self, pixel: mi.UInt32) -> mi.Vector3f | None:
+        return None if self.groups[1] is None else dr.gather(mi.Vector3f, self.groups[1], pixel)
+
+    def classes(self, pixel: mi.UInt32) -> mi.ArrayXf | None:
+        return None if self.groups[3] is None else self._group(3, pixel)
+
+    def _group(self, number: int, pixel: mi.UInt32) -> mi.ArrayXf:
+        shape = (self.widths[number], dr.width(pixel))
+        return dr.gather(mi.ArrayXf, self.groups[number], pixel, shape=shape)
+
+    def times(self, channels: Sequence[mi.Float], pixel: mi.UInt32) -> mi.Float:
+        """Sum over the channels of adjoint times value, in the lanes' pixels."""
         total = mi.Float(0)
-        for values, width, group in zip(self.groups, self.widths, GROUPS, strict=True):
-            if values is None or group.start == without:
-                continue
-            g = dr.gather(mi.ArrayXf, values, pixel, active, shape=(width, dr.width(pixel)))
-            for k in range(width):
-                total += g[k] * channels[group.start + k]
+        for number, group in enumerate(GROUPS):
+            if self.groups[number] is not None:
+                for g, value in zip(self._group(number, pixel), channels[group], strict=True):
+                    total += g * value
         return total
 
 
-class VertexSum:
-    """Sums of lanes' vectors at vertices, in fixed point: parallel sums of floats would differ from run to run."""
+def unit_of(values: Sequence[Tensor]) -> mi.Float:
+    """A unit for `RowSum` that suits values (and what is alike)."""
+    scale = max((_size(v[:: 1 + len(v) // _SAMPLED]) for v in values), default=0.0)
+    if scale == 0:
+        scale = max((_size(v) for v in values), default=0.0)
+    return dr.opaque(mi.Float, max(scale, 1e-30) * _UNIT)
 
-    def __init__(self, vertex_count: int, adjoint: Adjoint):
-        self._unit = adjoint.unit
-        self.total = dr.zeros(mi.Int64, 3 * vertex_count)
 
-    def add(self, vertex: mi.UInt32, value: mi.Vector3f) -> None:
-        for k in range(3):
-            units = dr.clip(value[k] / self._unit, -_MOST, _MOST)
-            dr.scatter_add(self.total, mi.Int64(dr.detach(units)), vertex * 3 + k)
+def _size(values: Tensor) -> float:
+    return values.abs().max().item() if values.numel() else 0.0
 
-    def tensor(self) -> Tensor:
-        """(V, 3), a copy."""
-        total = mi.Float(mi.Float64(self.total) * mi.Float64(self._unit))
-        dr.eval(total)
-        dr.sync_thread()
-        return total.torch().view(-1, 3).clone()
+
+class RowSum:
+    """Sums of lanes' vectors (three or four numbers) into rows of a table.
+
+    With a unit they are summed in fixed point: parallel sums of floats would differ from run to run.
+    """
+
+    def __init__(self, rows: int, unit: mi.Float | None = None):
+        self._unit = unit
+        self._kind = mi.Vector4f if unit is None else dr.int64_array_t(mi.Vector4f)
+        number = mi.Float if unit is None else mi.Int64
+        self.total = dr.zeros(number, 4 * rows)
+        copies = dr.thread_count() * 4 * rows * dr.itemsize_v(number)
+        apart = "llvm" in mi.variant() and copies < _COPIES_BYTES
+        self._mode = dr.ReduceMode.Expand if apart else dr.ReduceMode.Auto
+
+    def add(self, row: mi.UInt32, value: mi.Vector3f | mi.Vector4f) -> None:
+        columns = [dr.detach(column) for column in value]
+        if self._unit is not None:
+            columns = [mi.Int64(dr.clip(column / self._unit, -_MOST, _MOST)) for column in columns]
+        columns += [type(columns[0])(0)] * (4 - len(columns))
+        dr.scatter_add(self.total, self._kind(*columns), row, mode=self._mode)
+
+    def table(self) -> mi.Float:
+        """(N, 4) flat."""
+        return self.total if self._unit is None else mi.Float(mi.Float64(self.total) * mi.Float64(self._unit))

@@ -10,14 +10,14 @@ import numpy as np
 
 from registration.types import Pixels
 
-_STRIDE = 16  # floats of a camera: R (9, row by row), centre (3), fx, fy, cx, cy
+_ROWS = 4  # of four floats, a camera: see `CameraLanes`
 
 
 @dataclass(frozen=True, kw_only=True)
 class PixelList:
     """`types.Pixels` on the device."""
 
-    cameras: mi.Float  # _STRIDE floats a camera
+    cameras: mi.Float  # (N, 4, 4)
     camera_count: int
     view: mi.UInt32  # P
     x: mi.UInt32  # P
@@ -31,10 +31,11 @@ class PixelList:
         return dr.width(self.view)
 
     def camera(self, view: mi.UInt32) -> CameraLanes:
-        return CameraLanes(dr.gather(mi.ArrayXf, self.cameras, view, shape=(_STRIDE, dr.width(view))))
+        return CameraLanes([dr.gather(mi.Vector4f, self.cameras, _ROWS * view + k) for k in range(_ROWS)])
 
     def centre(self, view: mi.UInt32) -> mi.Point3f:
-        return mi.Point3f(*(dr.gather(mi.Float, self.cameras, view * _STRIDE + 9 + k) for k in range(3)))
+        row = dr.gather(mi.Vector4f, self.cameras, _ROWS * view + 3)
+        return mi.Point3f(row.x, row.y, row.z)
 
     def rays(self, offset: tuple[float, float], which: mi.UInt32 | None = None) -> tuple[mi.Point3f, mi.Vector3f]:
         """Rays through all or some pixels, at an offset from the pixel's corner; see `CameraLanes.direction`."""
@@ -57,24 +58,31 @@ class PixelList:
 
 
 class CameraLanes:
-    """One camera per lane of a wavefront."""
+    """One camera per lane of a wavefront, from the rows (x axis, cx), (y axis, cy), (z axis, fx), (centre, fy).
 
-    def __init__(self, values: mi.ArrayXf):
-        self.rotation = [values[k] for k in range(9)]
-        self.centre = mi.Point3f(values[9], values[10], values[11])
-        self.fx, self.fy, self.cx, self.cy = (values[k] for k in range(12, 16))
+    The axes are the camera's in the world; centre in metres; fx, fy, cx, cy in pixels.
+    """
+
+    def __init__(self, rows: list[mi.Vector4f]):
+        self.axes = [mi.Vector3f(row.x, row.y, row.z) for row in rows[:3]]
+        self.centre = mi.Point3f(rows[3].x, rows[3].y, rows[3].z)
+        self.cx, self.cy, self.fx, self.fy = (row.w for row in rows)
 
     def direction(self, x_px: mi.Float, y_px: mi.Float) -> mi.Vector3f:
         """World direction through a pixel position, scaled so that t along it is camera depth (m)."""
-        r = self.rotation
         x, y = (x_px - self.cx) / self.fx, (y_px - self.cy) / self.fy
-        return mi.Vector3f(*(dr.fma(r[k], x, dr.fma(r[3 + k], y, r[6 + k])) for k in range(3)))
+        return dr.fma(self.axes[0], x, dr.fma(self.axes[1], y, self.axes[2]))
 
     def project(self, point: mi.Point3f) -> tuple[mi.Point2f, mi.Float]:
         """World point to pixel position and depth (m)."""
-        r, q = self.rotation, point - self.centre
-        x, y, z = (r[3 * k] * q.x + r[3 * k + 1] * q.y + r[3 * k + 2] * q.z for k in range(3))
+        x, y, z = (dr.dot(axis, point - self.centre) for axis in self.axes)
         return mi.Point2f(self.fx * x / z + self.cx, self.fy * y / z + self.cy), z
+
+    def speed(self, point: mi.Point3f, normal: mi.Vector2f) -> mi.Vector3f:
+        """How fast the projection of a moving point goes along an image normal: pixels per metre, a gradient."""
+        x, y, z = (dr.dot(axis, point - self.centre) for axis in self.axes)
+        along_x, along_y = self.fx * normal.x / z, self.fy * normal.y / z
+        return along_x * self.axes[0] + along_y * self.axes[1] - (along_x * x + along_y * y) / z * self.axes[2]
 
 
 def upload(pixels: Pixels) -> PixelList:
@@ -83,12 +91,11 @@ def upload(pixels: Pixels) -> PixelList:
     sizes = {(camera.height_px, camera.width_px) for camera in cameras}
     if len(sizes) != 1 or any(camera.distortion for camera in cameras):
         raise ValueError("pixels need cameras of one size without distortion")
-    packed = np.empty((len(cameras), _STRIDE), np.float32)
-    for row, camera in zip(packed, cameras, strict=True):
+    packed = np.empty((len(cameras), _ROWS, 4), np.float32)
+    for rows, camera in zip(packed, cameras, strict=True):
         k = camera.intrinsics
-        row[:9] = camera.T_cam_world[:3, :3].ravel()
-        row[9:12] = camera.centre
-        row[12:] = k[0, 0], k[1, 1], k[0, 2], k[1, 2]
+        rows[:3, :3], rows[3, :3] = camera.T_cam_world[:3, :3], camera.centre
+        rows[:, 3] = k[0, 2], k[1, 2], k[0, 0], k[1, 1]
     height, width = sizes.pop()
     view, x, y = (mi.UInt32(mi.Int32(values)) for values in (pixels.view, pixels.x, pixels.y))
     return PixelList(

@@ -7,6 +7,8 @@ there is no shading, no film and no filter; a pixel is a box.
 
 from __future__ import annotations  # mi.Float exists only once a variant is chosen
 
+import functools
+from dataclasses import dataclass
 from typing import Any
 
 import drjit as dr
@@ -16,16 +18,31 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from registration.geometry.topology import edges, vertex_normals
-from registration.render import silhouette
-from registration.render.adjoint import Adjoint, VertexSum
+from registration.geometry.topology import edges
+from registration.render import interior, normals, silhouette
+from registration.render.adjoint import Adjoint, RowSum, unit_of
 from registration.render.cameras import PixelList, upload
 from registration.render.scene import TriangleScene
-from registration.render.shading import GROUPS, MASK, Corners, Surface, texel_footprint
+from registration.render.shading import GROUPS, Hits, Surface, rows, rows_of_four
 from registration.types import Pixels, Rendered
 
-_MISS = 0xFFFFFFFF
 _CENTRE = (0.5, 0.5)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Drawn:
+    """One drawing, as its adjoint needs it."""
+
+    surface: Surface
+    pixels: PixelList
+    facing: mi.Bool  # N F: whether a view sees a face's outer side
+    hits: list[Hits]  # one for each ray of a pixel
+    slopes: list[list[mi.Vector3f]]  # the hits' `colour_slopes`
+
+    @property
+    def deepest(self) -> mi.Float:
+        """The greatest depth that any ray of a pixel found."""
+        return functools.reduce(dr.maximum, (hits.depth for hits in self.hits))
 
 
 class Renderer:
@@ -56,15 +73,13 @@ class Renderer:
         vertex_count, self._class_count = vertex_classes.shape
         self._scene = TriangleScene(vertex_count, triangles)
         self._edges = silhouette.upload(edges(triangles), corner_uvs)
-        self._faces = mi.UInt32(triangles.astype(np.uint32).ravel())
-        self._corner_uvs = mi.Float(corner_uvs.astype(np.float32).ravel())
-        self._classes = mi.Float(vertex_classes.astype(np.float32).ravel())
-        self._triangles = torch.as_tensor(triangles.astype(np.int64))
+        self._faces = mi.UInt32(rows(triangles.astype(np.uint32)))
+        self._corner_uvs = mi.Float(rows(corner_uvs.astype(np.float32).reshape(-1, 6), 8))
+        self._classes = mi.Float(rows(vertex_classes.astype(np.float32)))
         self._pixel_offsets = _pixel_offsets(pixel_samples)
         self._edge_samples = edge_samples
         self._seed = seed
-        self._drawn: Pixels | None = None  # the pixels drawn last, and the faces they met
-        self._seen: list[mi.UInt32] = []
+        self._last: tuple[Pixels, Drawn] | None = None
         dr.eval(self._faces, self._corner_uvs, self._classes)
 
     def __call__(
@@ -74,141 +89,131 @@ class Renderer:
 
         Without a texture the RGB channels are zero and cost nothing.
         """
-        self._triangles = self._triangles.to(vertices.device)
-        normals = vertex_normals(vertices, self._triangles)
-        rgb, normal, mask, classes = _Draw.apply(vertices, normals, texture, self, upload(pixels))
-        self._drawn = pixels
+        rgb, normal, mask, classes = _Draw.apply(vertices, texture, self, pixels)
         return Rendered(rgb=rgb, normals=normal, mask=mask, classes=classes)
 
     def unwrap(
         self,
         vertices: Float[Tensor, "V 3"],
-        values: Float[Tensor, "P D"],
+        values: Float[Tensor, "P 3"],
         weights: Float[Tensor, "P"],
         pixels: Pixels,
         texture_size: int,
-    ) -> tuple[Float[Tensor, "R R D"], Float[Tensor, "R R"]]:
+    ) -> tuple[Float[Tensor, "R R 3"], Float[Tensor, "R R"]]:
         """Carry pixels back to the texture: the transpose of the bilinear look-up.
 
         Returns the weighted sum of `values` that fell on each texel, and the sum of the weights. Not differentiable.
         """
-        with torch.no_grad():
-            self._triangles = self._triangles.to(vertices.device)
-            surface = self._surface(vertices, vertex_normals(vertices, self._triangles), None, texture_size)
+        with torch.no_grad(), dr.suspend_grad():
             self._move(vertices)
-            uploaded = upload(pixels)
             # A fit looks, then carries back what it saw.
-            remembered = self._drawn is pixels and len(self._pixel_offsets) == 1
-            seen = self._seen[0] if remembered else self._faces_at(uploaded, _CENTRE)
-            return self._splat(surface, uploaded, seen, values, weights)
+            if self._last is not None and self._last[0] is pixels and len(self._pixel_offsets) == 1:
+                hits = self._last[1].hits[0]
+            else:
+                hits = self._cast(upload(pixels), _CENTRE)
+            weighted = torch.cat([values * weights[:, None], weights[:, None]], -1)
+            texels = RowSum(texture_size**2, unit_of([weighted]))
+            if hits.count:
+                surface = self._surface(vertices, None, texture_size)
+                footprint = surface.footprint(hits.shares, surface.uvs(hits.face))
+                interior.carry_back(texels, footprint, dr.gather(mi.Vector4f, _flat(weighted), hits.pixel))
+            image = _tensor(texels.table()).view(texture_size, texture_size, 4)
+            return image[..., :3], image[..., 3]
 
     def _move(self, vertices: Tensor) -> None:
-        """Put the vertices here; what was seen of others is forgotten."""
+        """Put the vertices here; what was drawn of others is forgotten."""
         if self._scene.move(vertices):
-            self._drawn = None
+            self._last = None
 
-    def _surface(self, positions: Tensor, normals: Tensor, texture: Tensor | None, texture_size: int = 0) -> Surface:
+    def _surface(self, vertices: Tensor, texture: Tensor | None, texture_size: int = 0) -> Surface:
+        positions = rows_of_four(_flat(vertices))
+        planes, vertex_normals = normals.planes_and_normals(self._faces, positions)
         return Surface(
             faces=self._faces,
             corner_uvs=self._corner_uvs,
             classes=self._classes,
             class_count=self._class_count,
-            positions=_upload(positions),
-            normals=_upload(normals),
-            texture=None if texture is None else _upload(texture),
+            positions=positions,
+            planes=planes,
+            normals=vertex_normals,
+            texture=None if texture is None else _flat(texture),
             texture_size=texture_size if texture is None else texture.shape[0],
         )
 
-    def _forward(self, surface: Surface, pixels: PixelList) -> tuple[list[mi.Float], list[mi.UInt32]]:
-        """The groups of channels of every pixel, each flat, and for each ray of a pixel the face it meets, or _MISS."""
-        image, seen = [mi.Float(0)] * len(GROUPS), []
-        with dr.suspend_grad():
-            for offset in self._pixel_offsets:
-                origin, direction = pixels.rays(offset)
-                hit = self._scene.cast(origin, direction, mi.Bool(True), coherent=True)
-                is_hit = hit.is_valid()
-                face = dr.select(is_hit, hit.prim_index, 0)
-                corners = surface.load(face, is_hit)
-                channels = surface.shade(corners, hit.prim_uv.x, hit.prim_uv.y, direction, is_hit)
-                share = 1 / len(self._pixel_offsets)
-                image = [
-                    total + share * dr.ravel(mi.ArrayXf(channels[group]))
-                    for total, group in zip(image, GROUPS, strict=True)
-                ]
-                seen.append(dr.select(is_hit, hit.prim_index, _MISS))
-                dr.eval(image, seen)
-            dr.sync_thread()
-        return image, seen
+    def _cast(self, pixels: PixelList, offset: tuple[float, float]) -> Hits:
+        hit = self._scene.cast(*pixels.rays(offset), mi.Bool(True), coherent=True)
+        is_hit = hit.is_valid()
+        depth = dr.select(is_hit, hit.t, dr.inf)
+        met = (hit.prim_index, hit.prim_uv.x, hit.prim_uv.y)
+        dr.eval(is_hit, depth, met)
+        pixel = dr.compress(is_hit)
+        face, b1, b2 = (dr.gather(type(values), values, pixel) for values in met)
+        return Hits(depth=depth, pixel=pixel, face=face, b1=b1, b2=b2)
 
-    def _interior(
-        self, surface: Surface, pixels: PixelList, offset: tuple[float, float], seen: mi.UInt32, adjoint: Adjoint
-    ) -> Corners | None:
-        """Fill the gradients of the corners that were hit: the part that needs no visibility change."""
-        pixel = dr.compress(seen != _MISS)
-        if dr.width(pixel) == 0 or not adjoint.moves_inside:
-            return None
-        corners = surface.load(dr.gather(mi.UInt32, seen, pixel))
-        dr.enable_grad(corners.positions, corners.normals)
-        origin, direction = pixels.rays(offset, pixel)
-        b1, b2 = corners.barycentrics(origin, direction)
-        channels = surface.shade(corners, b1, b2, direction, mi.Bool(True))
-        value = adjoint.times(channels, pixel, without=MASK)
-        dr.backward(value * (1 / len(self._pixel_offsets)))
-        return corners
-
-    def _interior_gradients(
-        self, surface: Surface, pixels: PixelList, seen: list[mi.UInt32], adjoint: Adjoint
-    ) -> tuple[Tensor, Tensor]:
-        """What the inside of the faces gives to positions and normals; the texture's stays with the surface."""
-        positions, normals = VertexSum(surface.vertex_count, adjoint), VertexSum(surface.vertex_count, adjoint)
-        for offset, faces in zip(self._pixel_offsets, seen, strict=True):
-            corners = self._interior(surface, pixels, offset, faces, adjoint)
-            if corners is not None:
-                for vertex, position, normal in zip(corners.vertices, corners.positions, corners.normals, strict=True):
-                    positions.add(vertex, dr.grad(position))
-                    normals.add(vertex, dr.grad(normal))
-                dr.eval(positions.total, normals.total)
-        return positions.tensor(), normals.tensor()
-
-    def _edge_gradients(self, surface: Surface, pixels: PixelList, adjoint: Adjoint) -> Tensor:
-        """What the silhouettes give to the gradient of positions."""
-        self._seed += 1
-        terms = silhouette.backward(
-            self._scene, surface, self._edges, pixels, adjoint, samples_per_px=self._edge_samples, seed=self._seed
+    def _draw(self, surface: Surface, pixels: PixelList) -> tuple[Drawn, list[mi.Float | None]]:
+        """The drawing, and the groups of channels of all pixels, each flat; no colour without a texture."""
+        facing = silhouette.facing(surface, pixels)
+        dr.eval(facing)
+        drawn = Drawn(
+            surface=surface,
+            pixels=pixels,
+            facing=facing,
+            hits=[self._cast(pixels, offset) for offset in self._pixel_offsets],
+            slopes=[],
         )
-        positions = VertexSum(surface.vertex_count, adjoint)
-        for vertex, gradient in terms:
-            positions.add(vertex, gradient)
-        return positions.tensor()
+        widths = [0 if surface.texture is None else 3, 3, 1, surface.class_count]
+        image = [dr.zeros(mi.Float, width * pixels.count) if width else None for width in widths]
+        for hits in drawn.hits:
+            drawn.slopes.append(self._shade(drawn, hits, image) if hits.count else [])
+        dr.sync_thread()
+        return drawn, image
 
-    def _faces_at(self, pixels: PixelList, offset: tuple[float, float]) -> mi.UInt32:
-        with dr.suspend_grad():
-            hit = self._scene.cast(*pixels.rays(offset), mi.Bool(True), coherent=True)
-            return dr.select(hit.is_valid(), hit.prim_index, _MISS)
+    def _shade(self, drawn: Drawn, hits: Hits, image: list[mi.Float | None]) -> list[mi.Vector3f]:
+        """Add one ray's share to every pixel; the colours' slopes."""
+        surface = drawn.surface
+        uvs = surface.uvs(hits.face)
+        colour, (du, dv) = surface.colour(hits.shares, uvs)
+        slopes = interior.colour_slopes(uvs, du, dv)
+        facing = silhouette.sees(drawn.facing, surface, drawn.pixels, hits)
+        channels = surface.shade(hits.shares, surface.corners(hits.face), colour, facing)
+        for total, group in zip(image, GROUPS, strict=True):
+            if total is None:
+                continue
+            values = mi.ArrayXf([channel / len(drawn.hits) for channel in channels[group]])
+            if len(drawn.hits) == 1:
+                dr.scatter(total, values, hits.pixel)
+            else:
+                dr.scatter_add(total, values, hits.pixel, mode=dr.ReduceMode.NoConflicts)
+        dr.eval(image, slopes)
+        return slopes
 
-    def _splat(
-        self, surface: Surface, pixels: PixelList, seen: mi.UInt32, values: Tensor, weights: Tensor
-    ) -> tuple[Tensor, Tensor]:
-        size, depth = surface.texture_size, values.shape[-1]
-        with dr.suspend_grad():
-            weight = _upload(weights)
-            active = (seen != _MISS) & (weight > 0)
-            corners = surface.load(dr.select(active, seen, 0), active)
-            b1, b2 = corners.barycentrics(*pixels.rays(_CENTRE))
-            uvs = [dr.gather(mi.Point2f, surface.corner_uvs, 3 * corners.face + k, active) for k in range(3)]
-            index, fx, fy = texel_footprint((1 - b1 - b2) * uvs[0] + b1 * uvs[1] + b2 * uvs[2], size)
-            shares = [(1 - fx) * (1 - fy), fx * (1 - fy), (1 - fx) * fy, fx * fy]
-            shares = [dr.select(active, share * weight, 0) for share in shares]
-            index = dr.select(active, index, 0)
-            dr.eval(index, shares)
-            dr.sync_thread()
-        first = index.torch().long()
-        total, density = values.new_zeros(size * size, depth), values.new_zeros(size * size)
-        for step, share in zip((0, 1, size, size + 1), (share.torch() for share in shares), strict=True):
-            density.index_add_(0, first + step, share)
-            for k in range(depth):
-                total[:, k].index_add_(0, first + step, share * values[:, k])
-        return total.view(size, size, depth), density.view(size, size)
+    def _interior_gradients(self, drawn: Drawn, adjoint: Adjoint, sums: interior.Sums) -> None:
+        """Add what the inside of the faces gives."""
+        if adjoint.moves_inside:
+            for hits, slopes in zip(drawn.hits, drawn.slopes, strict=True):
+                if hits.count:
+                    facing = silhouette.sees(drawn.facing, drawn.surface, drawn.pixels, hits)
+                    interior.backward(
+                        drawn.surface, drawn.pixels, hits, slopes, facing, adjoint, sums, 1 / len(drawn.hits)
+                    )
+            surface = drawn.surface
+            normals.backward(surface.faces, surface.positions, surface.normals, sums.normals.table(), sums.positions)
+
+    def _edge_gradients(self, drawn: Drawn, adjoint: Adjoint, positions: RowSum) -> None:
+        """Add what the silhouettes give."""
+        self._seed += 1
+        silhouette.backward(
+            self._scene,
+            drawn.surface,
+            self._edges,
+            drawn.pixels,
+            drawn.facing,
+            drawn.deepest,
+            adjoint,
+            positions,
+            samples_per_px=self._edge_samples,
+            seed=self._seed,
+        )
 
 
 class _Draw(torch.autograd.Function):
@@ -216,42 +221,54 @@ class _Draw(torch.autograd.Function):
 
     @staticmethod
     def forward(
-        ctx: Any, positions: Tensor, normals: Tensor, texture: Tensor | None, renderer: Renderer, pixels: PixelList
+        ctx: Any, vertices: Tensor, texture: Tensor | None, renderer: Renderer, pixels: Pixels
     ) -> tuple[Tensor, ...]:
-        renderer._move(positions)
-        surface = renderer._surface(positions, normals, texture)
-        image, ctx.seen = renderer._forward(surface, pixels)
-        renderer._seen = ctx.seen
-        ctx.renderer, ctx.pixels = renderer, pixels
-        ctx.save_for_backward(positions, normals, *(() if texture is None else (texture,)))
+        with dr.suspend_grad():
+            renderer._move(vertices)
+            drawn, image = renderer._draw(renderer._surface(vertices, texture), upload(pixels))
+        renderer._last = pixels, drawn
+        ctx.renderer, ctx.drawn = renderer, drawn
+        ctx.save_for_backward(vertices)
         ctx.set_materialize_grads(False)
-        normal, mask, classes = (values.torch() for values in image[1:])
-        rgb = normal.new_zeros(3 * pixels.count) if texture is None else image[0].torch()
-        return rgb.view(-1, 3), normal.view(-1, 3), mask, classes.view(pixels.count, surface.class_count)
+        count = len(pixels.view)
+        rgb, normal, mask, classes = (
+            vertices.new_zeros(3 * count) if values is None else values.torch() for values in image
+        )
+        return rgb.view(count, 3), normal.view(count, 3), mask, classes.view(count, -1)
 
     @staticmethod
     def backward(ctx: Any, *grad_outputs: Tensor | None) -> tuple[Tensor | None, ...]:
-        positions, normals, *rest = ctx.saved_tensors
-        texture = rest[0] if rest else None
         renderer: Renderer = ctx.renderer
-        renderer._move(positions)
-        surface = renderer._surface(positions, normals, texture)
-        adjoint = Adjoint.of(grad_outputs, surface)
-        if ctx.needs_input_grad[2]:
-            dr.enable_grad(surface.texture)
-        position_gradient, normal_gradient = renderer._interior_gradients(surface, ctx.pixels, ctx.seen, adjoint)
-        texture_gradient = None
-        if texture is not None and ctx.needs_input_grad[2]:
-            texture_gradient = dr.grad(surface.texture).torch().reshape(texture.shape).clone()
-        if ctx.needs_input_grad[0]:
-            surface = renderer._surface(positions, normals, texture)
-            position_gradient += renderer._edge_gradients(surface, ctx.pixels, adjoint)
-        return position_gradient, normal_gradient, texture_gradient, None, None
+        drawn: Drawn = ctx.drawn
+        surface = drawn.surface
+        with dr.suspend_grad():
+            (vertices,) = ctx.saved_tensors
+            renderer._move(vertices)
+            adjoint = Adjoint.of(grad_outputs, surface)
+            sums = interior.Sums(
+                positions=RowSum(surface.vertex_count, adjoint.unit),
+                normals=RowSum(surface.vertex_count, adjoint.unit),
+                texels=RowSum(surface.texture_size**2) if ctx.needs_input_grad[1] else None,
+            )
+            renderer._interior_gradients(drawn, adjoint, sums)
+            if ctx.needs_input_grad[0]:
+                renderer._edge_gradients(drawn, adjoint, sums.positions)
+            tables = [table.table() for table in (sums.positions, sums.texels) if table is not None]
+            dr.eval(tables)
+        position_gradient, *texture_gradient = (_tensor(table).view(-1, 4)[:, :3] for table in tables)
+        size = surface.texture_size
+        return position_gradient, texture_gradient[0].view(size, size, 3) if texture_gradient else None, None, None
 
 
-def _upload(tensor: Tensor) -> mi.Float:
+def _flat(tensor: Tensor) -> mi.Float:
     """A torch tensor as a flat Dr.Jit array; shares memory where it can."""
     return mi.Float(tensor.detach().contiguous().reshape(-1))
+
+
+def _tensor(array: mi.Float) -> Tensor:
+    dr.eval(array)
+    dr.sync_thread()
+    return array.torch()
 
 
 def _pixel_offsets(count: int) -> list[tuple[float, float]]:

@@ -1,143 +1,169 @@
 """What a surface point looks like, unshaded: texture colour, world normal, soft classes, mask.
 
-Everything is a Dr.Jit gather; looking a point up needs its face, its barycentrics and where it is seen from.
+Everything is a Dr.Jit gather; looking a point up needs its face, its barycentrics and which side of it is seen. Tables
+have rows of four numbers: a row is one load (and one store, where gradients are summed), several times as fast as
+four.
 """
 
 from __future__ import annotations  # mi.Float exists only once a variant is chosen
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
+from jaxtyping import Shaped
 
 MASK = 6  # the channel of coverage
 GROUPS = (slice(0, 3), slice(3, 6), slice(MASK, 7), slice(7, None))  # channels: colour, normal, mask, classes
 
 
 @dataclass(frozen=True, kw_only=True)
-class Corners:
-    """The three corners of one face per lane. Gradients stop here: lanes are summed to vertices in a fixed order."""
+class Hits:
+    """What the rays through one point of all pixels met."""
 
-    face: mi.UInt32
-    vertices: list[mi.UInt32]
-    positions: list[mi.Point3f]
-    normals: list[mi.Vector3f]
+    depth: mi.Float  # P, metres; infinite where nothing was met
+    pixel: mi.UInt32  # N, of those that met a face
+    face: mi.UInt32  # N
+    b1: mi.Float  # N, barycentric of the face's second corner
+    b2: mi.Float  # N, and of its third
 
-    def barycentrics(self, origin: mi.Point3f, direction: mi.Vector3f) -> tuple[mi.Float, mi.Float]:
-        """Where a fixed ray meets the plane of the face (Moeller and Trumbore); differentiable in `positions`."""
-        a, b, c = self.positions
-        ab, ac = b - a, c - a
-        p = dr.cross(direction, ac)
-        scale = dr.rcp(dr.dot(ab, p))
-        t = origin - a
-        return dr.dot(t, p) * scale, dr.dot(direction, dr.cross(t, ab)) * scale
+    @property
+    def count(self) -> int:
+        return dr.width(self.pixel)
 
-    def from_behind(self, direction: mi.Vector3f) -> mi.Bool:
-        """Whether a ray meets the inner side of the face: a scanner's normals point to the camera there too."""
-        a, b, c = (dr.detach(position) for position in self.positions)
-        return dr.dot(dr.cross(b - a, c - a), direction) > 0
+    @property
+    def shares(self) -> list[mi.Float]:
+        """Barycentrics of all three corners."""
+        return [1 - self.b1 - self.b2, self.b1, self.b2]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Footprint:
+    """The four texels around a point of the texture, and where between them it lies."""
+
+    first: mi.UInt32  # texel; the others are next to it, below it and both
+    fx: mi.Float
+    fy: mi.Float
+    size: int
+
+    @classmethod
+    def of(cls, uv: mi.Point2f, size: int) -> Footprint:
+        """Bilinear, clamped at the border. Row 0 of the texture is at v = 1."""
+        x = dr.clip(uv.x * size - 0.5, 0, size - 1.001)
+        y = dr.clip((1 - uv.y) * size - 0.5, 0, size - 1.001)
+        column, row = mi.UInt32(x), mi.UInt32(y)
+        return cls(first=row * size + column, fx=x - mi.Float(column), fy=y - mi.Float(row), size=size)
+
+    def texels(self) -> list[tuple[mi.UInt32, mi.Float]]:
+        """Index and share of each."""
+        shares = [(1 - self.fx) * (1 - self.fy), self.fx * (1 - self.fy), (1 - self.fx) * self.fy, self.fx * self.fy]
+        return [(self.first + step, w) for step, w in zip((0, 1, self.size, self.size + 1), shares, strict=True)]
+
+    def slopes(self, values: Sequence[mi.Vector3f]) -> tuple[mi.Vector3f, mi.Vector3f]:
+        """d/du and d/dv of what lies between four texels' values."""
+        du = dr.lerp(values[1] - values[0], values[3] - values[2], self.fy)
+        dv = dr.lerp(values[2] - values[0], values[3] - values[1], self.fx)
+        return self.size * du, -self.size * dv
 
 
 @dataclass(frozen=True, kw_only=True)
 class Surface:
-    """The arrays of one mesh on the device. `positions` and `normals` may carry gradients, `texture` too."""
+    """The tables of one mesh on the device."""
 
-    faces: mi.UInt32  # 3F
-    corner_uvs: mi.Float  # 6F
-    classes: mi.Float  # V * class_count
+    faces: mi.UInt32  # (F, 4): vertices, 0
+    corner_uvs: mi.Float  # (F, 8): three uvs, 0
+    classes: mi.Float  # (V, class_count and what fills up a multiple of four)
     class_count: int
-    positions: mi.Float  # 3V, world, metres
-    normals: mi.Float  # 3V, unit
-    texture: mi.Float | None  # 3 R^2, row 0 at v = 1
+    positions: mi.Float  # (V, 4), world, metres
+    planes: mi.Float  # (F, 4): n, <n, p>; see `normals`
+    normals: mi.Float  # (V, 4), unit
+    texture: mi.Float | None  # (R R, 3), row 0 at v = 1
     texture_size: int
 
     @property
     def vertex_count(self) -> int:
-        return dr.width(self.positions) // 3
+        return dr.width(self.positions) // 4
 
-    def corners(self, face: mi.UInt32, active: mi.Bool | bool = True) -> mi.Point3u:
-        return dr.gather(mi.Point3u, self.faces, face, active)
+    @property
+    def face_count(self) -> int:
+        return dr.width(self.faces) // 4
+
+    def corners(self, face: mi.UInt32, active: mi.Bool | bool = True) -> list[mi.UInt32]:
+        return corners(self.faces, face, active)
 
     def position(self, vertex: mi.UInt32, active: mi.Bool | bool = True) -> mi.Point3f:
-        return dr.gather(mi.Point3f, self.positions, vertex, active)
+        return point(self.positions, vertex, active)
 
-    def load(self, face: mi.UInt32, active: mi.Bool | bool = True) -> Corners:
-        corners = self.corners(face, active)
-        vertices = [corners[k] for k in range(3)]
-        return Corners(
-            face=face,
-            vertices=vertices,
-            positions=[self.position(v, active) for v in vertices],
-            normals=[dr.gather(mi.Vector3f, self.normals, v, active) for v in vertices],
-        )
+    def normal(self, vertex: mi.UInt32) -> mi.Vector3f:
+        return mi.Vector3f(point(self.normals, vertex))
+
+    def vertex_classes(self, vertex: mi.UInt32) -> list[mi.Float]:
+        rows = -(-self.class_count // 4)
+        loaded = [dr.gather(mi.Vector4f, self.classes, rows * vertex + k) for k in range(rows)]
+        return [share for row in loaded for share in row][: self.class_count]
+
+    def uvs(self, face: mi.UInt32) -> list[mi.Point2f]:
+        """Of the three corners."""
+        first, second = (dr.gather(mi.Vector4f, self.corner_uvs, 2 * face + k) for k in range(2))
+        return [mi.Point2f(first.x, first.y), mi.Point2f(first.z, first.w), mi.Point2f(second.x, second.y)]
+
+    def corner_uv(self, corner: mi.UInt32) -> mi.Point2f:
+        """Of one of all faces' corners."""
+        return dr.gather(mi.Point2f, self.corner_uvs, corner + corner // 3)  # four uvs a row, three of them used
+
+    def footprint(self, shares: Sequence[mi.Float], uvs: Sequence[mi.Point2f]) -> Footprint:
+        return Footprint.of(blend(shares, uvs), self.texture_size)
+
+    def colour(
+        self, shares: Sequence[mi.Float], uvs: Sequence[mi.Point2f]
+    ) -> tuple[mi.Vector3f, tuple[mi.Vector3f, mi.Vector3f]]:
+        """The texture's colour at a blend of uvs, and its d/du and d/dv; black without a texture."""
+        if self.texture is None:
+            return mi.Vector3f(0), (mi.Vector3f(0), mi.Vector3f(0))
+        footprint = self.footprint(shares, uvs)
+        indices, parts = zip(*footprint.texels(), strict=True)
+        values = [dr.gather(mi.Vector3f, self.texture, index) for index in indices]
+        return blend(parts, values), footprint.slopes(values)
 
     def shade(
-        self, corners: Corners, b1: mi.Float, b2: mi.Float, direction: mi.Vector3f, active: mi.Bool
+        self, shares: Sequence[mi.Float], vertices: Sequence[mi.UInt32], colour: mi.Vector3f, facing: mi.Bool
     ) -> list[mi.Float]:
-        """The channels of (face; 1 - b1 - b2, b1, b2) seen along `direction`; zero where not active."""
-        return self._mix(
-            [1 - b1 - b2, b1, b2],
-            corners.normals,
-            corners.vertices,
-            [3 * corners.face + k for k in range(3)],
-            corners.from_behind(direction),
-            active,
-        )
-
-    def shade_edge(
-        self,
-        face: mi.UInt32,
-        vertex: mi.Point2u,
-        corner: mi.Point2u,
-        t: mi.Float,
-        direction: mi.Vector3f,
-        active: mi.Bool,
-    ) -> list[mi.Float]:
-        """The channels of a point on a face's edge, at share t of the way from its first to its second end."""
-        behind = self.load(face, active).from_behind(direction)
-        ends = [vertex.x, vertex.y]
-        normals = [dr.gather(mi.Vector3f, self.normals, v, active) for v in ends]
-        return self._mix([1 - t, t], normals, ends, [corner.x, corner.y], behind, active)
-
-    def _mix(
-        self,
-        weights: list[mi.Float],
-        normals: list[mi.Vector3f],
-        vertices: list[mi.UInt32],
-        corners: list[mi.UInt32],
-        behind: mi.Bool,
-        active: mi.Bool,
-    ) -> list[mi.Float]:
-        # prim_uv is undefined on a miss: weights must be silenced there or NaNs spread.
-        weights = [dr.select(active, w, 0) for w in weights]
-        normal = sum((w * n for w, n in zip(weights, normals, strict=True)), mi.Vector3f(0))
-        normal *= dr.rsqrt(dr.maximum(dr.squared_norm(normal), 1e-12)) * dr.select(behind, mi.Float(-1), 1)
-        classes = [mi.Float(0)] * self.class_count
-        for w, v in zip(weights, vertices, strict=True):
-            row = dr.gather(mi.ArrayXf, self.classes, v, active, shape=(self.class_count, dr.width(v)))
-            classes = [total + w * row[k] for k, total in enumerate(classes)]
-        colour = [mi.Float(0)] * 3
-        if self.texture is not None:
-            uvs = [dr.gather(mi.Point2f, self.corner_uvs, c, active) for c in corners]
-            colour = list(
-                self._lookup(sum((w * uv for w, uv in zip(weights, uvs, strict=True)), mi.Point2f(0)), active)
-            )
-        mask = dr.select(active, mi.Float(1), 0)
-        return [*colour, normal.x, normal.y, normal.z, mask, *classes]
-
-    def _lookup(self, uv: mi.Point2f, active: mi.Bool) -> mi.Color3f:
-        def texel(index: mi.UInt32) -> mi.Color3f:
-            return dr.gather(mi.Color3f, self.texture, index, active)
-
-        index, fx, fy = texel_footprint(uv, self.texture_size)
-        top = dr.lerp(texel(index), texel(index + 1), fx)
-        bottom = dr.lerp(texel(index + self.texture_size), texel(index + self.texture_size + 1), fx)
-        return dr.lerp(top, bottom, fy)
+        """The channels of a point that has a share of each of some vertices, of a face whose outer side is `facing`."""
+        normal = blend(shares, [self.normal(vertex) for vertex in vertices])
+        # A scanner's normals point to the camera, on the inner side of a face too.
+        normal *= dr.rsqrt(dr.maximum(dr.squared_norm(normal), 1e-12)) * dr.select(facing, mi.Float(1), -1)
+        classes = [blend(shares, values) for values in zip(*map(self.vertex_classes, vertices), strict=True)]
+        return [*colour, *normal, mi.Float(1), *classes]
 
 
-def texel_footprint(uv: mi.Point2f, size: int) -> tuple[mi.UInt32, mi.Float, mi.Float]:
-    """The first texel of a bilinear footprint and the position inside it. Row 0 of the texture is at v = 1."""
-    x = dr.clip(uv.x * size - 0.5, 0, size - 1.001)
-    y = dr.clip((1 - uv.y) * size - 0.5, 0, size - 1.001)
-    column, row = mi.UInt32(dr.detach(x)), mi.UInt32(dr.detach(y))
-    return row * size + column, x - mi.Float(column), y - mi.Float(row)
+def blend(shares: Sequence[mi.Float], values: Sequence[Any]) -> Any:
+    total = shares[0] * values[0]
+    for share, value in zip(shares[1:], values[1:], strict=True):
+        total += share * value
+    return total
+
+
+def corners(faces: mi.UInt32, face: mi.UInt32, active: mi.Bool | bool = True) -> list[mi.UInt32]:
+    """The vertices of faces, from their table."""
+    row = dr.gather(mi.Vector4u, faces, face, active)
+    return [row.x, row.y, row.z]
+
+
+def point(table: mi.Float, row: mi.UInt32, active: mi.Bool | bool = True) -> mi.Point3f:
+    """The first three of four columns."""
+    values = dr.gather(mi.Vector4f, table, row, active)
+    return mi.Point3f(values.x, values.y, values.z)
+
+
+def rows(table: Shaped[np.ndarray, "N D"], width: int = 4) -> Shaped[np.ndarray, "M"]:
+    """A flat table whose rows are filled up with zeros to a multiple of `width`."""
+    return np.pad(table, ((0, 0), (0, -table.shape[1] % width))).ravel()
+
+
+def rows_of_four(table: mi.Float) -> mi.Float:
+    """A flat table of three columns as one of four."""
+    values = dr.gather(mi.Point3f, table, dr.arange(mi.UInt32, dr.width(table) // 3))
+    return dr.ravel(mi.Vector4f(*values, 0))

@@ -20,15 +20,17 @@ import numpy as np
 from jaxtyping import Float
 
 from registration.geometry.topology import Edges
-from registration.render.adjoint import Adjoint
+from registration.render.adjoint import Adjoint, RowSum
 from registration.render.cameras import CameraLanes, PixelList
 from registration.render.scene import TriangleScene
-from registration.render.shading import Surface
+from registration.render.shading import Hits, Surface
 
 # How far beyond the edge the outside ray goes, in focal lengths (px). Larger biases, smaller meets float32.
 _STEP = 1e-6
 # An outside hit nearer than the edge by more than this share of its depth hides the edge.
 _DEPTH_TOLERANCE = 1e-5
+# A sample this far behind all that the pixels around it show, in metres, is hidden. Thinner gaps than a pixel are lost.
+_FAR = 5e-3
 _SEARCH_END = (1 << 22) - 1  # fixed, so that the number of silhouette edges never compiles a new kernel
 _SAMPLE_BLOCK = 4096
 _NONE = 0xFFFFFFFF
@@ -62,26 +64,33 @@ def upload(edges: Edges, corner_uvs: Float[np.ndarray, "F 3 2"]) -> EdgeArrays:
 
 @dataclass(frozen=True, kw_only=True)
 class _Silhouettes:
-    """The silhouette edges of all views: which, how they lie in the cumulated length, which side is seen."""
+    """The silhouette edges of all views: which, how they lie in the images and in the cumulated length."""
 
     ids: mi.UInt32  # view * edge count + edge
     side: mi.UInt32  # 0 or 1: the side that is seen
+    rows: mi.Float  # (M, 8): x and y of both ends (px), depth of both (m), outward normal
     length_px: mi.Float  # cumulated
     count: mi.UInt32
     total_px: mi.Float
 
 
-def _find(surface: Surface, edges: EdgeArrays, pixels: PixelList) -> _Silhouettes | None:
-    face_count = dr.width(surface.faces) // 3
-    faces, edge_count = dr.opaque(mi.UInt32, face_count), dr.opaque(mi.UInt32, edges.count)
+def facing(surface: Surface, pixels: PixelList) -> mi.Bool:
+    """Whether a view sees the outer side of a face, for all views' faces (N F)."""
+    face_count = dr.opaque(mi.UInt32, surface.face_count)
+    lane = dr.arange(mi.UInt32, pixels.camera_count * surface.face_count)
+    view = lane // face_count
+    plane = dr.gather(mi.Vector4f, surface.planes, lane - view * face_count)
+    return dr.dot(mi.Vector3f(plane.x, plane.y, plane.z), pixels.centre(view)) > plane.w
 
-    lane = dr.arange(mi.UInt32, pixels.camera_count * face_count)
-    view = lane // faces
-    corners = surface.corners(lane - view * faces)
-    a, b, c = (surface.position(corners[k]) for k in range(3))
-    facing = dr.dot(dr.cross(b - a, c - a), pixels.centre(view) - a) > 0
-    dr.eval(facing)
 
+def sees(facing: mi.Bool, surface: Surface, pixels: PixelList, hits: Hits) -> mi.Bool:
+    """Whether pixels see the outer sides of the faces that they hit."""
+    view = dr.gather(mi.UInt32, pixels.view, hits.pixel)
+    return dr.gather(mi.Bool, facing, view * dr.opaque(mi.UInt32, surface.face_count) + hits.face)
+
+
+def _find(surface: Surface, edges: EdgeArrays, pixels: PixelList, facing: mi.Bool) -> _Silhouettes | None:
+    faces, edge_count = dr.opaque(mi.UInt32, surface.face_count), dr.opaque(mi.UInt32, edges.count)
     lane = dr.arange(mi.UInt32, pixels.camera_count * edges.count)
     view = lane // edge_count
     edge = lane - view * edge_count
@@ -95,36 +104,35 @@ def _find(surface: Surface, edges: EdgeArrays, pixels: PixelList) -> _Silhouette
     ids = dr.compress(jumps)
     if dr.width(ids) == 0:
         return None
-    side = dr.gather(mi.UInt32, dr.select(boundary | first, mi.UInt32(0), 1), ids)
-
     view = ids // edge_count
     edge = ids - view * edge_count
-    side = _nearer(surface, edges, edge, side)
+    pair = dr.gather(mi.Point2u, edges.faces, edge)
+    first = (pair.y == _NONE) | dr.gather(mi.Bool, facing, view * faces + pair.x)
+    side = _nearer(surface, pair, dr.select(first, mi.UInt32(0), 1))
     ends = dr.gather(mi.Point2u, edges.vertices, edge)
     camera = pixels.camera(view)
     xa, za = camera.project(surface.position(ends.x))
     xb, zb = camera.project(surface.position(ends.y))
+    normal = _outward(surface, camera, dr.select(side == 0, pair.x, pair.y), xa, xb)
     length = dr.cumsum(dr.select((za > 0) & (zb > 0), dr.norm(xb - xa), 0))
     count = dr.opaque(mi.UInt32, dr.width(ids))
     total = dr.gather(mi.Float, length, count - 1)
-    dr.eval(ids, side, length, total)
-    return _Silhouettes(ids=ids, side=side, length_px=length, count=count, total_px=total)
+    rows = dr.ravel(mi.ArrayXf([*xa, *xb, za, zb, *normal]))
+    dr.eval(ids, side, rows, length, total)
+    return _Silhouettes(ids=ids, side=side, rows=rows, length_px=length, count=count, total_px=total)
 
 
-def _nearer(surface: Surface, edges: EdgeArrays, edge: mi.UInt32, facing: mi.UInt32) -> mi.UInt32:
-    """The side of each edge that hides the other, given a side that faces the camera.
+def _nearer(surface: Surface, pair: mi.Point2u, facing: mi.UInt32) -> mi.UInt32:
+    """Which of an edge's two faces hides the other, given one that faces the camera.
 
     Both faces of a silhouette lie on one side of it in the image. On an outer bulge the one that faces the camera is
     nearer; on a fold that is seen from inside an open mesh it is the other, which then lies before the first's plane.
     """
-    pair = dr.gather(mi.Point2u, edges.faces, edge)
-    other = dr.select(facing == 0, pair.y, pair.x)
+    own, other = (dr.select(facing == side, pair.x, pair.y) for side in (0, 1))
     has_other = other != _NONE
-    corners = surface.corners(dr.select(facing == 0, pair.x, pair.y))
-    a, b, c = (surface.position(corners[k]) for k in range(3))
-    corners = surface.corners(other, has_other)
-    beside = sum((surface.position(corners[k], has_other) for k in range(3)), mi.Point3f(0)) / 3
-    folded = has_other & (dr.dot(dr.cross(b - a, c - a), beside - a) > 0)
+    plane = dr.gather(mi.Vector4f, surface.planes, own)
+    beside = dr.dot(mi.Vector3f(plane.x, plane.y, plane.z), _centre(surface, other, has_other)) - plane.w
+    folded = has_other & (beside > 0)
     return dr.select(folded, 1 - facing, facing)
 
 
@@ -151,9 +159,46 @@ def _outward(surface: Surface, camera: CameraLanes, face: mi.UInt32, xa: mi.Poin
     along = xb - xa
     along /= dr.maximum(dr.norm(along), 1e-12)
     normal = mi.Vector2f(-along.y, along.x)
-    corners = surface.corners(face)
-    centre, _ = camera.project(sum((surface.position(corners[k]) for k in range(3)), mi.Point3f(0)) / 3)
+    centre, _ = camera.project(_centre(surface, face))
     return dr.select(dr.dot(centre - xa, normal) > 0, -normal, normal)
+
+
+def _centre(surface: Surface, face: mi.UInt32, active: mi.Bool | bool = True) -> mi.Point3f:
+    a, b, c = (surface.position(vertex, active) for vertex in surface.corners(face, active))
+    return (a + b + c) / 3
+
+
+class _Samples:
+    """Points on silhouettes, where they lie in their images, and what lies there."""
+
+    def __init__(self, found: _Silhouettes, which: mi.UInt32, s: mi.Float):
+        self.found, self.which, self.s = found, which, s
+        first, second = (dr.gather(mi.Vector4f, found.rows, 2 * which + k) for k in range(2))
+        self.za, self.zb = second.x, second.y
+        self.normal = mi.Vector2f(second.z, second.w)  # outward
+        self.x = mi.Point2f(dr.lerp(first.x, first.z, s), dr.lerp(first.y, first.w, s))
+        self.depth = dr.rcp((1 - s) / self.za + s / self.zb)
+        self.in_front = (self.za > 0) & (self.zb > 0)
+
+    def take(self, lanes: mi.UInt32) -> _Samples:
+        return _Samples(self.found, dr.gather(mi.UInt32, self.which, lanes), dr.gather(mi.Float, self.s, lanes))
+
+    def edge(self, edges: EdgeArrays) -> tuple[mi.UInt32, mi.UInt32]:
+        """View and edge."""
+        ids = dr.gather(mi.UInt32, self.found.ids, self.which)
+        count = dr.opaque(mi.UInt32, edges.count)
+        view = ids // count
+        return view, ids - view * count
+
+
+def _far_behind(samples: _Samples, view: mi.UInt32, pixels: PixelList, depth: mi.Float, listed: mi.Bool) -> mi.Bool:
+    """Whether the four pixel centres around a point all show something far before it."""
+    hidden = mi.Bool(True)
+    for dx in (-0.5, 0.5):
+        for dy in (-0.5, 0.5):
+            pixel, known = pixels.at(view, samples.x + mi.Vector2f(dx, dy), listed)
+            hidden &= known & (dr.gather(mi.Float, depth, pixel, known) < samples.depth - _FAR)
+    return hidden
 
 
 def backward(
@@ -161,48 +206,82 @@ def backward(
     surface: Surface,
     edges: EdgeArrays,
     pixels: PixelList,
+    facing: mi.Bool,
+    depth: mi.Float,
     adjoint: Adjoint,
+    positions: RowSum,
     *,
     samples_per_px: float,
     seed: int,
-) -> list[tuple[mi.UInt32, mi.Point3f]]:
-    """The silhouettes' part of d(adjoint . image)/d(positions), as terms: (vertex, gradient) per lane."""
-    with dr.suspend_grad():
-        found = _find(surface, edges, pixels)
-        if found is None:
-            return []
-        samples = int(samples_per_px * float(dr.slice(found.total_px, 0)))
-        samples = _SAMPLE_BLOCK * (1 + samples // _SAMPLE_BLOCK)  # few distinct sizes: memory is reused
-        which, s = _sample(found, samples, seed)
-        view_edge, side = dr.gather(mi.UInt32, found.ids, which), dr.gather(mi.UInt32, found.side, which)
-        edge_count = dr.opaque(mi.UInt32, edges.count)
-        view = view_edge // edge_count
-        edge = view_edge - view * edge_count
-        ends = dr.gather(mi.Point2u, edges.vertices, edge)
-        camera = pixels.camera(view)
-        xa, za = camera.project(surface.position(ends.x))
-        xb, zb = camera.project(surface.position(ends.y))
-        own = dr.gather(mi.UInt32, edges.faces, 2 * edge + side)
-        normal = _outward(surface, camera, own, xa, xb)
+) -> None:
+    """Add the silhouettes' part of d(adjoint . image) to the gradient of positions."""
+    found = _find(surface, edges, pixels, facing)
+    if found is None:
+        return
+    count = int(samples_per_px * float(dr.slice(found.total_px, 0)))
+    count = _SAMPLE_BLOCK * (1 + count // _SAMPLE_BLOCK)  # few distinct sizes: memory is reused
+    samples = _Samples(found, *_sample(found, count, seed))
+    # Most silhouettes lie deep inside the head: they need no ray.
+    view, _ = samples.edge(edges)
+    _, listed = pixels.at(view, samples.x, samples.in_front)
+    kept = listed & ~_far_behind(samples, view, pixels, depth, listed)
+    dr.eval(samples.which, samples.s, kept)
+    kept = dr.compress(kept)
+    if dr.width(kept) == 0:
+        return
+    samples = samples.take(kept)
+    hit, seen = _beyond(scene, samples, pixels.camera(samples.edge(edges)[0]))
+    met = (dr.select(hit.is_valid(), hit.prim_index, _NONE), hit.prim_uv.x, hit.prim_uv.y)
+    dr.eval(samples.which, samples.s, met, seen)
+    seen = dr.compress(seen)
+    if dr.width(seen) == 0:
+        return
+    face, b1, b2 = (dr.gather(type(values), values, seen) for values in met)
+    samples = samples.take(seen)
+    view, edge = samples.edge(edges)
+    pixel, _ = pixels.at(view, samples.x, samples.in_front)
+    f_in, f_out = _on(samples, surface, edges, view, edge, facing), _off(surface, view, face, b1, b2, facing)
+    jump = adjoint.times([inner - outer for inner, outer in zip(f_in, f_out, strict=True)], pixel)
+    weight = jump * (found.total_px / dr.opaque(mi.Float, count))
+    camera = pixels.camera(view)
+    ends = dr.gather(mi.Point2u, edges.vertices, edge)
+    for end, share in ((ends.x, 1 - samples.s), (ends.y, samples.s)):
+        positions.add(end, weight * share * camera.speed(surface.position(end), samples.normal))
 
-        x = dr.lerp(xa, xb, s)
-        depth = dr.rcp((1 - s) / za + s / zb)
-        pixel, inside = pixels.at(view, x, (za > 0) & (zb > 0))
-        beyond = x + normal * (_STEP * camera.fx)
-        direction = camera.direction(beyond.x, beyond.y)
-        hit = scene.cast(camera.centre, direction, inside, coherent=False)
-        is_hit = inside & hit.is_valid()
-        seen = inside & ~(is_hit & (hit.t < depth * (1 - _DEPTH_TOLERANCE)))
-        face = dr.select(is_hit, hit.prim_index, 0)
-        f_out = surface.shade(surface.load(face, is_hit & seen), hit.prim_uv.x, hit.prim_uv.y, direction, is_hit & seen)
-        corners = dr.gather(mi.Point2u, edges.corners, 2 * edge + side, seen)
-        perspective = s * za / dr.maximum((1 - s) * zb + s * za, 1e-9)
-        f_in = surface.shade_edge(own, ends, corners, perspective, direction, seen)
-        jump = adjoint.times([inner - outer for inner, outer in zip(f_in, f_out, strict=True)], pixel, inside)
-        weight = dr.select(seen, jump, 0) * (found.total_px / dr.opaque(mi.Float, samples))
 
-    a, b = (dr.gather(mi.Point3f, surface.positions, end, seen) for end in (ends.x, ends.y))
-    dr.enable_grad(a, b)
-    speed = dr.lerp(dr.dot(normal, camera.project(a)[0]), dr.dot(normal, camera.project(b)[0]), s)
-    dr.backward(dr.select(seen, weight * speed, 0))
-    return [(ends.x, dr.grad(a)), (ends.y, dr.grad(b))]
+def _beyond(
+    scene: TriangleScene, samples: _Samples, camera: CameraLanes
+) -> tuple[mi.PreliminaryIntersection3f, mi.Bool]:
+    """What the rays just outside the edges meet, and whether the edges are seen."""
+    x = samples.x + samples.normal * (_STEP * camera.fx)
+    hit = scene.cast(camera.centre, camera.direction(x.x, x.y), mi.Bool(True), coherent=False)
+    return hit, ~(hit.is_valid() & (hit.t < samples.depth * (1 - _DEPTH_TOLERANCE)))
+
+
+def _on(
+    samples: _Samples, surface: Surface, edges: EdgeArrays, view: mi.UInt32, edge: mi.UInt32, facing: mi.Bool
+) -> list[mi.Float]:
+    """The channels on the edge, of the side that is seen."""
+    side = 2 * edge + dr.gather(mi.UInt32, samples.found.side, samples.which)
+    ends, corners = dr.gather(mi.Point2u, edges.vertices, edge), dr.gather(mi.Point2u, edges.corners, side)
+    s, za, zb = samples.s, samples.za, samples.zb
+    share = s * za / dr.maximum((1 - s) * zb + s * za, 1e-9)  # linear in space
+    outside = dr.gather(
+        mi.Bool, facing, view * dr.opaque(mi.UInt32, surface.face_count) + dr.gather(mi.UInt32, edges.faces, side)
+    )
+    shares = [1 - share, share]
+    colour, _ = surface.colour(shares, [surface.corner_uv(corner) for corner in corners])
+    return surface.shade(shares, list(ends), colour, outside)
+
+
+def _off(
+    surface: Surface, view: mi.UInt32, face: mi.UInt32, b1: mi.Float, b2: mi.Float, facing: mi.Bool
+) -> list[mi.Float]:
+    """The channels just beyond: of a face, or zeros of the background."""
+    is_hit = face != _NONE
+    face = dr.select(is_hit, face, 0)
+    outside = dr.gather(mi.Bool, facing, view * dr.opaque(mi.UInt32, surface.face_count) + face)
+    shares = [1 - b1 - b2, b1, b2]
+    colour, _ = surface.colour(shares, surface.uvs(face))
+    channels = surface.shade(shares, surface.corners(face), colour, outside)
+    return [dr.select(is_hit, value, 0) for value in channels]

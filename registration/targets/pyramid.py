@@ -194,11 +194,10 @@ def _targets(windows: list[_Window], mapping: ClassMap) -> Targets:
     weighed = [_weigh(w) for w in windows]
     taking_part = np.stack([np.any([w[name] > 0 for name in w if name.endswith("weight")], axis=0) for w in weighed])
     pixels = Pixels.of([w.camera for w in windows], torch.as_tensor(taking_part))
+    place = tuple(axis.numpy() for axis in (pixels.view, pixels.y, pixels.x))
 
     def listed(values: list[np.ndarray]) -> torch.Tensor:
-        return torch.as_tensor(
-            np.concatenate([v[t] for v, t in zip(values, taking_part, strict=True)]).astype(np.float16)
-        )
+        return torch.as_tensor(np.stack([value.astype(np.float16) for value in values])[place])
 
     schemes = sorted({scheme for w in windows for scheme in w.landmarks})
     return Targets(

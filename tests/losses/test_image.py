@@ -193,13 +193,13 @@ def test_ssim_is_that_of_a_window_of_eleven():
     from skimage.metrics import structural_similarity
 
     seen, other = targets(), targets(seed=1)
-    middle = torch.zeros(HEIGHT, WIDTH, dtype=torch.float64)
-    middle[7, 8] = 1
-    seen = replace(seen, rgb_weight=middle.reshape(-1))
+    middle = torch.zeros(1, HEIGHT, WIDTH, dtype=torch.float64)
+    middle[0, 7, 8] = 1
+    seen = replace(seen, rgb_weight=seen.pixels.of_image(middle))
     # Elsewhere the rendering would be replaced by what was seen: leave a trace of weight.
     seen = replace(seen, rgb_weight=seen.rgb_weight.clamp_min(1e-12))
     value = image.rgb_ssim(same(other), seen, everywhere(seen)).item() * len(seen.mask)
-    a, b = (image.encoded(t.rgb).reshape(HEIGHT, WIDTH, 3).numpy() for t in (other, seen))
+    a, b = (seen.pixels.image(image.encoded(t.rgb))[0].numpy() for t in (other, seen))
     _, full = structural_similarity(
         a,
         b,
@@ -219,14 +219,15 @@ def test_a_few_pixels_or_all_of_them():
     chosen = torch.zeros(1, HEIGHT, WIDTH, dtype=torch.bool)
     chosen[0, 3:12, 4:13] = True
     whole, rendered = targets(), same(targets(seed=1))
-    index = chosen.reshape(-1)
+    index = whole.pixels.of_image(chosen)
     only = {name: values * index for name, values in vars(whole).items() if name.endswith("weight")}
     whole = replace(whole, mask=whole.mask * index, **only)
     shown = Pixels.of([camera()], chosen)
-    listed = {name: value[index] for name, value in vars(whole).items() if isinstance(value, torch.Tensor)}
+    place = shown.of_image(whole.pixels.index)
+    listed = {name: value[place] for name, value in vars(whole).items() if isinstance(value, torch.Tensor)}
     part = replace(whole, pixels=shown, **listed)
-    cut = Rendered(**{name: value[index] for name, value in vars(rendered).items()})
+    cut = Rendered(**{name: value[place] for name, value in vars(rendered).items()})
     for name, term in TERMS.items():
         if name != "ssim":  # its windows see the background beyond the list
             agree = everywhere(whole)
-            assert term(cut, part, agree[index]).item() == pytest.approx(term(rendered, whole, agree).item()), name
+            assert term(cut, part, agree[place]).item() == pytest.approx(term(rendered, whole, agree).item()), name

@@ -77,9 +77,9 @@ def test_a_square_by_hand():
     # Linear in u and v, so that bilinear look-ups are exact between the outermost texels' centres.
     centre = (np.arange(size) + 0.5) / size
     texture = np.stack(np.broadcast_arrays(centre[None, :], 1 - centre[:, None], 0.25), -1)
-    image = square()(torch.tensor(SQUARE), torch.tensor(texture, dtype=torch.float32), Pixels.all_of([view]))
-    y, x = (axis.ravel() for axis in np.mgrid[: view.height_px, : view.width_px])
-    rays = centre_rays(view, x, y)
+    pixels = Pixels.all_of([view])
+    image = square()(torch.tensor(SQUARE), torch.tensor(texture, dtype=torch.float32), pixels)
+    rays = centre_rays(view, pixels.x.numpy(), pixels.y.numpy())
     point = view.centre - view.centre[2] / rays[:, 2:] * rays
     u, v = point[:, 0] / 0.1, point[:, 1] / 0.1
     margin = np.minimum.reduce([u, v, 1 - u, 1 - v])
@@ -134,9 +134,10 @@ def test_a_head_against_the_numpy_rasteriser():
     normals = vertex_normals(vertices, torch.tensor(TINY.triangles.astype(np.int64))).numpy()
     per_view = pixels.index[0].numel()
     for number, view in enumerate(pixels.cameras):
-        face, weight = (a.reshape(per_view, -1) for a in rasterize(positions, TINY.triangles, view))
-        face = face[:, 0]
-        part = {name: values[per_view * number :][:per_view].numpy() for name, values in vars(image).items()}
+        here = slice(per_view * number, per_view * (number + 1))
+        place = (pixels.y[here].numpy(), pixels.x[here].numpy())
+        face, weight = (a[place] for a in rasterize(positions, TINY.triangles, view))
+        part = {name: values[here].numpy() for name, values in vars(image).items()}
         corners = TINY.triangles[face]
         a, b, c = (positions[corners[:, k]] for k in range(3))
         towards = (np.cross(b - a, c - a) * (view.centre - a)).sum(1)
@@ -186,8 +187,8 @@ def test_some_pixels_are_those_of_all():
         pixels = Pixels.of(everywhere.cameras, mask)
         image = renderer(vertices, texture, pixels)
         for name, values in vars(image).items():
-            torch.testing.assert_close(values, getattr(whole, name)[mask.reshape(-1)])
-        parts.append(gradient(pixels, weight[mask.reshape(-1)]))
+            torch.testing.assert_close(values, getattr(whole, name)[everywhere.of_image(mask)])
+        parts.append(gradient(pixels, weight[everywhere.of_image(mask)]))
     total = gradient(everywhere, weight)
     assert (parts[0] + parts[1] - total).norm() < 0.05 * total.norm()
 
@@ -252,7 +253,7 @@ def test_another_forward_between_forward_and_backward():
         if disturb:
             other = Pixels.all_of(pixels.cameras[:1])
             renderer(vertices * 1.3 + 0.02, None, other)
-            renderer.unwrap(vertices * 0.9, torch.ones(len(other.view), 1), torch.ones(len(other.view)), other, 32)
+            renderer.unwrap(vertices * 0.9, torch.ones(len(other.view), 3), torch.ones(len(other.view)), other, 32)
         (image.rgb.sum() + image.normals[:, 0].sum() + image.mask.sum()).backward()
         return attached.grad, colours.grad
 

@@ -1,0 +1,121 @@
+"""The gradient of what is seen inside the faces, where nothing comes into sight or leaves it.
+
+A ray from o along d meets a face with corners p_0, p_1, p_2 at barycentrics b, and sees the values sum_j b_j v_j there.
+Let g be the pixel's adjoint. Along the face the loss changes by A_j = <g, v_j> per b_j. When corner j moves by x, the
+face slips under the fixed ray by b_j x less what of it is along d, so that
+
+    dLoss/dp_j = -b_j w,  w = ((A_1 - A_0) e_2 x d + (A_2 - A_0) d x e_1) / <e_1 x e_2, d>,  e_j = p_j - p_0
+
+Nothing is traced again, and nothing of a lane is kept: each adds its gradients to the tables of vertices and texels.
+"""
+
+from __future__ import annotations  # mi.Float exists only once a variant is chosen
+
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+
+from registration.render.adjoint import Adjoint, RowSum
+from registration.render.cameras import PixelList
+from registration.render.shading import Footprint, Hits, Surface
+
+
+@dataclass(frozen=True, kw_only=True)
+class Sums:
+    """Where gradients go: to positions and normals of vertices, and to texels if asked."""
+
+    positions: RowSum
+    normals: RowSum
+    texels: RowSum | None
+
+
+def colour_slopes(uvs: list[mi.Point2f], du: mi.Vector3f, dv: mi.Vector3f) -> list[mi.Vector3f]:
+    """d(colour) / d(b_1) and / d(b_2): what drawing knows of the texture, and reading it again would cost more."""
+    return [du * (uv.x - uvs[0].x) + dv * (uv.y - uvs[0].y) for uv in uvs[1:]]
+
+
+def backward(
+    surface: Surface,
+    pixels: PixelList,
+    hits: Hits,
+    slopes: list[mi.Vector3f],
+    facing: mi.Bool,
+    adjoint: Adjoint,
+    sums: Sums,
+    share: float,
+) -> None:
+    """Add d(adjoint . image) of some hits to the sums; `slopes` are `colour_slopes`, each has a share of its pixel."""
+    b = hits.shares
+    vertices = surface.corners(hits.face)
+    change = [mi.Float(0) for _ in range(3)]  # A
+    _classes(surface, hits, vertices, adjoint, change)
+    normal = _normals(surface, hits, b, vertices, facing, adjoint, change)
+    _colour(surface, hits, slopes, adjoint, change, sums.texels, share)
+    p0, p1, p2 = (surface.position(vertex) for vertex in vertices)
+    direction = b[0] * p0 + b[1] * p1 + b[2] * p2 - pixels.centre(dr.gather(mi.UInt32, pixels.view, hits.pixel))
+    e1, e2 = p1 - p0, p2 - p0
+    slip = (change[1] - change[0]) * dr.cross(e2, direction) + (change[2] - change[0]) * dr.cross(direction, e1)
+    slip *= share * dr.rcp(dr.dot(dr.cross(e1, e2), direction))
+    for vertex, part in zip(vertices, b, strict=True):
+        sums.positions.add(vertex, -part * slip)
+        if normal is not None:
+            sums.normals.add(vertex, share * part * normal)
+    dr.eval(sums.positions.total, sums.normals.total)
+
+
+def _classes(surface: Surface, hits: Hits, vertices: list[mi.UInt32], adjoint: Adjoint, change: list[mi.Float]) -> None:
+    g = adjoint.classes(hits.pixel)
+    if g is None:
+        return
+    for j, vertex in enumerate(vertices):
+        for k, value in enumerate(surface.vertex_classes(vertex)):
+            change[j] = dr.fma(g[k], value, change[j])
+
+
+def _normals(
+    surface: Surface,
+    hits: Hits,
+    b: list[mi.Float],
+    vertices: list[mi.UInt32],
+    facing: mi.Bool,
+    adjoint: Adjoint,
+    change: list[mi.Float],
+) -> mi.Vector3f | None:
+    """dLoss / d(interpolated normal before it is made unit)."""
+    g = adjoint.normal(hits.pixel)
+    if g is None:
+        return None
+    normals = [surface.normal(vertex) for vertex in vertices]
+    normal = b[0] * normals[0] + b[1] * normals[1] + b[2] * normals[2]
+    inverse = dr.rsqrt(dr.maximum(dr.squared_norm(normal), 1e-12))
+    unit = normal * inverse
+    g = (g - unit * dr.dot(unit, g)) * (inverse * dr.select(facing, mi.Float(1), -1))
+    for j in range(3):
+        change[j] += dr.dot(g, normals[j])
+    return g
+
+
+def _colour(
+    surface: Surface,
+    hits: Hits,
+    slopes: list[mi.Vector3f],
+    adjoint: Adjoint,
+    change: list[mi.Float],
+    texels: RowSum | None,
+    share: float,
+) -> None:
+    g = adjoint.colour(hits.pixel)
+    if g is None:
+        return
+    change[1] += dr.dot(g, slopes[0])
+    change[2] += dr.dot(g, slopes[1])
+    if texels is not None:
+        carry_back(texels, surface.footprint(hits.shares, surface.uvs(hits.face)), share * mi.Vector4f(*g, 0))
+
+
+def carry_back(texels: RowSum, footprint: Footprint, value: mi.Vector4f) -> None:
+    """Add what pixels hold to the texels that they show: the transpose of the look-up."""
+    for texel, share in footprint.texels():
+        texels.add(texel, share * value)
+    dr.eval(texels.total)
