@@ -15,7 +15,7 @@ from registration.losses import geometry, image, landmark
 from registration.model.gnm import GNM
 from registration.model.gnm_npz import GNMData
 from registration.model.landmarks import LandmarkScheme
-from registration.model.regions import vertex_classes
+from registration.model.regions import crossing_parts, vertex_classes
 from registration.optimize import AdamBlock, AdamUniformBlock, Block, History, minimise
 from registration.render.renderer import Renderer
 from registration.stages import Recipe, Stage, rigid
@@ -62,7 +62,8 @@ class Fit:
         self.data, self.model, self.pyramid, self.recipe = data, model, pyramid, recipe
         self.device = model.template.device
         self.corner_uvs = corner_uvs
-        self.renderer = Renderer(data.triangles, corner_uvs, vertex_classes(data)[1] @ mapping.from_model, seed=seed)
+        classes = vertex_classes(data)[1] @ mapping.from_model
+        self.renderer = Renderer(data.triangles, corner_uvs, classes, parts=crossing_parts(data), seed=seed)
         self.schemes = {name: scheme for name, scheme in schemes.items() if name in pyramid[0].landmarks}
         self.landmark_use: dict[str, np.ndarray] = {  # bool (L,)
             name: np.ones(len(scheme.indices), bool) for name, scheme in self.schemes.items()

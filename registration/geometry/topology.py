@@ -5,6 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 from jaxtyping import Float, Int
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
 from torch import Tensor
 
 from registration.errors import InputError
@@ -63,6 +65,14 @@ def edges(triangles: Int[np.ndarray, "F 3"]) -> Edges:
         faces=np.stack([face[first], np.where(two, face[second], -1)], 1),
         corners=corners,
     )
+
+
+def connected_parts(triangles: Int[np.ndarray, "F 3"]) -> Int[np.ndarray, "F"]:
+    """For each triangle the number of the part of the mesh that it is connected to."""
+    count = int(triangles.max()) + 1
+    start, end = triangles[:, [0, 1]].ravel(), triangles[:, [1, 2]].ravel()
+    graph = coo_matrix((np.ones(len(start)), (start, end)), (count, count))
+    return connected_components(graph, directed=False)[1][triangles[:, 0]]
 
 
 def vertex_normals(vertices: Float[Tensor, "V 3"], triangles: Int[Tensor, "F 3"]) -> Float[Tensor, "V 3"]:

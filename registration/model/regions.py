@@ -76,3 +76,15 @@ def components(data: GNMData) -> Int[np.ndarray, "V"]:
             fix="use a model file whose components' vertex groups cover the mesh",
         )
     return weights.argmax(0)
+
+
+def crossing_parts(data: GNMData) -> Int[np.ndarray, "F"]:
+    """For each triangle the number of its part: parts may run through one another, faces of one part do not.
+
+    The components of the mesh are parts, and so are the lips.
+    """
+    lips = [group(data, name)[data.triangles].min(1) > 0.5 for name in ("upper_lip", "lower_lip")]
+    parts = components(data)[data.triangles[:, 0]]
+    for number, lip in enumerate(lips):
+        parts = np.where(lip, len(data.mesh_component_names) + number, parts)
+    return parts

@@ -17,8 +17,7 @@ import drjit as dr
 import mitsuba as mi
 
 from registration.render.adjoint import Adjoint, RowSum
-from registration.render.cameras import PixelList
-from registration.render.shading import Footprint, Hits, Surface
+from registration.render.shading import Drawn, Footprint, Hits, Surface
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -30,30 +29,18 @@ class Sums:
     texels: RowSum | None
 
 
-def colour_slopes(uvs: list[mi.Point2f], du: mi.Vector3f, dv: mi.Vector3f) -> list[mi.Vector3f]:
-    """d(colour) / d(b_1) and / d(b_2): what drawing knows of the texture, and reading it again would cost more."""
-    return [du * (uv.x - uvs[0].x) + dv * (uv.y - uvs[0].y) for uv in uvs[1:]]
-
-
-def backward(
-    surface: Surface,
-    pixels: PixelList,
-    hits: Hits,
-    slopes: list[mi.Vector3f],
-    facing: mi.Bool,
-    adjoint: Adjoint,
-    sums: Sums,
-    share: float,
-) -> None:
-    """Add d(adjoint . image) of some hits to the sums; `slopes` are `colour_slopes`, each has a share of its pixel."""
+def backward(drawn: Drawn, number: int, adjoint: Adjoint, sums: Sums) -> None:
+    """Add d(adjoint . image) of what one ray of each pixel met."""
+    surface, pixels, hits, share = drawn.surface, drawn.pixels, drawn.hits[number], drawn.share
+    view = dr.gather(mi.UInt32, pixels.view, hits.pixel)
     b = hits.shares
     vertices = surface.corners(hits.face)
     change = [mi.Float(0) for _ in range(3)]  # A
     _classes(surface, hits, vertices, adjoint, change)
-    normal = _normals(surface, hits, b, vertices, facing, adjoint, change)
-    _colour(surface, hits, slopes, adjoint, change, sums.texels, share)
+    normal = _normals(surface, hits, b, vertices, drawn.sees_outside(view, hits.face), adjoint, change)
+    _colour(surface, hits, drawn.slopes[number], adjoint, change, sums.texels, share)
     p0, p1, p2 = (surface.position(vertex) for vertex in vertices)
-    direction = b[0] * p0 + b[1] * p1 + b[2] * p2 - pixels.centre(dr.gather(mi.UInt32, pixels.view, hits.pixel))
+    direction = b[0] * p0 + b[1] * p1 + b[2] * p2 - pixels.centre(view)
     e1, e2 = p1 - p0, p2 - p0
     slip = (change[1] - change[0]) * dr.cross(e2, direction) + (change[2] - change[0]) * dr.cross(direction, e1)
     slip *= share * dr.rcp(dr.dot(dr.cross(e1, e2), direction))

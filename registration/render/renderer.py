@@ -7,8 +7,6 @@ there is no shading, no film and no filter; a pixel is a box.
 
 from __future__ import annotations  # mi.Float exists only once a variant is chosen
 
-import functools
-from dataclasses import dataclass
 from typing import Any
 
 import drjit as dr
@@ -18,31 +16,15 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from registration.geometry.topology import edges
-from registration.render import interior, normals, silhouette
+from registration.geometry.topology import connected_parts, edges
+from registration.render import crossings, interior, normals, silhouette
 from registration.render.adjoint import Adjoint, RowSum, unit_of
 from registration.render.cameras import PixelList, upload
 from registration.render.scene import TriangleScene
-from registration.render.shading import GROUPS, Hits, Surface, rows, rows_of_four
+from registration.render.shading import GROUPS, NO_FACE, Drawn, Hits, Surface, rows, rows_of_four
 from registration.types import Pixels, Rendered
 
 _CENTRE = (0.5, 0.5)
-
-
-@dataclass(frozen=True, kw_only=True)
-class Drawn:
-    """One drawing, as its adjoint needs it."""
-
-    surface: Surface
-    pixels: PixelList
-    facing: mi.Bool  # N F: whether a view sees a face's outer side
-    hits: list[Hits]  # one for each ray of a pixel
-    slopes: list[list[mi.Vector3f]]  # the hits' `colour_slopes`
-
-    @property
-    def deepest(self) -> mi.Float:
-        """The greatest depth that any ray of a pixel found."""
-        return functools.reduce(dr.maximum, (hits.depth for hits in self.hits))
 
 
 class Renderer:
@@ -54,6 +36,7 @@ class Renderer:
         corner_uvs: Float[np.ndarray, "F 3 2"],
         vertex_classes: Float[np.ndarray, "V K"],
         *,
+        parts: Int[np.ndarray, "F"] | None = None,
         pixel_samples: int = 1,
         edge_samples: float = 1.0,
         seed: int = 0,
@@ -63,6 +46,7 @@ class Renderer:
             triangles: of welded vertices; what is not listed is not drawn.
             corner_uvs: in [0, 1]^2 of one atlas; (0, 0) is the texture's lower left corner.
             vertex_classes: soft class shares of the vertices.
+            parts: of the mesh that may run through one another, by number; unless told, those that share no vertex.
             pixel_samples: rays per pixel, averaged; 1 is the pixel's centre, which aliases but is enough for a fit.
             edge_samples: silhouette samples per pixel of projected silhouette length, in the adjoint.
             seed: of those samples; every adjoint draws new ones.
@@ -76,6 +60,7 @@ class Renderer:
         self._faces = mi.UInt32(rows(triangles.astype(np.uint32)))
         self._corner_uvs = mi.Float(rows(corner_uvs.astype(np.float32).reshape(-1, 6), 8))
         self._classes = mi.Float(rows(vertex_classes.astype(np.float32)))
+        self._parts = _parts(connected_parts(triangles) if parts is None else parts)
         self._pixel_offsets = _pixel_offsets(pixel_samples)
         self._edge_samples = edge_samples
         self._seed = seed
@@ -143,12 +128,12 @@ class Renderer:
     def _cast(self, pixels: PixelList, offset: tuple[float, float]) -> Hits:
         hit = self._scene.cast(*pixels.rays(offset), mi.Bool(True), coherent=True)
         is_hit = hit.is_valid()
-        depth = dr.select(is_hit, hit.t, dr.inf)
-        met = (hit.prim_index, hit.prim_uv.x, hit.prim_uv.y)
-        dr.eval(is_hit, depth, met)
+        depth, seen = dr.select(is_hit, hit.t, dr.inf), dr.select(is_hit, hit.prim_index, NO_FACE)
+        b1, b2 = hit.prim_uv.x, hit.prim_uv.y
+        dr.eval(is_hit, depth, seen, b1, b2)
         pixel = dr.compress(is_hit)
-        face, b1, b2 = (dr.gather(type(values), values, pixel) for values in met)
-        return Hits(depth=depth, pixel=pixel, face=face, b1=b1, b2=b2)
+        face, b1, b2 = (dr.gather(type(values), values, pixel) for values in (seen, b1, b2))
+        return Hits(offset=offset, seen=seen, depth=depth, pixel=pixel, face=face, b1=b1, b2=b2)
 
     def _draw(self, surface: Surface, pixels: PixelList) -> tuple[Drawn, list[mi.Float | None]]:
         """The drawing, and the groups of channels of all pixels, each flat; no colour without a texture."""
@@ -173,9 +158,10 @@ class Renderer:
         surface = drawn.surface
         uvs = surface.uvs(hits.face)
         colour, (du, dv) = surface.colour(hits.shares, uvs)
-        slopes = interior.colour_slopes(uvs, du, dv)
-        facing = silhouette.sees(drawn.facing, surface, drawn.pixels, hits)
+        facing = drawn.sees_outside(dr.gather(mi.UInt32, drawn.pixels.view, hits.pixel), hits.face)
         channels = surface.shade(hits.shares, surface.corners(hits.face), colour, facing)
+        # What drawing knows of the texture: to read it again would cost more.
+        slopes = [du * (uv.x - uvs[0].x) + dv * (uv.y - uvs[0].y) for uv in uvs[1:]]
         for total, group in zip(image, GROUPS, strict=True):
             if total is None:
                 continue
@@ -190,12 +176,9 @@ class Renderer:
     def _interior_gradients(self, drawn: Drawn, adjoint: Adjoint, sums: interior.Sums) -> None:
         """Add what the inside of the faces gives."""
         if adjoint.moves_inside:
-            for hits, slopes in zip(drawn.hits, drawn.slopes, strict=True):
+            for number, hits in enumerate(drawn.hits):
                 if hits.count:
-                    facing = silhouette.sees(drawn.facing, drawn.surface, drawn.pixels, hits)
-                    interior.backward(
-                        drawn.surface, drawn.pixels, hits, slopes, facing, adjoint, sums, 1 / len(drawn.hits)
-                    )
+                    interior.backward(drawn, number, adjoint, sums)
             surface = drawn.surface
             normals.backward(surface.faces, surface.positions, surface.normals, sums.normals.table(), sums.positions)
 
@@ -204,16 +187,18 @@ class Renderer:
         self._seed += 1
         silhouette.backward(
             self._scene,
-            drawn.surface,
+            drawn,
             self._edges,
-            drawn.pixels,
-            drawn.facing,
-            drawn.deepest,
             adjoint,
             positions,
             samples_per_px=self._edge_samples,
             seed=self._seed,
         )
+
+    def _crossing_gradients(self, drawn: Drawn, adjoint: Adjoint, positions: RowSum) -> None:
+        """Add what parts that run through one another give."""
+        if self._parts is not None:
+            crossings.backward(self._scene, drawn, self._parts, adjoint, positions)
 
 
 class _Draw(torch.autograd.Function):
@@ -253,6 +238,7 @@ class _Draw(torch.autograd.Function):
             renderer._interior_gradients(drawn, adjoint, sums)
             if ctx.needs_input_grad[0]:
                 renderer._edge_gradients(drawn, adjoint, sums.positions)
+                renderer._crossing_gradients(drawn, adjoint, sums.positions)
             tables = [table.table() for table in (sums.positions, sums.texels) if table is not None]
             dr.eval(tables)
         position_gradient, *texture_gradient = (_tensor(table).view(-1, 4)[:, :3] for table in tables)
@@ -269,6 +255,13 @@ def _tensor(array: mi.Float) -> Tensor:
     dr.eval(array)
     dr.sync_thread()
     return array.torch()
+
+
+def _parts(numbers: Int[np.ndarray, "F"]) -> mi.UInt32 | None:
+    """Numbers in the order of the parts' sizes; None if there is but one part."""
+    _, part, sizes = np.unique(numbers, return_inverse=True, return_counts=True)
+    rank = (-sizes).argsort(kind="stable").argsort()
+    return mi.UInt32(rank[part].astype(np.uint32)) if len(sizes) > 1 else None
 
 
 def _pixel_offsets(count: int) -> list[tuple[float, float]]:

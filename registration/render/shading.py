@@ -7,6 +7,7 @@ four.
 
 from __future__ import annotations  # mi.Float exists only once a variant is chosen
 
+import functools
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -16,6 +17,9 @@ import mitsuba as mi
 import numpy as np
 from jaxtyping import Shaped
 
+from registration.render.cameras import PixelList
+
+NO_FACE = 0xFFFFFFFF
 MASK = 6  # the channel of coverage
 GROUPS = (slice(0, 3), slice(3, 6), slice(MASK, 7), slice(7, None))  # channels: colour, normal, mask, classes
 
@@ -24,6 +28,8 @@ GROUPS = (slice(0, 3), slice(3, 6), slice(MASK, 7), slice(7, None))  # channels:
 class Hits:
     """What the rays through one point of all pixels met."""
 
+    offset: tuple[float, float]  # that point, from the pixel's corner (px)
+    seen: mi.UInt32  # P: the face, or NO_FACE
     depth: mi.Float  # P, metres; infinite where nothing was met
     pixel: mi.UInt32  # N, of those that met a face
     face: mi.UInt32  # N
@@ -137,6 +143,36 @@ class Surface:
         normal *= dr.rsqrt(dr.maximum(dr.squared_norm(normal), 1e-12)) * dr.select(facing, mi.Float(1), -1)
         classes = [blend(shares, values) for values in zip(*map(self.vertex_classes, vertices), strict=True)]
         return [*colour, *normal, mi.Float(1), *classes]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Drawn:
+    """One drawing, as its adjoint needs it."""
+
+    surface: Surface
+    pixels: PixelList
+    facing: mi.Bool  # (N F): whether a view sees a face's outer side
+    hits: list[Hits]  # one for each ray of a pixel
+    slopes: list[list[mi.Vector3f]]  # of the hits: d(colour) / d(b_1) and / d(b_2)
+
+    @property
+    def share(self) -> float:
+        """Of one ray in its pixel."""
+        return 1 / len(self.hits)
+
+    @property
+    def deepest(self) -> mi.Float:
+        """The greatest depth that any ray of a pixel found."""
+        return functools.reduce(dr.maximum, (hits.depth for hits in self.hits))
+
+    def sees_outside(self, view: mi.UInt32, face: mi.UInt32) -> mi.Bool:
+        return dr.gather(mi.Bool, self.facing, view * dr.opaque(mi.UInt32, self.surface.face_count) + face)
+
+    def channels(self, view: mi.UInt32, face: mi.UInt32, shares: Sequence[mi.Float]) -> list[mi.Float]:
+        """What a view sees at barycentrics of a face."""
+        surface = self.surface
+        colour, _ = surface.colour(shares, surface.uvs(face))
+        return surface.shade(shares, surface.corners(face), colour, self.sees_outside(view, face))
 
 
 def blend(shares: Sequence[mi.Float], values: Sequence[Any]) -> Any:

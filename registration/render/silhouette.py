@@ -23,7 +23,7 @@ from registration.geometry.topology import Edges
 from registration.render.adjoint import Adjoint, RowSum
 from registration.render.cameras import CameraLanes, PixelList
 from registration.render.scene import TriangleScene
-from registration.render.shading import Hits, Surface
+from registration.render.shading import NO_FACE, Drawn, Surface
 
 # How far beyond the edge the outside ray goes, in focal lengths (px). Larger biases, smaller meets float32.
 _STEP = 1e-6
@@ -33,12 +33,11 @@ _DEPTH_TOLERANCE = 1e-5
 _FAR = 5e-3
 _SEARCH_END = (1 << 22) - 1  # fixed, so that the number of silhouette edges never compiles a new kernel
 _SAMPLE_BLOCK = 4096
-_NONE = 0xFFFFFFFF
 
 
 @dataclass(frozen=True, kw_only=True)
 class EdgeArrays:
-    """`topology.Edges` on the device; a missing second side is _NONE."""
+    """`topology.Edges` on the device; a missing second side is NO_FACE."""
 
     vertices: mi.UInt32  # 2E
     faces: mi.UInt32  # 2E
@@ -49,7 +48,7 @@ class EdgeArrays:
 
 def upload(edges: Edges, corner_uvs: Float[np.ndarray, "F 3 2"]) -> EdgeArrays:
     def flat(array: np.ndarray) -> mi.UInt32:
-        return mi.UInt32(np.where(array < 0, _NONE, array).astype(np.uint32).ravel())
+        return mi.UInt32(np.where(array < 0, NO_FACE, array).astype(np.uint32).ravel())
 
     uvs = corner_uvs.reshape(-1, 2)
     seams = (edges.faces[:, 1] >= 0) & (uvs[edges.corners[:, 0]] != uvs[edges.corners[:, 1]]).any((1, 2))
@@ -83,19 +82,13 @@ def facing(surface: Surface, pixels: PixelList) -> mi.Bool:
     return dr.dot(mi.Vector3f(plane.x, plane.y, plane.z), pixels.centre(view)) > plane.w
 
 
-def sees(facing: mi.Bool, surface: Surface, pixels: PixelList, hits: Hits) -> mi.Bool:
-    """Whether pixels see the outer sides of the faces that they hit."""
-    view = dr.gather(mi.UInt32, pixels.view, hits.pixel)
-    return dr.gather(mi.Bool, facing, view * dr.opaque(mi.UInt32, surface.face_count) + hits.face)
-
-
 def _find(surface: Surface, edges: EdgeArrays, pixels: PixelList, facing: mi.Bool) -> _Silhouettes | None:
     faces, edge_count = dr.opaque(mi.UInt32, surface.face_count), dr.opaque(mi.UInt32, edges.count)
     lane = dr.arange(mi.UInt32, pixels.camera_count * edges.count)
     view = lane // edge_count
     edge = lane - view * edge_count
     pair = dr.gather(mi.Point2u, edges.faces, edge)
-    boundary = pair.y == _NONE
+    boundary = pair.y == NO_FACE
     first = dr.gather(mi.Bool, facing, view * faces + pair.x)
     second = dr.gather(mi.Bool, facing, view * faces + pair.y, ~boundary)
     jumps = boundary | (first != second)
@@ -107,7 +100,7 @@ def _find(surface: Surface, edges: EdgeArrays, pixels: PixelList, facing: mi.Boo
     view = ids // edge_count
     edge = ids - view * edge_count
     pair = dr.gather(mi.Point2u, edges.faces, edge)
-    first = (pair.y == _NONE) | dr.gather(mi.Bool, facing, view * faces + pair.x)
+    first = (pair.y == NO_FACE) | dr.gather(mi.Bool, facing, view * faces + pair.x)
     side = _nearer(surface, pair, dr.select(first, mi.UInt32(0), 1))
     ends = dr.gather(mi.Point2u, edges.vertices, edge)
     camera = pixels.camera(view)
@@ -129,7 +122,7 @@ def _nearer(surface: Surface, pair: mi.Point2u, facing: mi.UInt32) -> mi.UInt32:
     nearer; on a fold that is seen from inside an open mesh it is the other, which then lies before the first's plane.
     """
     own, other = (dr.select(facing == side, pair.x, pair.y) for side in (0, 1))
-    has_other = other != _NONE
+    has_other = other != NO_FACE
     plane = dr.gather(mi.Vector4f, surface.planes, own)
     beside = dr.dot(mi.Vector3f(plane.x, plane.y, plane.z), _centre(surface, other, has_other)) - plane.w
     folded = has_other & (beside > 0)
@@ -203,11 +196,8 @@ def _far_behind(samples: _Samples, view: mi.UInt32, pixels: PixelList, depth: mi
 
 def backward(
     scene: TriangleScene,
-    surface: Surface,
+    drawn: Drawn,
     edges: EdgeArrays,
-    pixels: PixelList,
-    facing: mi.Bool,
-    depth: mi.Float,
     adjoint: Adjoint,
     positions: RowSum,
     *,
@@ -215,7 +205,8 @@ def backward(
     seed: int,
 ) -> None:
     """Add the silhouettes' part of d(adjoint . image) to the gradient of positions."""
-    found = _find(surface, edges, pixels, facing)
+    surface, pixels = drawn.surface, drawn.pixels
+    found = _find(surface, edges, pixels, drawn.facing)
     if found is None:
         return
     count = int(samples_per_px * float(dr.slice(found.total_px, 0)))
@@ -224,14 +215,14 @@ def backward(
     # Most silhouettes lie deep inside the head: they need no ray.
     view, _ = samples.edge(edges)
     _, listed = pixels.at(view, samples.x, samples.in_front)
-    kept = listed & ~_far_behind(samples, view, pixels, depth, listed)
+    kept = listed & ~_far_behind(samples, view, pixels, drawn.deepest, listed)
     dr.eval(samples.which, samples.s, kept)
     kept = dr.compress(kept)
     if dr.width(kept) == 0:
         return
     samples = samples.take(kept)
     hit, seen = _beyond(scene, samples, pixels.camera(samples.edge(edges)[0]))
-    met = (dr.select(hit.is_valid(), hit.prim_index, _NONE), hit.prim_uv.x, hit.prim_uv.y)
+    met = (dr.select(hit.is_valid(), hit.prim_index, NO_FACE), hit.prim_uv.x, hit.prim_uv.y)
     dr.eval(samples.which, samples.s, met, seen)
     seen = dr.compress(seen)
     if dr.width(seen) == 0:
@@ -240,7 +231,7 @@ def backward(
     samples = samples.take(seen)
     view, edge = samples.edge(edges)
     pixel, _ = pixels.at(view, samples.x, samples.in_front)
-    f_in, f_out = _on(samples, surface, edges, view, edge, facing), _off(surface, view, face, b1, b2, facing)
+    f_in, f_out = _on(samples, drawn, edges, view, edge), _off(drawn, view, face, [1 - b1 - b2, b1, b2])
     jump = adjoint.times([inner - outer for inner, outer in zip(f_in, f_out, strict=True)], pixel)
     weight = jump * (found.total_px / dr.opaque(mi.Float, count))
     camera = pixels.camera(view)
@@ -258,30 +249,21 @@ def _beyond(
     return hit, ~(hit.is_valid() & (hit.t < samples.depth * (1 - _DEPTH_TOLERANCE)))
 
 
-def _on(
-    samples: _Samples, surface: Surface, edges: EdgeArrays, view: mi.UInt32, edge: mi.UInt32, facing: mi.Bool
-) -> list[mi.Float]:
+def _on(samples: _Samples, drawn: Drawn, edges: EdgeArrays, view: mi.UInt32, edge: mi.UInt32) -> list[mi.Float]:
     """The channels on the edge, of the side that is seen."""
     side = 2 * edge + dr.gather(mi.UInt32, samples.found.side, samples.which)
     ends, corners = dr.gather(mi.Point2u, edges.vertices, edge), dr.gather(mi.Point2u, edges.corners, side)
     s, za, zb = samples.s, samples.za, samples.zb
     share = s * za / dr.maximum((1 - s) * zb + s * za, 1e-9)  # linear in space
-    outside = dr.gather(
-        mi.Bool, facing, view * dr.opaque(mi.UInt32, surface.face_count) + dr.gather(mi.UInt32, edges.faces, side)
-    )
     shares = [1 - share, share]
-    colour, _ = surface.colour(shares, [surface.corner_uv(corner) for corner in corners])
-    return surface.shade(shares, list(ends), colour, outside)
+    colour, _ = drawn.surface.colour(shares, [drawn.surface.corner_uv(corner) for corner in corners])
+    return drawn.surface.shade(
+        shares, list(ends), colour, drawn.sees_outside(view, dr.gather(mi.UInt32, edges.faces, side))
+    )
 
 
-def _off(
-    surface: Surface, view: mi.UInt32, face: mi.UInt32, b1: mi.Float, b2: mi.Float, facing: mi.Bool
-) -> list[mi.Float]:
+def _off(drawn: Drawn, view: mi.UInt32, face: mi.UInt32, shares: list[mi.Float]) -> list[mi.Float]:
     """The channels just beyond: of a face, or zeros of the background."""
-    is_hit = face != _NONE
-    face = dr.select(is_hit, face, 0)
-    outside = dr.gather(mi.Bool, facing, view * dr.opaque(mi.UInt32, surface.face_count) + face)
-    shares = [1 - b1 - b2, b1, b2]
-    colour, _ = surface.colour(shares, surface.uvs(face))
-    channels = surface.shade(shares, surface.corners(face), colour, outside)
+    is_hit = face != NO_FACE
+    channels = drawn.channels(view, dr.select(is_hit, face, 0), shares)
     return [dr.select(is_hit, value, 0) for value in channels]

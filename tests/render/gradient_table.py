@@ -4,14 +4,10 @@ Differences average many rays per pixel; the gradient averages seeds until its s
 image of a cell is what a motion does to its channels, so that contributions do not cancel. Run it by hand:
 
     python -m tests.render.gradient_table
-
-What no mesh edge marks the adjoint cannot see: where parts run through one another, the curve in which they meet moves
-without a gradient. On the real head lids and eyeballs meet so, and the lips; there they are left out of the classes'
-row, where the loss is greatest (rotation -12%, a bump on the nose -18% from the front).
 """
 
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 
@@ -20,7 +16,7 @@ import torch
 
 from registration.model import gnm_npz
 from registration.model.atlas import texture_atlas
-from registration.model.regions import components, group, vertex_classes
+from registration.model.regions import crossing_parts, vertex_classes
 from registration.render.renderer import Renderer
 from registration.types import Camera, Pixels, Rendered
 
@@ -47,11 +43,17 @@ class Scene:
     triangles: np.ndarray  # (F, 3)
     corner_uvs: np.ndarray  # (F, 3, 2)
     classes: np.ndarray  # (V, K)
+    parts: np.ndarray  # (F,)
     cameras: Sequence[Camera]
 
     def renderer(self, pixel_samples: int, edge_samples: float = 1.0) -> Renderer:
         return Renderer(
-            self.triangles, self.corner_uvs, self.classes, pixel_samples=pixel_samples, edge_samples=edge_samples
+            self.triangles,
+            self.corner_uvs,
+            self.classes,
+            parts=self.parts,
+            pixel_samples=pixel_samples,
+            edge_samples=edge_samples,
         )
 
     @cached_property
@@ -71,9 +73,6 @@ class Scene:
         """Metres that a pixel spans at the scene's centre."""
         camera = self.cameras[0]
         return float(np.linalg.norm(camera.centre - self.centre) / camera.intrinsics[0, 0])
-
-    def without(self, triangles: np.ndarray, name: str) -> "Scene":
-        return replace(self, name=name, triangles=self.triangles[~triangles], corner_uvs=self.corner_uvs[~triangles])
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -107,34 +106,16 @@ def head(file: Path, name: str) -> Scene:
         triangles=data.triangles,
         corner_uvs=texture_atlas(data),
         classes=vertex_classes(data)[1],
+        parts=crossing_parts(data),
         cameras=[
             look_at(centre, azimuth, elevation, 0.9, 1.2 * span) for azimuth, elevation in ((-0.8, 0.1), (2.3, 0))
         ],
     )
 
 
-def tiny_rows() -> list[tuple[Scene, Sequence[str]]]:
-    """The synthetic head, whose parts do not touch where they are seen."""
-    return [(head(TINY, "synthetic head"), tuple(CHANNELS))]
-
-
-def real_rows() -> list[tuple[Scene, Sequence[str]]]:
-    """The real head; its classes' row without the parts that run through one another."""
-    whole, data = head(REAL, "head"), gnm_npz.read(REAL)
-    lips = np.maximum(group(data, "upper_lip"), group(data, "lower_lip")) > 0.5
-    part = components(data)
-    skin = data.mesh_component_names.tolist().index("skin")
-    crossing = (lips | (part != skin))[data.triangles].any(1)
-    apart = whole.without(
-        crossing, "head without eyeballs, teeth, gums, tongue and lips, which run through one another"
-    )
-    return [(whole, ("rgb", "normal", "mask")), (apart, ("class",))]
-
-
-def table(rows: list[tuple[Scene, Sequence[str]]]) -> Iterator[tuple[str, list[Cell]]]:
-    """Name and cells of each scene; the texels' cell stands with the first."""
-    for number, (scene, channels) in enumerate(rows):
-        yield scene.name, motion_cells(scene, channels) + ([texel_cell(scene)] if number == 0 else [])
+def table(scene: Scene) -> list[Cell]:
+    """All cells of a scene."""
+    return [*motion_cells(scene), texel_cell(scene)]
 
 
 def look_at(target: np.ndarray, azimuth: float, elevation: float, distance_m: float, fill_m: float) -> Camera:
@@ -175,9 +156,9 @@ def motions(scene: Scene) -> dict[str, np.ndarray]:
     return {name: field / np.linalg.norm(field, axis=1).max() for name, field in fields.items()}
 
 
-def motion_cells(scene: Scene, channels: Sequence[str]) -> list[Cell]:
+def motion_cells(scene: Scene) -> list[Cell]:
     """One cell for every motion and channel."""
-    texture = soft_texture() if "rgb" in channels else None
+    texture = soft_texture()
     fine = scene.renderer(PIXEL_SAMPLES)
     base = torch.tensor(scene.vertices)
     attached = base.clone().requires_grad_()
@@ -194,8 +175,7 @@ def motion_cells(scene: Scene, channels: Sequence[str]) -> list[Cell]:
     for motion, field in motions(scene).items():
         direction = torch.tensor(field, dtype=torch.float32)
         wide, near = change(SWEEP_PX, direction), change(NEAR_PX, direction)
-        for channel in channels:
-            pick = CHANNELS[channel]
+        for channel, pick in CHANNELS.items():
             adjoint = pick(wide)
             values: list[float] = []
             while len(values) < SEEDS[0] or (_standard_error(values) > STANDARD_ERROR and len(values) < SEEDS[1]):
@@ -244,12 +224,8 @@ def main() -> None:
     from registration.render import backend
 
     backend.activate()
-    for rows in (tiny_rows, real_rows):
-        if rows is real_rows and not REAL.is_file():
-            print(f"no {REAL.name}: the real head is left out")
-            continue
-        for name, cells in table(rows()):
-            print(name, *cells, sep="\n", end="\n\n")
+    for file, name in ((TINY, "synthetic head"), (REAL, "head")):
+        print(name, *(table(head(file, name)) if file.is_file() else ["left out: no such file"]), sep="\n", end="\n\n")
 
 
 if __name__ == "__main__":
