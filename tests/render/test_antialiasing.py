@@ -1,0 +1,74 @@
+"""What several rays per pixel are worth: a mask that does not flicker when the mesh moves by less than a pixel."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from registration.model import gnm_npz
+from registration.render import backend
+from registration.render.renderer import Renderer
+from registration.types import Camera, Pixels
+
+TINY = gnm_npz.read(Path(__file__).resolve().parents[1] / "fixtures" / "tiny_gnm.npz")
+SAMPLES = 4
+SHARE_OF_HEIGHT = 0.7  # of the image, that the mesh fills
+RADIUS = 0.08  # metres, of the disc
+LIMIT = 1e-3
+
+
+@pytest.fixture(autouse=True)
+def llvm():
+    backend.activate()
+
+
+def head() -> tuple[np.ndarray, np.ndarray]:
+    return TINY.template_vertex_positions.astype(np.float64), TINY.triangles
+
+
+def disc(corners: int = 720) -> tuple[np.ndarray, np.ndarray]:
+    angle = 2 * np.pi * np.arange(corners) / corners
+    rim = RADIUS * np.stack([np.cos(angle), np.sin(angle), 0 * angle], 1)
+    after = np.roll(np.arange(corners), -1)
+    return np.concatenate([rim, np.zeros((1, 3))]), np.stack([np.arange(corners), after, np.full(corners, corners)], 1)
+
+
+class Scene:
+    """A mesh before a camera that looks along -z and whose principal point is off the centre."""
+
+    def __init__(self, mesh: tuple[np.ndarray, np.ndarray], side_px: int):
+        self.vertices, self.triangles = mesh
+        low, high = self.vertices.min(0), self.vertices.max(0)
+        height = high[1] - low[1]
+        distance = 4 * height
+        focal_px = SHARE_OF_HEIGHT * side_px * distance / height
+        pose = np.diag([1.0, -1.0, -1.0, 1.0])
+        pose[:3, 3] = -pose[:3, :3] @ ((low + high) / 2 + [0, 0, distance])
+        intrinsics = np.array([[focal_px, 0, 0.51 * side_px], [0, focal_px, 0.48 * side_px], [0, 0, 1]])
+        self.camera = Camera(width_px=side_px, height_px=side_px, intrinsics=intrinsics, T_cam_world=pose)
+        self.pixels = Pixels.all_of([self.camera])
+        self.pixel_m = distance / focal_px
+
+    def renderer(self, samples: int) -> Renderer:
+        uvs = np.zeros((len(self.triangles), 3, 2), np.float32)
+        return Renderer(self.triangles, uvs, np.ones((len(self.vertices), 1), np.float32), pixel_samples=samples)
+
+    def mask(self, renderer: Renderer, shift_px: np.ndarray) -> torch.Tensor:
+        """With the mesh moved to the right and upwards."""
+        moved = self.vertices + [*shift_px * self.pixel_m, 0]
+        return renderer(torch.tensor(moved, dtype=torch.float32), None, self.pixels).mask.double()
+
+
+@pytest.mark.parametrize("side_px", [256, 512])
+@pytest.mark.parametrize("mesh", [head, disc])
+def test_a_moving_mesh_keeps_its_area(mesh, side_px, capsys):
+    """Over a sweep of one pixel in tenths, either way."""
+    scene = Scene(mesh(), side_px)
+    renderer = scene.renderer(SAMPLES)
+    for name, way in (("x", [1, 0]), ("y", [0, 1])):
+        areas = [scene.mask(renderer, step / 10 * np.array(way)).sum().item() for step in range(11)]
+        varied = (max(areas) - min(areas)) / np.mean(areas)
+        with capsys.disabled():
+            print(f"\n{mesh.__name__}, {side_px} px, along {name}: area varies by {varied:.3%}", end="")
+        assert varied < LIMIT
