@@ -78,11 +78,11 @@ def backward(scene: TriangleScene, drawn: Drawn, parts: mi.UInt32, adjoint: Adjo
 def _pairs(parts: mi.UInt32, pixels: PixelList, hits: Hits) -> tuple[mi.UInt32, mi.UInt32, mi.Vector2f]:
     """Neighbours that see different parts, each pair once: two places in the list, and the step between them (px)."""
     own = dr.compress(dr.gather(mi.UInt32, parts, hits.face) != 0)
-    count = dr.width(own)
-    if count == 0:
+    if dr.width(own) == 0:
         return own, own, mi.Vector2f(0)
-    lane = dr.arange(mi.UInt32, 4 * count)
-    turn = lane // dr.opaque(mi.UInt32, count)
+    count = dr.opaque(mi.UInt32, dr.width(own))
+    lane = dr.arange(mi.UInt32, 4 * dr.width(own))
+    turn = lane // count
     lane = dr.gather(mi.UInt32, own, lane - turn * count)
     ahead = mi.Float(1) - 2 * mi.Float(turn >> 1)  # right and down, then left and up
     step = dr.select((turn & 1) == 0, mi.Vector2f(ahead, 0), mi.Vector2f(0, ahead))
