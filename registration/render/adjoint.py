@@ -2,7 +2,7 @@
 
 from __future__ import annotations  # mi.Float exists only once a variant is chosen
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import drjit as dr
@@ -79,27 +79,29 @@ def _size(values: Tensor) -> float:
 
 
 class RowSum:
-    """Sums of lanes' vectors (three or four numbers) into rows of a table.
+    """Sums of lanes' vectors into rows of a table, of four or eight columns.
 
     With a unit they are summed in fixed point: parallel sums of floats would differ from run to run.
     """
 
-    def __init__(self, rows: int, unit: mi.Float | None = None):
-        self._unit = unit
-        self._kind = mi.Vector4f if unit is None else dr.int64_array_t(mi.Vector4f)
+    def __init__(self, rows: int, unit: mi.Float | None = None, columns: int = 4):
+        self._unit, self._columns = unit, columns
         number = mi.Float if unit is None else mi.Int64
-        self.total = dr.zeros(number, 4 * rows)
-        copies = dr.thread_count() * 4 * rows * dr.itemsize_v(number)
+        self._packet = mi.ArrayXf if unit is None else dr.int64_array_t(mi.ArrayXf)
+        self.total = dr.zeros(number, columns * rows)
+        copies = dr.thread_count() * columns * rows * dr.itemsize_v(number)
         apart = "llvm" in mi.variant() and copies < _COPIES_BYTES
         self._mode = dr.ReduceMode.Expand if apart else dr.ReduceMode.Auto
 
-    def add(self, row: mi.UInt32, value: mi.Vector3f | mi.Vector4f) -> None:
-        columns = [dr.detach(column) for column in value]
+    def add(self, row: mi.UInt32, value: Iterable[mi.Float]) -> None:
+        """Up to eight numbers, if there are so many columns; those of three or four go to the first columns."""
+        values = list(value)
         if self._unit is not None:
-            columns = [mi.Int64(dr.clip(column / self._unit, -_MOST, _MOST)) for column in columns]
-        columns += [type(columns[0])(0)] * (4 - len(columns))
-        dr.scatter_add(self.total, self._kind(*columns), row, mode=self._mode)
+            values = [mi.Int64(dr.clip(v / self._unit, -_MOST, _MOST)) for v in values]
+        packet = 4 if len(values) <= 4 else 8
+        values += [type(values[0])(0)] * (packet - len(values))
+        dr.scatter_add(self.total, self._packet(values), row * (self._columns // packet), mode=self._mode)
 
     def table(self) -> mi.Float:
-        """(N, 4) flat."""
+        """Flat, row by row."""
         return self.total if self._unit is None else mi.Float(mi.Float64(self.total) * mi.Float64(self._unit))

@@ -62,7 +62,7 @@ class _Side:
         return dr.dot(self.normal, direction) / self.reach
 
 
-def backward(scene: TriangleScene, drawn: Drawn, parts: mi.UInt32, adjoint: Adjoint, positions: RowSum) -> None:
+def backward(scene: TriangleScene, drawn: Drawn, parts: mi.UInt32, adjoint: Adjoint, vertices: RowSum) -> None:
     """Add the crossings' part of d(adjoint . image) to the gradient of positions.
 
     `parts` (F,) numbers the parts of the mesh; part 0 covers most of what is seen.
@@ -71,8 +71,8 @@ def backward(scene: TriangleScene, drawn: Drawn, parts: mi.UInt32, adjoint: Adjo
         if hits.count:
             pixel, other, step = _pairs(parts, drawn.pixels, hits)
             if dr.width(pixel):
-                _cross(scene, drawn, parts, hits, pixel, other, step, adjoint, positions)
-                dr.eval(positions.total)
+                _cross(scene, drawn, parts, hits, pixel, other, step, adjoint, vertices)
+                dr.eval(vertices.total)
 
 
 def _pairs(parts: mi.UInt32, pixels: PixelList, hits: Hits) -> tuple[mi.UInt32, mi.UInt32, mi.Vector2f]:
@@ -111,7 +111,7 @@ def _cross(
     other: mi.UInt32,
     step: mi.Vector2f,
     adjoint: Adjoint,
-    positions: RowSum,
+    vertices: RowSum,
 ) -> None:
     surface, pixels = drawn.surface, drawn.pixels
     view, x, y = (dr.gather(mi.UInt32, values, pixel) for values in (pixels.view, pixels.x, pixels.y))
@@ -138,7 +138,7 @@ def _cross(
     for side, part, sign in zip(sides, shares, (-1, 1), strict=True):
         push = sign * weight / dr.dot(side.normal, ray(s)) * side.normal
         for vertex, b in zip(surface.corners(side.face), part, strict=True):
-            positions.add(vertex, dr.select(active, b * push, 0))
+            vertices.add(vertex, dr.select(active, b * push, 0))
 
 
 def _halve(

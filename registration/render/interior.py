@@ -11,8 +11,6 @@ Nothing is traced again, and nothing of a lane is kept: each adds its gradients 
 
 from __future__ import annotations  # mi.Float exists only once a variant is chosen
 
-from dataclasses import dataclass
-
 import drjit as dr
 import mitsuba as mi
 
@@ -20,43 +18,36 @@ from registration.render.adjoint import Adjoint, RowSum
 from registration.render.shading import Drawn, Footprint, Hits, Surface
 
 
-@dataclass(frozen=True, kw_only=True)
-class Sums:
-    """Where gradients go: to positions and normals of vertices, and to texels if asked."""
+def backward(drawn: Drawn, number: int, adjoint: Adjoint, vertices: RowSum, texels: RowSum | None) -> None:
+    """Add d(adjoint . image) of what one ray of each pixel met.
 
-    positions: RowSum
-    normals: RowSum
-    texels: RowSum | None
-
-
-def backward(drawn: Drawn, number: int, adjoint: Adjoint, sums: Sums) -> None:
-    """Add d(adjoint . image) of what one ray of each pixel met."""
+    To rows of `vertices`: to position (columns 0 to 2) and normal (4 to 6); to texels, if asked.
+    """
     surface, pixels, hits, share = drawn.surface, drawn.pixels, drawn.hits[number], drawn.share
     view = dr.gather(mi.UInt32, pixels.view, hits.pixel)
     b = hits.shares
-    vertices = surface.corners(hits.face)
+    corners = surface.corners(hits.face)
     change = [mi.Float(0) for _ in range(3)]  # A
-    _classes(surface, hits, vertices, adjoint, change)
-    normal = _normals(surface, hits, b, vertices, drawn.sees_outside(view, hits.face), adjoint, change)
-    _colour(surface, hits, drawn.slopes[number], adjoint, change, sums.texels, share)
-    p0, p1, p2 = (surface.position(vertex) for vertex in vertices)
+    _classes(surface, hits, corners, adjoint, change)
+    normal = _normals(surface, hits, b, corners, drawn.sees_outside(view, hits.face), adjoint, change)
+    _colour(surface, hits, drawn.slopes[number], adjoint, change, texels, share)
+    p0, p1, p2 = (surface.position(corner) for corner in corners)
     direction = b[0] * p0 + b[1] * p1 + b[2] * p2 - pixels.centre(view)
     e1, e2 = p1 - p0, p2 - p0
     slip = (change[1] - change[0]) * dr.cross(e2, direction) + (change[2] - change[0]) * dr.cross(direction, e1)
     slip *= share * dr.rcp(dr.dot(dr.cross(e1, e2), direction))
-    for vertex, part in zip(vertices, b, strict=True):
-        sums.positions.add(vertex, -part * slip)
-        if normal is not None:
-            sums.normals.add(vertex, share * part * normal)
-    dr.eval(sums.positions.total, sums.normals.total)
+    for corner, part in zip(corners, b, strict=True):
+        normal_part = [] if normal is None else [mi.Float(0), *(share * part * normal)]
+        vertices.add(corner, [*(-part * slip), *normal_part])
+    dr.eval(vertices.total)
 
 
-def _classes(surface: Surface, hits: Hits, vertices: list[mi.UInt32], adjoint: Adjoint, change: list[mi.Float]) -> None:
+def _classes(surface: Surface, hits: Hits, corners: list[mi.UInt32], adjoint: Adjoint, change: list[mi.Float]) -> None:
     g = adjoint.classes(hits.pixel)
     if g is None:
         return
-    for j, vertex in enumerate(vertices):
-        for k, value in enumerate(surface.vertex_classes(vertex)):
+    for j, corner in enumerate(corners):
+        for k, value in enumerate(surface.vertex_classes(corner)):
             change[j] = dr.fma(g[k], value, change[j])
 
 
@@ -64,7 +55,7 @@ def _normals(
     surface: Surface,
     hits: Hits,
     b: list[mi.Float],
-    vertices: list[mi.UInt32],
+    corners: list[mi.UInt32],
     facing: mi.Bool,
     adjoint: Adjoint,
     change: list[mi.Float],
@@ -73,7 +64,7 @@ def _normals(
     g = adjoint.normal(hits.pixel)
     if g is None:
         return None
-    normals = [surface.normal(vertex) for vertex in vertices]
+    normals = [surface.normal(corner) for corner in corners]
     normal = b[0] * normals[0] + b[1] * normals[1] + b[2] * normals[2]
     inverse = dr.rsqrt(dr.maximum(dr.squared_norm(normal), 1e-12))
     unit = normal * inverse

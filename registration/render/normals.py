@@ -32,15 +32,15 @@ def planes_and_normals(faces: mi.UInt32, positions: mi.Float) -> tuple[mi.Float,
     return planes, dr.ravel(mi.Vector4f(*(total * inverse), inverse))
 
 
-def backward(faces: mi.UInt32, positions: mi.Float, normals: mi.Float, gradient: mi.Float, sums: RowSum) -> None:
-    """Add to the gradient of positions what the gradient of normals (V, 4) makes of it."""
+def backward(faces: mi.UInt32, positions: mi.Float, normals: mi.Float, gradients: RowSum) -> None:
+    """Add to the gradient of positions what that of normals makes of it; see `interior.backward`."""
     vertices = corners(faces, dr.arange(mi.UInt32, dr.width(faces) // 4))
     a, b, c = (point(positions, vertex) for vertex in vertices)
-    total = mi.Vector3f(0)
+    table, total = gradients.table(), mi.Vector3f(0)
     for vertex in vertices:
-        row, g = dr.gather(mi.Vector4f, normals, vertex), point(gradient, vertex)
+        row, g = dr.gather(mi.Vector4f, normals, vertex), point(table, 2 * vertex + 1)
         unit = mi.Vector3f(row.x, row.y, row.z)
         total += (g - unit * dr.dot(unit, g)) * row.w
     to_b, to_c = dr.cross(c - a, total), dr.cross(total, b - a)
     for vertex, value in zip(vertices, (-to_b - to_c, to_b, to_c), strict=True):
-        sums.add(vertex, value)
+        gradients.add(vertex, value)

@@ -173,16 +173,16 @@ class Renderer:
         dr.eval(image, slopes)
         return slopes
 
-    def _interior_gradients(self, drawn: Drawn, adjoint: Adjoint, sums: interior.Sums) -> None:
+    def _interior_gradients(self, drawn: Drawn, adjoint: Adjoint, vertices: RowSum, texels: RowSum | None) -> None:
         """Add what the inside of the faces gives."""
         if adjoint.moves_inside:
             for number, hits in enumerate(drawn.hits):
                 if hits.count:
-                    interior.backward(drawn, number, adjoint, sums)
+                    interior.backward(drawn, number, adjoint, vertices, texels)
             surface = drawn.surface
-            normals.backward(surface.faces, surface.positions, surface.normals, sums.normals.table(), sums.positions)
+            normals.backward(surface.faces, surface.positions, surface.normals, vertices)
 
-    def _edge_gradients(self, drawn: Drawn, adjoint: Adjoint, positions: RowSum) -> None:
+    def _edge_gradients(self, drawn: Drawn, adjoint: Adjoint, vertices: RowSum) -> None:
         """Add what the silhouettes give."""
         self._seed += 1
         silhouette.backward(
@@ -190,15 +190,15 @@ class Renderer:
             drawn,
             self._edges,
             adjoint,
-            positions,
+            vertices,
             samples_per_px=self._edge_samples,
             seed=self._seed,
         )
 
-    def _crossing_gradients(self, drawn: Drawn, adjoint: Adjoint, positions: RowSum) -> None:
+    def _crossing_gradients(self, drawn: Drawn, adjoint: Adjoint, vertices: RowSum) -> None:
         """Add what parts that run through one another give."""
         if self._parts is not None:
-            crossings.backward(self._scene, drawn, self._parts, adjoint, positions)
+            crossings.backward(self._scene, drawn, self._parts, adjoint, vertices)
 
 
 class _Draw(torch.autograd.Function):
@@ -230,20 +230,16 @@ class _Draw(torch.autograd.Function):
             (vertices,) = ctx.saved_tensors
             renderer._move(vertices)
             adjoint = Adjoint.of(grad_outputs, surface)
-            sums = interior.Sums(
-                positions=RowSum(surface.vertex_count, adjoint.unit),
-                normals=RowSum(surface.vertex_count, adjoint.unit),
-                texels=RowSum(surface.texture_size**2) if ctx.needs_input_grad[1] else None,
-            )
-            renderer._interior_gradients(drawn, adjoint, sums)
+            vertex_sum = RowSum(surface.vertex_count, adjoint.unit, columns=8)
+            texels = RowSum(surface.texture_size**2) if ctx.needs_input_grad[1] else None
+            renderer._interior_gradients(drawn, adjoint, vertex_sum, texels)
             if ctx.needs_input_grad[0]:
-                renderer._edge_gradients(drawn, adjoint, sums.positions)
-                renderer._crossing_gradients(drawn, adjoint, sums.positions)
-            tables = [table.table() for table in (sums.positions, sums.texels) if table is not None]
-            dr.eval(tables)
-        position_gradient, *texture_gradient = (_tensor(table).view(-1, 4)[:, :3] for table in tables)
-        size = surface.texture_size
-        return position_gradient, texture_gradient[0].view(size, size, 3) if texture_gradient else None, None, None
+                renderer._edge_gradients(drawn, adjoint, vertex_sum)
+                renderer._crossing_gradients(drawn, adjoint, vertex_sum)
+            position_gradient = _tensor(vertex_sum.table()).view(-1, 8)[:, :3]
+            size = surface.texture_size
+            texture_gradient = None if texels is None else _tensor(texels.table()).view(size, size, 4)[..., :3]
+        return position_gradient, texture_gradient, None, None
 
 
 def _flat(tensor: Tensor) -> mi.Float:

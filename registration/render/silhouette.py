@@ -199,7 +199,7 @@ def backward(
     drawn: Drawn,
     edges: EdgeArrays,
     adjoint: Adjoint,
-    positions: RowSum,
+    vertices: RowSum,
     *,
     samples_per_px: float,
     seed: int,
@@ -237,7 +237,7 @@ def backward(
     camera = pixels.camera(view)
     ends = dr.gather(mi.Point2u, edges.vertices, edge)
     for end, share in ((ends.x, 1 - samples.s), (ends.y, samples.s)):
-        positions.add(end, weight * share * camera.speed(surface.position(end), samples.normal))
+        vertices.add(end, weight * share * camera.speed(surface.position(end), samples.normal))
 
 
 def _beyond(
