@@ -1,11 +1,12 @@
 """What one step of the renderer costs, as a ratio to the bare ray cast of every pixel of every view.
 
-    python bench/renderer.py --case 22x512 --case 8x512 --case 8x256 [--variant llvm|cuda] [--memory]
+    python bench/renderer.py --case 22x512 --case 8x512 --case 8x256 [--variant llvm|cuda] [--memory] [--stock]
 
 A case is VIEWSxSIDE. The scene is the first model's head and the studio's rig; the head moves in every iteration. The
 floor is one coherent cast of *all* pixels with the BVH built; what the renderer draws is what a fit compares, the
 pixels in and near the head. Stages are medians over interleaved repeats. `misses` counts kernels that had to be
 compiled after the second iteration; `memory_growth` is the process' size at iteration 1,000 over that at 100, minus 1.
+`--stock` sets our whole iteration and that of Mitsuba's own projective integrator (`stock.py`) against the same floor.
 """
 
 import argparse
@@ -36,14 +37,16 @@ CLASSES = 9  # 16 channels: colour, normal, mask and these
 TEXTURE_PX = 512
 NEAR = 0.08  # of the image's height: how far around the head a fit compares pixels
 MOTION = 1e-4  # metres, standard deviation, of every vertex in every iteration
-CAST, MOVE, FORWARD, INTERIOR, EDGES, WHOLE = (
+CAST, MOVE, FORWARD, INTERIOR, EDGES, WHOLE, STOCK = (
     "bare ray cast of all pixels (the floor)",
     "vertex update and BVH",
     "forward, 16 channels",
     "interior adjoint, with texture",
     "silhouettes",
     "whole iteration",
+    "stock Mitsuba's whole iteration, 3 channels",
 )
+STOCK_CASE = "2x256"
 
 
 class Case:
@@ -58,7 +61,8 @@ class Case:
         cameras = rig(views, (side, side), 0, centre=centre, head_height_m=float(np.ptp(head[:, 1])))
         self.triangles = triangles = data.triangles.astype(np.int64)
         shares = label_shares(data)[:, :CLASSES]
-        self.renderer = Renderer(triangles, texture_atlas(data), shares.astype(np.float32))
+        self.corner_uvs = texture_atlas(data)
+        self.renderer = Renderer(triangles, self.corner_uvs, shares.astype(np.float32))
         self.all = Pixels.all_of(cameras, device)
         self.rest = torch.as_tensor(head, dtype=torch.float32, device=device)
         generator = torch.Generator().manual_seed(0)
@@ -170,6 +174,19 @@ def measure(case: Case) -> dict[str, float]:
     return {stage: statistics.median(seconds) for stage, seconds in found.items()}
 
 
+def measure_stock(case: Case) -> dict[str, float]:
+    """Median seconds of the floor, of our iteration and of stock Mitsuba's."""
+    import stock
+
+    theirs = stock.iteration(case.all.cameras, case.triangles, case.corner_uvs, case.texture, case.moved)
+    calls = {CAST: floor(case), WHOLE: case.iterate, STOCK: theirs}
+    for _ in range(3):
+        for call in calls.values():
+            call()
+    rounds = [{stage: timed(call) for stage, call in calls.items()} for _ in range(REPEATS)]
+    return {stage: statistics.median(seconds[stage] for seconds in rounds) for stage in calls}
+
+
 def _stages(renderer: type, scene: type) -> list[tuple[type, str]]:
     return [(scene, "move"), (renderer, "_draw"), (renderer, "_interior_gradients"), (renderer, "_edge_gradients")]
 
@@ -199,11 +216,21 @@ def memory_growth(device: torch.device) -> float:
     return resident_bytes() / early - 1
 
 
+def show(name: str, case: Case, seconds: dict[str, float]) -> None:
+    title = f"{name}: {len(case.all.view):,} rays, {case.hits:.0%} hit, {len(case.pixels.view):,} pixels compared"
+    table = Table("stage", "ms", "x the floor", title=title, title_justify="left")
+    for stage in (CAST, MOVE, FORWARD, INTERIOR, EDGES, WHOLE, STOCK):
+        if stage in seconds:
+            table.add_row(stage, f"{1000 * seconds[stage]:.1f}", f"{seconds[stage] / seconds[CAST]:.2f}")
+    Console(width=110).print(table)
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--case", action="append", default=[], metavar="VIEWSxSIDE")
     parser.add_argument("--variant", choices=("llvm", "cuda"), default="llvm")
     parser.add_argument("--memory", action="store_true")
+    parser.add_argument("--stock", action="store_true")
     options = parser.parse_args()
     device = backend.activate(options.variant)
     lines, missed = [], 0
@@ -212,15 +239,17 @@ def main() -> None:
         case = Case(views, side, device)
         seconds = measure(case)
         missed += misses(case)
-        title = f"{name}: {len(case.all.view):,} rays, {case.hits:.0%} hit, {len(case.pixels.view):,} pixels compared"
-        table = Table("stage", "ms", "x the floor", title=title, title_justify="left")
-        for stage in (CAST, MOVE, FORWARD, INTERIOR, EDGES, WHOLE):
-            table.add_row(stage, f"{1000 * seconds[stage]:.1f}", f"{seconds[stage] / seconds[CAST]:.2f}")
-        Console(width=110).print(table)
+        show(name, case, seconds)
         lines.append(f"ratio {name} {seconds[WHOLE] / seconds[CAST]:.2f}")
     print(*lines, f"misses {missed}", sep="\n")
     if options.memory:
         print(f"memory_growth {memory_growth(device):.4f}")
+    if options.stock:
+        case = Case(*map(int, STOCK_CASE.split("x")), device)
+        seconds = measure_stock(case)
+        show(STOCK_CASE, case, seconds)
+        print(f"ratio {STOCK_CASE} {seconds[WHOLE] / seconds[CAST]:.2f}")
+        print(f"stock {STOCK_CASE} {seconds[STOCK] / seconds[CAST]:.1f}")
 
 
 if __name__ == "__main__":
