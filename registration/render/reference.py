@@ -139,7 +139,7 @@ class Reference:
         ends = ends[(ends[..., 2] > 0).all(1)] @ _tensor(camera.intrinsics.T)
         a, b = (ends[..., :2] / ends[..., 2:]).unbind(1)
         along = (b - a).detach()
-        length = along.norm(dim=1)
+        length = along.norm(dim=1).clamp_min(1e-12)
         sizes = camera.width_px, camera.height_px
         borders = [(torch.arange(size + 1) - a[:, k, None]) / along[:, k, None] for k, size in enumerate(sizes)]
         cuts = torch.cat([*borders, 0 * along], 1).detach().nan_to_num().clamp(0, 1)
@@ -166,8 +166,8 @@ def _local(vertices: Float[Tensor, "V 3"], camera: Camera) -> Float[Tensor, "V 3
 def _meet(
     corners: Float[Tensor, "*B 3 3"], directions: Float[Tensor, "N 3"]
 ) -> tuple[Float[Tensor, "N 3"], Float[Tensor, "N"], Bool[Tensor, "*B"]]:
-    """Barycentrics and depths at which rays meet the planes of faces, one each or one for all; whether the faces show
-    their outer side."""
+    """Barycentrics and depths (m) at which rays meet the planes of faces, one each or one for all; and whether the
+    camera sees the faces' outer sides."""
     crosses = torch.linalg.cross(corners.roll(-1, -2), corners.roll(-2, -2))
     w = (crosses @ directions[..., None])[..., 0] if crosses.ndim == 3 else directions @ crosses.T
     determinant = (corners[..., 0, :] * crosses[..., 0, :]).sum(-1)
