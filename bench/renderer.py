@@ -35,17 +35,19 @@ from registration.types import Pixels
 REPEATS = 7
 CLASSES = 9  # 16 channels: colour, normal, mask and these
 TEXTURE_PX = 512
-NEAR = 0.08  # of the image's height: how far around the head a fit compares pixels
+NEAR = 0.08  # of the head's height: how far around the head a fit compares pixels
 MOTION = 1e-4  # metres, standard deviation, of every vertex in every iteration
-CAST, MOVE, FORWARD, INTERIOR, EDGES, WHOLE, STOCK = (
+CAST, MOVE, FORWARD, INTERIOR, EDGES, CROSSINGS, WHOLE, STOCK = (
     "bare ray cast of all pixels (the floor)",
     "vertex update and BVH",
     "forward, 16 channels",
     "interior adjoint, with texture",
     "silhouettes",
+    "crossings of parts",
     "whole iteration",
     "stock Mitsuba's whole iteration, 3 channels",
 )
+STAGES = (MOVE, FORWARD, INTERIOR, EDGES, CROSSINGS)
 STOCK_CASE = "2x256"
 
 
@@ -70,8 +72,7 @@ class Case:
         with torch.no_grad():
             mask = self.all.image(self.renderer(self.rest, None, self.all).mask[:, None])[..., 0] > 0
         self.hits = float(mask.float().mean())
-        kernel = np.ones((2 * int(NEAR * side) + 1,) * 2, np.uint8)
-        near = np.stack([cv2.dilate(m, kernel) for m in mask.cpu().numpy().astype(np.uint8)]) > 0
+        near = np.stack([_near(m) for m in mask.cpu().numpy()])
         self.pixels = Pixels.of(cameras, torch.as_tensor(near, device=device))
         count = len(self.pixels.view)
         shapes = ((count, 3), (count, 3), (count,), (count, CLASSES))
@@ -88,6 +89,12 @@ class Case:
         drawn = self.renderer(vertices, self.texture, self.pixels)
         image = (drawn.rgb, drawn.normals, drawn.mask, drawn.classes)
         torch.autograd.grad(image, (vertices, self.texture), self.adjoint)
+
+
+def _near(mask: np.ndarray) -> np.ndarray:
+    """A head's pixels and those around it that a fit compares."""
+    distance = cv2.distanceTransform((~mask).astype(np.uint8), cv2.DIST_L2, 5)
+    return distance < NEAR * np.ptp(np.flatnonzero(mask.any(1))) + 2
 
 
 @dataclass
@@ -164,7 +171,7 @@ def measure(case: Case) -> dict[str, float]:
     for _ in range(REPEATS):
         found.setdefault(CAST, []).append(timed(cast))
         found.setdefault(WHOLE, []).append(timed(case.iterate))
-        for (owner, name, _original), stage in zip(originals, (MOVE, FORWARD, INTERIOR, EDGES), strict=True):
+        for (owner, name, _original), stage in zip(originals, STAGES, strict=True):
             clock.around(owner, name, stage)
         case.iterate()
         for owner, name, original in originals:
@@ -188,7 +195,8 @@ def measure_stock(case: Case) -> dict[str, float]:
 
 
 def _stages(renderer: type, scene: type) -> list[tuple[type, str]]:
-    return [(scene, "move"), (renderer, "_draw"), (renderer, "_interior_gradients"), (renderer, "_edge_gradients")]
+    adjoint = ("_interior_gradients", "_edge_gradients", "_crossing_gradients")
+    return [(scene, "move"), (renderer, "_draw"), *((renderer, name) for name in adjoint)]
 
 
 def misses(case: Case, iterations: int = 5) -> int:
@@ -219,7 +227,7 @@ def memory_growth(device: torch.device) -> float:
 def show(name: str, case: Case, seconds: dict[str, float]) -> None:
     title = f"{name}: {len(case.all.view):,} rays, {case.hits:.0%} hit, {len(case.pixels.view):,} pixels compared"
     table = Table("stage", "ms", "x the floor", title=title, title_justify="left")
-    for stage in (CAST, MOVE, FORWARD, INTERIOR, EDGES, WHOLE, STOCK):
+    for stage in (CAST, *STAGES, WHOLE, STOCK):
         if stage in seconds:
             table.add_row(stage, f"{1000 * seconds[stage]:.1f}", f"{seconds[stage] / seconds[CAST]:.2f}")
     Console(width=110).print(table)

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+import torch
 
 from registration.types import Pixels
 
@@ -97,7 +98,7 @@ def upload(pixels: Pixels) -> PixelList:
         rows[:3, :3], rows[3, :3] = camera.T_cam_world[:3, :3], camera.centre
         rows[:, 3] = k[0, 2], k[1, 2], k[0, 0], k[1, 1]
     height, width = sizes.pop()
-    view, x, y = (mi.UInt32(mi.Int32(values)) for values in (pixels.view, pixels.x, pixels.y))
+    view, x, y = (mi.UInt32(values.view(torch.uint32)) for values in (pixels.view, pixels.x, pixels.y))
     return PixelList(
         cameras=mi.Float(packed.ravel()),
         camera_count=len(cameras),

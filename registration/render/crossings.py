@@ -77,22 +77,21 @@ def backward(scene: TriangleScene, drawn: Drawn, parts: mi.UInt32, adjoint: Adjo
 
 def _pairs(parts: mi.UInt32, pixels: PixelList, hits: Hits) -> tuple[mi.UInt32, mi.UInt32, mi.Vector2f]:
     """Neighbours that see different parts, each pair once: two places in the list, and the step between them (px)."""
-    own = dr.compress(dr.gather(mi.UInt32, parts, hits.face) != 0)
+    own = dr.compress(hits.small)
     if dr.width(own) == 0:
         return own, own, mi.Vector2f(0)
     count = dr.opaque(mi.UInt32, dr.width(own))
     lane = dr.arange(mi.UInt32, 4 * dr.width(own))
     turn = lane // count
-    lane = dr.gather(mi.UInt32, own, lane - turn * count)
+    pixel = dr.gather(mi.UInt32, own, lane - turn * count)
     ahead = mi.Float(1) - 2 * mi.Float(turn >> 1)  # right and down, then left and up
     step = dr.select((turn & 1) == 0, mi.Vector2f(ahead, 0), mi.Vector2f(0, ahead))
-    pixel = dr.gather(mi.UInt32, hits.pixel, lane)
     view, x, y = (dr.gather(mi.UInt32, values, pixel) for values in (pixels.view, pixels.x, pixels.y))
     other, listed = pixels.at(view, mi.Point2f(mi.Float(x) + 0.5, mi.Float(y) + 0.5) + step, mi.Bool(True))
     face = dr.gather(mi.UInt32, hits.seen, other, listed)
     met = listed & (face != NO_FACE)
     first, second = (
-        dr.gather(mi.UInt32, parts, dr.gather(mi.UInt32, hits.face, lane)),
+        dr.gather(mi.UInt32, parts, dr.gather(mi.UInt32, hits.seen, pixel)),
         dr.gather(mi.UInt32, parts, face, met),
     )
     # A pair of small parts is met from both of its pixels.

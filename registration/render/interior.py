@@ -23,7 +23,8 @@ def backward(drawn: Drawn, number: int, adjoint: Adjoint, vertices: RowSum, texe
 
     To rows of `vertices`: to position (columns 0 to 2) and normal (4 to 6); to texels, if asked.
     """
-    surface, pixels, hits, share = drawn.surface, drawn.pixels, drawn.hits[number], drawn.share
+    surface, pixels, hits = drawn.surface, drawn.pixels, drawn.rays[number]
+    share = drawn.weight(hits)
     view = dr.gather(mi.UInt32, pixels.view, hits.pixel)
     b = hits.shares
     corners = surface.corners(hits.face)
@@ -81,7 +82,7 @@ def _colour(
     adjoint: Adjoint,
     change: list[mi.Float],
     texels: RowSum | None,
-    share: float,
+    share: mi.Float | float,
 ) -> None:
     g = adjoint.colour(hits.pixel)
     if g is None:

@@ -7,6 +7,8 @@ there is no shading, no film and no filter; a pixel is a box.
 
 from __future__ import annotations  # mi.Float exists only once a variant is chosen
 
+import functools
+import math
 from typing import Any
 
 import drjit as dr
@@ -25,6 +27,7 @@ from registration.render.shading import GROUPS, NO_FACE, Drawn, Hits, Surface, r
 from registration.types import Pixels, Rendered
 
 _CENTRE = (0.5, 0.5)
+_SILHOUETTE_RAYS = 16  # of an anti-aliased pixel that is partly covered: coverage errs by 0.035 rms, with 4 by 0.1
 
 
 class Renderer:
@@ -47,7 +50,8 @@ class Renderer:
             corner_uvs: in [0, 1]^2 of one atlas; (0, 0) is the texture's lower left corner.
             vertex_classes: soft class shares of the vertices.
             parts: of the mesh that may run through one another, by number; unless told, those that share no vertex.
-            pixel_samples: rays per pixel, averaged; 1 is the pixel's centre, which aliases but is enough for a fit.
+            pixel_samples: rays per pixel, averaged; 1 is the pixel's centre, which aliases but is enough for a fit. Of
+                more, pixels whose rays differ on whether they meet the mesh have at least 16.
             edge_samples: silhouette samples per pixel of projected silhouette length, in the adjoint.
             seed: of those samples; every adjoint draws new ones.
 
@@ -61,7 +65,7 @@ class Renderer:
         self._corner_uvs = mi.Float(rows(corner_uvs.astype(np.float32).reshape(-1, 6), 8))
         self._classes = mi.Float(rows(vertex_classes.astype(np.float32)))
         self._parts = _parts(connected_parts(triangles) if parts is None else parts)
-        self._pixel_offsets = _pixel_offsets(pixel_samples)
+        self._pixel_offsets, self._finer_offsets = _pixel_offsets(pixel_samples)
         self._edge_samples = edge_samples
         self._seed = seed
         self._last: tuple[Pixels, Drawn] | None = None
@@ -125,31 +129,55 @@ class Renderer:
             texture_size=texture_size if texture is None else texture.shape[0],
         )
 
-    def _cast(self, pixels: PixelList, offset: tuple[float, float]) -> Hits:
-        hit = self._scene.cast(*pixels.rays(offset), mi.Bool(True), coherent=True)
+    def _cast(self, pixels: PixelList, offset: tuple[float, float], which: mi.UInt32 | None = None) -> Hits:
+        hit = self._scene.cast(*pixels.rays(offset, which), mi.Bool(True), coherent=True)
         is_hit = hit.is_valid()
         depth, seen = dr.select(is_hit, hit.t, dr.inf), dr.select(is_hit, hit.prim_index, NO_FACE)
         b1, b2 = hit.prim_uv.x, hit.prim_uv.y
-        dr.eval(is_hit, depth, seen, b1, b2)
-        pixel = dr.compress(is_hit)
-        face, b1, b2 = (dr.gather(type(values), values, pixel) for values in (seen, b1, b2))
-        return Hits(offset=offset, seen=seen, depth=depth, pixel=pixel, face=face, b1=b1, b2=b2)
+        small = None
+        if self._parts is not None:
+            small = is_hit & (dr.gather(mi.UInt32, self._parts, hit.prim_index, is_hit) != 0)
+        dr.eval(is_hit, depth, seen, b1, b2, small)
+        lane = dr.compress(is_hit)
+        face, b1, b2 = (dr.gather(type(values), values, lane) for values in (seen, b1, b2))
+        pixel = lane if which is None else dr.gather(mi.UInt32, which, lane)
+        return Hits(offset=offset, seen=seen, depth=depth, pixel=pixel, face=face, b1=b1, b2=b2, small=small)
+
+    def _cast_finer(self, pixels: PixelList, hits: list[Hits]) -> tuple[list[Hits], mi.Float | None]:
+        """Further rays where a pixel's first differ on whether they meet the mesh, and the weight of each pixel's rays.
+
+        Adaptive supersampling (Whitted 1980).
+        """
+        if not self._finer_offsets:
+            return [], None if len(hits) == 1 else dr.full(mi.Float, 1 / len(hits), pixels.count)
+        nearest, deepest = (functools.reduce(f, (h.depth for h in hits)) for f in (dr.minimum, dr.maximum))
+        partly = dr.isfinite(nearest) & ~dr.isfinite(deepest)
+        total = len(hits) + len(self._finer_offsets)
+        weights = dr.select(partly, mi.Float(1 / total), 1 / len(hits))
+        dr.eval(partly, weights)
+        which = dr.compress(partly)
+        finer = [self._cast(pixels, offset, which) for offset in self._finer_offsets] if dr.width(which) else []
+        return finer, weights
 
     def _draw(self, surface: Surface, pixels: PixelList) -> tuple[Drawn, list[mi.Float | None]]:
         """The drawing, and the groups of channels of all pixels, each flat; no colour without a texture."""
         facing = silhouette.facing(surface, pixels)
         dr.eval(facing)
+        hits = [self._cast(pixels, offset) for offset in self._pixel_offsets]
+        finer, weights = self._cast_finer(pixels, hits)
         drawn = Drawn(
             surface=surface,
             pixels=pixels,
             facing=facing,
-            hits=[self._cast(pixels, offset) for offset in self._pixel_offsets],
+            hits=hits,
+            finer=finer,
+            weights=weights,
             slopes=[],
         )
         widths = [0 if surface.texture is None else 3, 3, 1, surface.class_count]
         image = [dr.zeros(mi.Float, width * pixels.count) if width else None for width in widths]
-        for hits in drawn.hits:
-            drawn.slopes.append(self._shade(drawn, hits, image) if hits.count else [])
+        for ray in drawn.rays:
+            drawn.slopes.append(self._shade(drawn, ray, image) if ray.count else [])
         dr.sync_thread()
         return drawn, image
 
@@ -162,21 +190,23 @@ class Renderer:
         channels = surface.shade(hits.shares, surface.corners(hits.face), colour, facing)
         # What drawing knows of the texture: to read it again would cost more.
         slopes = [du * (uv.x - uvs[0].x) + dv * (uv.y - uvs[0].y) for uv in uvs[1:]]
+        weight = drawn.weight(hits)
         for total, group in zip(image, GROUPS, strict=True):
             if total is None:
                 continue
-            values = mi.ArrayXf([channel / len(drawn.hits) for channel in channels[group]])
-            if len(drawn.hits) == 1:
+            values = mi.ArrayXf([weight * channel for channel in channels[group]])
+            if drawn.weights is None:
                 dr.scatter(total, values, hits.pixel)
             else:
                 dr.scatter_add(total, values, hits.pixel, mode=dr.ReduceMode.NoConflicts)
-        dr.eval(image, slopes)
+        # The adjoint reads the hits in a row, not gathered from all pixels once more.
+        dr.eval(image, slopes, hits.face, hits.b1, hits.b2)
         return slopes
 
     def _interior_gradients(self, drawn: Drawn, adjoint: Adjoint, vertices: RowSum, texels: RowSum | None) -> None:
         """Add what the inside of the faces gives."""
         if adjoint.moves_inside:
-            for number, hits in enumerate(drawn.hits):
+            for number, hits in enumerate(drawn.rays):
                 if hits.count:
                     interior.backward(drawn, number, adjoint, vertices, texels)
             surface = drawn.surface
@@ -260,8 +290,15 @@ def _parts(numbers: Int[np.ndarray, "F"]) -> mi.UInt32 | None:
     return mi.UInt32(rank[part].astype(np.uint32)) if len(sizes) > 1 else None
 
 
-def _pixel_offsets(count: int) -> list[tuple[float, float]]:
-    """Where in a pixel its rays go: the centre, or a low-discrepancy (golden ratio) lattice."""
+def _pixel_offsets(count: int) -> tuple[list[tuple[float, float]], list[tuple[float, float]]]:
+    """Where in a pixel its rays go, and where further rays go if it is partly covered.
+
+    The centre, or a low-discrepancy (golden ratio) lattice. Of the lattice the outermost come first: rays near the four
+    corners seldom overlook that a pixel is partly covered.
+    """
     if count == 1:
-        return [_CENTRE]
-    return [((i + 0.5) / count, (i * 0.6180339887498949 + 0.25) % 1) for i in range(count)]
+        return [_CENTRE], []
+    total = max(count, _SILHOUETTE_RAYS)
+    lattice = [((i + 0.5) / total, (i * 0.6180339887498949 + 0.125) % 1) for i in range(total)]
+    lattice.sort(key=lambda point: math.dist(point, _CENTRE), reverse=True)
+    return lattice[:count], lattice[count:]

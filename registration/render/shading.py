@@ -26,7 +26,7 @@ GROUPS = (slice(0, 3), slice(3, 6), slice(MASK, 7), slice(7, None))  # channels:
 
 @dataclass(frozen=True, kw_only=True)
 class Hits:
-    """What the rays through one point of all pixels met."""
+    """What the rays through one point of all pixels met, or of P chosen ones."""
 
     offset: tuple[float, float]  # that point, from the pixel's corner (px)
     seen: mi.UInt32  # P: the face, or NO_FACE
@@ -35,6 +35,7 @@ class Hits:
     face: mi.UInt32  # N
     b1: mi.Float  # N, barycentric of the face's second corner
     b2: mi.Float  # N, and of its third
+    small: mi.Bool | None  # P: whether it is of another part than the largest; None if there is but one part
 
     @property
     def count(self) -> int:
@@ -53,15 +54,22 @@ class Footprint:
     first: mi.UInt32  # texel; the others are next to it, below it and both
     fx: mi.Float
     fy: mi.Float
+    inside: mi.Vector2f  # 1, or 0 where it was clamped: beyond the outermost texels' centres nothing changes
     size: int
 
     @classmethod
     def of(cls, uv: mi.Point2f, size: int) -> Footprint:
         """Bilinear, clamped at the border. Row 0 of the texture is at v = 1."""
-        x = dr.clip(uv.x * size - 0.5, 0, size - 1.001)
-        y = dr.clip((1 - uv.y) * size - 0.5, 0, size - 1.001)
-        column, row = mi.UInt32(x), mi.UInt32(y)
-        return cls(first=row * size + column, fx=x - mi.Float(column), fy=y - mi.Float(row), size=size)
+        position = mi.Point2f(uv.x, 1 - uv.y) * size - 0.5
+        clamped = dr.clip(position, 0, size - 1.001)
+        column, row = mi.UInt32(clamped.x), mi.UInt32(clamped.y)
+        return cls(
+            first=row * size + column,
+            fx=clamped.x - mi.Float(column),
+            fy=clamped.y - mi.Float(row),
+            inside=dr.select(position == clamped, mi.Vector2f(1), 0),
+            size=size,
+        )
 
     def texels(self) -> list[tuple[mi.UInt32, mi.Float]]:
         """Index and share of each."""
@@ -72,7 +80,7 @@ class Footprint:
         """d/du and d/dv of what lies between four texels' values."""
         du = dr.lerp(values[1] - values[0], values[3] - values[2], self.fy)
         dv = dr.lerp(values[2] - values[0], values[3] - values[1], self.fx)
-        return self.size * du, -self.size * dv
+        return self.size * self.inside.x * du, -self.size * self.inside.y * dv
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -152,13 +160,23 @@ class Drawn:
     surface: Surface
     pixels: PixelList
     facing: mi.Bool  # (N F): whether a view sees a face's outer side
-    hits: list[Hits]  # one for each ray of a pixel
-    slopes: list[list[mi.Vector3f]]  # of the hits: d(colour) / d(b_1) and / d(b_2)
+    hits: list[Hits]  # one for each ray of every pixel
+    finer: list[Hits]  # of further rays, through pixels that are partly covered
+    weights: mi.Float | None  # P: of one of a pixel's rays; None: it has but one
+    slopes: list[list[mi.Vector3f]]  # of `rays`: d(colour) / d(b_1) and / d(b_2)
 
     @property
     def share(self) -> float:
-        """Of one ray in its pixel."""
+        """Of one of the rays that every pixel has, were there no more."""
         return 1 / len(self.hits)
+
+    def weight(self, hits: Hits) -> mi.Float | float:
+        """What these hits count in their pixels."""
+        return 1.0 if self.weights is None else dr.gather(mi.Float, self.weights, hits.pixel)
+
+    @property
+    def rays(self) -> list[Hits]:
+        return [*self.hits, *self.finer]
 
     @property
     def deepest(self) -> mi.Float:

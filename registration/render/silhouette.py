@@ -1,7 +1,8 @@
 """The gradient of visibility: primary edge sampling (Li et al. 2018) over the silhouettes of all views at once.
 
 An edge is a silhouette of a view if exactly one of its faces looks at the camera, or if it has one face only. Seams
-of the texture's charts are sampled like silhouettes: nothing is hidden there, but the colour may jump.
+of the texture's charts are sampled like silhouettes where their outer side is seen: nothing is hidden there, but the
+colour may jump.
 Samples are uniform over the projected length L (px) of all silhouettes of all views; with N samples
 
     dLoss = (L / N) sum [g(pixel) . (f_in - f_out)] n . [(1 - s) dx_A + s dx_B]
