@@ -97,7 +97,8 @@ class RowSum:
         """Up to eight numbers, if there are so many columns; those of three or four go to the first columns."""
         values = list(value)
         if self._unit is not None:
-            values = [mi.Int64(dr.clip(v / self._unit, -_MOST, _MOST)) for v in values]
+            per_unit = dr.rcp(self._unit)
+            values = [mi.Int64(dr.clip(v * per_unit, -_MOST, _MOST)) for v in values]
         packet = 4 if len(values) <= 4 else 8
         values += [type(values[0])(0)] * (packet - len(values))
         dr.scatter_add(self.total, self._packet(values), row * (self._columns // packet), mode=self._mode)

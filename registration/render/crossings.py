@@ -30,8 +30,8 @@ from registration.render.cameras import CameraLanes, PixelList
 from registration.render.scene import TriangleScene
 from registration.render.shading import NO_FACE, Drawn, Hits, Surface
 
-_HALVINGS = 8  # of the way between two pixels' centres
-_SLACK = 0.01  # of the barycentrics of a point that still counts as one of the face
+_HALVINGS = 6  # of the way between two pixels' centres
+_SLACK = 0.03  # of the barycentrics of a point that still counts as one of the face
 
 
 @dataclass(frozen=True, kw_only=True)

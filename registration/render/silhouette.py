@@ -31,7 +31,7 @@ _STEP = 1e-6
 # An outside hit nearer than the edge by more than this share of its depth hides the edge.
 _DEPTH_TOLERANCE = 1e-5
 # A sample this far behind all that the pixels around it show, in metres, is hidden. Thinner gaps than a pixel are lost.
-_FAR = 5e-3
+_FAR = 2e-3
 _SEARCH_END = (1 << 22) - 1  # fixed, so that the number of silhouette edges never compiles a new kernel
 _SAMPLE_BLOCK = 4096
 

@@ -16,6 +16,8 @@ SAMPLES = 4
 SHARE_OF_HEIGHT = 0.7  # of the image, that the mesh fills
 RADIUS = 0.08  # metres, of the disc
 LIMIT = 1e-3
+MANY = 256  # samples of the reference
+RMS = 0.05
 
 
 @pytest.fixture(autouse=True)
@@ -72,3 +74,33 @@ def test_a_moving_mesh_keeps_its_area(mesh, side_px, capsys):
         with capsys.disabled():
             print(f"\n{mesh.__name__}, {side_px} px, along {name}: area varies by {varied:.3%}", end="")
         assert varied < LIMIT
+
+
+def coverage_of_disc(scene: Scene, shift_px: np.ndarray) -> torch.Tensor:
+    """Exact along y, by columns along x."""
+    fine, side = 64, scene.camera.width_px
+    radius = RADIUS / scene.pixel_m
+    centre = scene.camera.intrinsics[:2, 2] + shift_px * [1, -1]
+    column = (np.arange(side * fine) + 0.5) / fine - centre[0]
+    half = np.sqrt(np.maximum(radius**2 - column**2, 0))
+    row = np.arange(side)[:, None]
+    covered = np.minimum(row + 1, centre[1] + half) - np.maximum(row, centre[1] - half)
+    image = np.maximum(covered, 0).reshape(side, side, fine).mean(2)
+    return scene.pixels.of_image(torch.tensor(image)[None])
+
+
+@pytest.mark.parametrize("side_px", [256, 512])
+@pytest.mark.parametrize("mesh", [head, disc])
+def test_silhouettes_are_covered_as_many_samples_have_it(mesh, side_px, capsys):
+    scene, shift = Scene(mesh(), side_px), np.array([0.37, 0.21])
+    mask = scene.mask(scene.renderer(SAMPLES), shift)
+    references = {f"{MANY} samples": scene.mask(scene.renderer(MANY), shift)}
+    if mesh is disc:
+        references["the formula"] = coverage_of_disc(scene, shift)
+    for name, reference in references.items():
+        partly = (reference > 1e-4) & (reference < 1 - 1e-4)
+        assert partly.sum() > 1.5 * side_px
+        rms = (mask - reference)[partly].square().mean().sqrt().item()
+        with capsys.disabled():
+            print(f"\n{mesh.__name__}, {side_px} px, against {name}: rms {rms:.4f}", end="")
+        assert rms < RMS
