@@ -44,3 +44,4 @@ def backward(faces: mi.UInt32, positions: mi.Float, normals: mi.Float, gradients
     to_b, to_c = dr.cross(c - a, total), dr.cross(total, b - a)
     for vertex, value in zip(vertices, (-to_b - to_c, to_b, to_c), strict=True):
         gradients.add(vertex, value)
+    dr.eval(gradients.total)

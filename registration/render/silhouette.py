@@ -239,6 +239,7 @@ def backward(
     ends = dr.gather(mi.Point2u, edges.vertices, edge)
     for end, share in ((ends.x, 1 - samples.s), (ends.y, samples.s)):
         vertices.add(end, weight * share * camera.speed(surface.position(end), samples.normal))
+    dr.eval(vertices.total)
 
 
 def _beyond(
