@@ -243,7 +243,8 @@ class _Draw(torch.autograd.Function):
             drawn, image = renderer._draw(renderer._surface(vertices, texture), upload(pixels))
         renderer._last = pixels, drawn
         ctx.renderer, ctx.drawn = renderer, drawn
-        ctx.save_for_backward(vertices)
+        # The texture too: its memory is shared, and torch tells if it was changed meanwhile.
+        ctx.save_for_backward(vertices, *(() if texture is None else (texture,)))
         ctx.set_materialize_grads(False)
         count = len(pixels.view)
         rgb, normal, mask, classes = (
@@ -257,7 +258,7 @@ class _Draw(torch.autograd.Function):
         drawn: Drawn = ctx.drawn
         surface = drawn.surface
         with dr.suspend_grad():
-            (vertices,) = ctx.saved_tensors
+            vertices, *_ = ctx.saved_tensors
             renderer._move(vertices)
             adjoint = Adjoint.of(grad_outputs, surface)
             vertex_sum = RowSum(surface.vertex_count, adjoint.unit, columns=8)
