@@ -193,6 +193,19 @@ def test_some_pixels_are_those_of_all():
     assert (parts[0] + parts[1] - total).norm() < 0.05 * total.norm()
 
 
+def test_a_loss_of_one_pixel_moves_the_mesh():
+    """Sums are in fixed point, their unit taken from a sample of the adjoint: a sparse one must not be lost."""
+    size = 200
+    view = camera((0.05, 0.05, 0.3), (0.05, 0.05, 0), focal_px=600.0, width_px=size, height_px=size)
+    pixels, attached = Pixels.all_of([view]), torch.tensor(SQUARE, requires_grad=True)
+    classes = square()(attached, None, pixels).classes[:, 1]
+    one = int(pixels.index[0, 101, 93])
+    assert 0.1 < classes[one] < 0.9
+    (gradient,) = torch.autograd.grad(classes[one], attached)
+    # A point that is seen slides by -1 m when the square slides by 1 m; the class grows by 1 in 0.1 m.
+    assert gradient[:, 0].sum().item() == pytest.approx(-10, rel=1e-3)
+
+
 def test_no_pixel_shows_the_mesh():
     away = camera((0, 0, 1), (0, 0, 2))
     vertices = torch.tensor(SQUARE, requires_grad=True)
