@@ -44,9 +44,8 @@ class _Side:
 
     @classmethod
     def of(cls, surface: Surface, face: mi.UInt32, centre: mi.Point3f) -> _Side:
-        plane = dr.gather(mi.Vector4f, surface.planes, face)
-        normal = mi.Vector3f(plane.x, plane.y, plane.z)
-        return cls(face=face, normal=normal, reach=plane.w - dr.dot(normal, centre))
+        normal, offset = surface.plane(face)
+        return cls(face=face, normal=normal, reach=offset - dr.dot(normal, centre))
 
     def shares(self, surface: Surface, centre: mi.Point3f, direction: mi.Vector3f) -> list[mi.Float]:
         """Barycentrics of where a ray meets the plane."""

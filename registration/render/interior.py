@@ -15,7 +15,7 @@ import drjit as dr
 import mitsuba as mi
 
 from registration.render.adjoint import Adjoint, RowSum
-from registration.render.shading import Drawn, Footprint, Hits, Surface
+from registration.render.shading import Drawn, Footprint, Hits, Surface, blend
 
 
 def backward(drawn: Drawn, number: int, adjoint: Adjoint, vertices: RowSum, texels: RowSum | None) -> None:
@@ -33,7 +33,7 @@ def backward(drawn: Drawn, number: int, adjoint: Adjoint, vertices: RowSum, texe
     normal = _normals(surface, hits, b, corners, drawn.sees_outside(view, hits.face), adjoint, change)
     _colour(surface, hits, drawn.slopes[number], adjoint, change, texels, share)
     p0, p1, p2 = (surface.position(corner) for corner in corners)
-    direction = b[0] * p0 + b[1] * p1 + b[2] * p2 - pixels.centre(view)
+    direction = blend(b, [p0, p1, p2]) - pixels.centre(view)
     e1, e2 = p1 - p0, p2 - p0
     slip = (change[1] - change[0]) * dr.cross(e2, direction) + (change[2] - change[0]) * dr.cross(direction, e1)
     slip *= share * dr.rcp(dr.dot(dr.cross(e1, e2), direction))
@@ -66,7 +66,7 @@ def _normals(
     if g is None:
         return None
     normals = [surface.normal(corner) for corner in corners]
-    normal = b[0] * normals[0] + b[1] * normals[1] + b[2] * normals[2]
+    normal = blend(b, normals)
     inverse = dr.rsqrt(dr.maximum(dr.squared_norm(normal), 1e-12))
     unit = normal * inverse
     g = (g - unit * dr.dot(unit, g)) * (inverse * dr.select(facing, mi.Float(1), -1))

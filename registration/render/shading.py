@@ -111,6 +111,11 @@ class Surface:
     def position(self, vertex: mi.UInt32, active: mi.Bool | bool = True) -> mi.Point3f:
         return point(self.positions, vertex, active)
 
+    def plane(self, face: mi.UInt32) -> tuple[mi.Vector3f, mi.Float]:
+        """Normal n (not unit) and <n, p>, with p in the plane."""
+        row = dr.gather(mi.Vector4f, self.planes, face)
+        return mi.Vector3f(row.x, row.y, row.z), row.w
+
     def normal(self, vertex: mi.UInt32) -> mi.Vector3f:
         return mi.Vector3f(point(self.normals, vertex))
 

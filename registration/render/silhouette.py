@@ -79,8 +79,8 @@ def facing(surface: Surface, pixels: PixelList) -> mi.Bool:
     face_count = dr.opaque(mi.UInt32, surface.face_count)
     lane = dr.arange(mi.UInt32, pixels.camera_count * surface.face_count)
     view = lane // face_count
-    plane = dr.gather(mi.Vector4f, surface.planes, lane - view * face_count)
-    return dr.dot(mi.Vector3f(plane.x, plane.y, plane.z), pixels.centre(view)) > plane.w
+    normal, offset = surface.plane(lane - view * face_count)
+    return dr.dot(normal, pixels.centre(view)) > offset
 
 
 def _find(surface: Surface, edges: EdgeArrays, pixels: PixelList, facing: mi.Bool) -> _Silhouettes | None:
@@ -124,9 +124,8 @@ def _nearer(surface: Surface, pair: mi.Point2u, facing: mi.UInt32) -> mi.UInt32:
     """
     own, other = (dr.select(facing == side, pair.x, pair.y) for side in (0, 1))
     has_other = other != NO_FACE
-    plane = dr.gather(mi.Vector4f, surface.planes, own)
-    beside = dr.dot(mi.Vector3f(plane.x, plane.y, plane.z), _centre(surface, other, has_other)) - plane.w
-    folded = has_other & (beside > 0)
+    normal, offset = surface.plane(own)
+    folded = has_other & (dr.dot(normal, _centre(surface, other, has_other)) > offset)
     return dr.select(folded, 1 - facing, facing)
 
 
