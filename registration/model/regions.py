@@ -88,3 +88,35 @@ def crossing_parts(data: GNMData) -> Int[np.ndarray, "F"]:
     for number, lip in enumerate(lips):
         parts = np.where(lip, len(data.mesh_component_names) + number, parts)
     return parts
+
+
+def eyeball_shells(data: GNMData) -> tuple[Bool[np.ndarray, "V"], Bool[np.ndarray, "V"]]:
+    """The outer shells of the left and the right eyeball: sclera and cornea, without iris and pupil."""
+    outer = group(data, "eye_exteriors") > _INSIDE
+    return outer & (group(data, "left_eye") > _INSIDE), outer & (group(data, "right_eye") > _INSIDE)
+
+
+def lips(data: GNMData) -> tuple[Bool[np.ndarray, "V"], Bool[np.ndarray, "V"]]:
+    """Upper and lower lip with the skin around them; what belongs to both, at the corners, is in neither."""
+    upper, lower = (
+        (group(data, name) > _INSIDE) | (group(data, f"{name}_region") > _INSIDE) for name in ("upper_lip", "lower_lip")
+    )
+    return upper & ~lower, lower & ~upper
+
+
+def ears(data: GNMData) -> Bool[np.ndarray, "V"]:
+    return group(data, "ears") > _INSIDE
+
+
+def teeth(data: GNMData) -> Bool[np.ndarray, "V"]:
+    """All teeth, without the gums' own vertices."""
+    return group(data, "teeth") > _INSIDE
+
+
+def tongue(data: GNMData) -> Bool[np.ndarray, "V"]:
+    return group(data, "tongue") > _INSIDE
+
+
+def palate(data: GNMData) -> Bool[np.ndarray, "V"]:
+    """The upper gums and the roof of the mouth, as far as the model has one."""
+    return (group(data, "gums") > _INSIDE) & (group(data, "upper_teeth_and_gums") > _INSIDE)
