@@ -147,6 +147,30 @@ def synth_capture(
     return 0
 
 
+def spoil_capture(
+    source: CaptureFolder,
+    target: Positional[Annotated[Path, arg(metavar="DIR")]],
+    /,
+    preset: Literal["none", "studio", "harsh"] = "studio",
+    seed: Annotated[int, arg(metavar="S")] = 0,
+    breaks: Annotated[tuple[str, ...], arg(name="break", metavar="VIEW=HOW")] = (),
+) -> int:
+    """Copy a good capture with the errors that real ones have: what a registration of it loses can be measured.
+
+    Args:
+        source: The capture folder; it stays as it is.
+        target: The capture folder to write; it must not exist.
+        preset: studio is what a good studio leaves, harsh about twice that; none changes nothing.
+        seed: Seed of everything random: one seed is one copy.
+        breaks: Break a view, which is not dropped then: shifted (by 30 px), black, or exposure (2.5 times the light).
+    """
+    broken = _broken_views(breaks)
+    from registration.capture.spoil import PRESETS, spoil
+
+    print(spoil(source, target, preset=PRESETS[preset], seed=seed, breaks=broken))
+    return 0
+
+
 def describe_model(
     file: Positional[Annotated[Path, arg(metavar="NPZ")]], /, out: Annotated[Path | None, arg(metavar="PNG")] = None
 ) -> int:
@@ -188,7 +212,10 @@ Group = tuple[str, Mapping[str, Command]]  # what the group is about, its comman
 COMMANDS: Mapping[str, Command | Group] = {
     "register": register,
     "evaluate": evaluate,
-    "capture": ("Look at captures and make synthetic ones.", {"check": check_capture, "synth": synth_capture}),
+    "capture": (
+        "Look at captures, make synthetic ones, spoil good ones.",
+        {"check": check_capture, "synth": synth_capture, "spoil": spoil_capture},
+    ),
     "model": (
         "Look at head models, make the first one, get the official one.",
         {"info": describe_model, "bootstrap": bootstrap_model, "fetch": fetch_model},
@@ -241,6 +268,23 @@ def _target_weights(pairs: Sequence[str]) -> dict[str, float]:
                 fix="write the target's name, an equals sign and a number",
             )
     return weights
+
+
+def _broken_views(pairs: Sequence[str]) -> dict[str, set[str]]:
+    """`VIEW=HOW` arguments as a mapping; a view may come several times."""
+    broken: dict[str, set[str]] = {}
+    for pair in pairs:
+        view, _, how = pair.rpartition("=")
+        if not (view and how):
+            raise InputError(
+                "Cannot read how a view is broken",
+                where="--break",
+                expected="VIEW=HOW, e.g. cam03=shifted",
+                got=pair,
+                fix="write the view's name, an equals sign and one of shifted, black, exposure",
+            )
+        broken.setdefault(view, set()).add(how)
+    return broken
 
 
 def _landmark_files(pairs: Sequence[str]) -> dict[str, Path]:

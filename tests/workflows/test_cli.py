@@ -16,7 +16,7 @@ HEAVY = {"torch", "mitsuba", "drjit", "numpy", "scipy", "cv2", "pycolmap", "korn
 @pytest.mark.parametrize(
     "command",
     [
-        *("", "register", "evaluate", "capture", "capture check", "capture synth"),
+        *("", "register", "evaluate", "capture", "capture check", "capture synth", "capture spoil"),
         *("model", "model info", "model fetch", "model bootstrap"),
     ],
 )
@@ -148,6 +148,32 @@ def test_capture_check_tells_and_draws(tmp_path: Path, capsys: pytest.CaptureFix
     told = capsys.readouterr().out
     assert "5 views, all checks passed" in told and str(sheet) in told
     assert sheet.read_bytes().startswith(b"\x89PNG")
+
+
+def test_capture_spoil_breaks_what_it_is_told_to(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    source, target = make(tmp_path / "source"), tmp_path / "target"
+    flags = ["--preset", "none", "--seed", "4", "--break", "cam3=shifted", "cam1=black", "cam3=exposure"]
+    assert main(["capture", "spoil", str(source), str(target), *flags]) == 0
+    assert capsys.readouterr().out == f"{target}\n"
+    assert main(["capture", "check", str(target)]) == 0
+    assert "preset none, seed 4; cam1 black; cam3 exposure shifted" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("pair", ["cam03", "cam03=", "=black"])
+def test_malformed_breaks_are_told(pair: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["capture", "spoil", str(tmp_path / "source"), str(tmp_path / "target"), "--break", pair]) == 2
+    error = capsys.readouterr().err
+    assert "VIEW=HOW" in error and pair in error and "fix:" in error and "Traceback" not in error
+
+
+def test_unknown_presets_stop_with_code_2(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    source = make(tmp_path / "source")
+    with pytest.raises(SystemExit) as stop:
+        main(["capture", "spoil", str(source), str(tmp_path / "target"), "--preset", "studioo"])
+    assert stop.value.code == 2
+    error = capsys.readouterr().err
+    assert "studioo" in error and "harsh" in error
+    assert list(tmp_path.iterdir()) == [source]
 
 
 @pytest.mark.parametrize("status, code", [("converged", 0), ("stopped", 0), ("failed", 1)])
