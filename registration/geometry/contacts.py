@@ -1,4 +1,11 @@
-"""Contacts of a mesh with itself: which triangle a vertex faces, and how deep it lies behind one."""
+"""Contacts within a mesh: how deep a vertex lies behind the surface of another part.
+
+Depth is the distance to the closest point of that surface, positive behind it. Which triangles may hold that point is
+looked up once for some steps; which one does, and where, is found at every step.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
 
 import numpy as np
 import torch
@@ -8,102 +15,204 @@ from scipy.sparse.csgraph import dijkstra
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from registration.geometry.closest_point import barycentric_points, closest_points
-from registration.geometry.topology import edges, vertex_normals
+from registration.geometry.topology import edges
 
-_OPPOSING = -0.2  # cosine between the normals of vertex and triangle
-_LOOKED_AT = 8  # triangles around a vertex
-_ALIGNED = 0.7  # cosine between the way to the closest point and the triangle's normal: not past the surface's border
+_WATCHED = 24  # triangles around a vertex
+# Cosine between the way to the closest point and the normal there; less is past the last triangle that was looked at.
+# Grooves of solids down to 60 degrees stay above it.
+_ALIGNED = 0.5
+_DETOUR = 3.0  # a contact is so much further along the surface than straight
 
 
-def plane_depths(
-    vertices: Float[Tensor, "V 3"], points: Int[Tensor, "M"], triangles: Int[Tensor, "M 3"]
-) -> Float[Tensor, "M"]:
-    """How far each vertex `points` lies behind the plane of its triangle, in the vertices' unit; negative in front.
+@dataclass(frozen=True, kw_only=True)
+class Watched:
+    """Vertices and, for each, K triangles one of which it may get behind."""
 
-    Differentiable in all four vertices. Where the foot lies within the triangle this is how the distance to the surface
-    changes: the corners share the gradient by the foot's barycentrics.
-    """
-    # Not vertices[...]: the adjoint of that sums in parallel, differently from run to run.
-    p, a, b, c = (vertices.index_select(0, index) for index in (points, *triangles.unbind(1)))
+    place: Int[Tensor, "M"]  # in the list of points that it was found in
+    points: Int[Tensor, "M"]
+    triangles: Int[Tensor, "M K 3"]
+    rim: Bool[Tensor, "M K 3"]  # corners on the border of an open surface
+
+    @classmethod
+    def joined(cls, parts: Sequence["Watched"]) -> "Watched":
+        """All rows of some, in their order."""
+        return cls(**{f.name: torch.cat([getattr(part, f.name) for part in parts]) for f in fields(cls)})
+
+    def only(self, rows: Bool[Tensor, "M"]) -> "Watched":
+        return Watched(**{f.name: getattr(self, f.name)[rows] for f in fields(self)})
+
+    def to(self, device: torch.device) -> "Watched":
+        return Watched(**{f.name: getattr(self, f.name).to(device) for f in fields(self)})
+
+
+@dataclass(frozen=True, kw_only=True)
+class Depths:
+    """How deep M vertices lie: depth = direction . (sum of weights * corners - vertex). Nothing has a gradient."""
+
+    depth: Float[Tensor, "M"]  # negative in front of the surface, -inf past the border of an open one
+    triangle: Int[Tensor, "M 3"]
+    weights: Float[Tensor, "M 3"]  # barycentrics of the closest point
+    direction: Float[Tensor, "M 3"]  # unit, the shortest way out
+
+    def again(
+        self, vertices: Float[Tensor, "V 3"], points: Int[Tensor, "M"], rows: Int[Tensor, "R"]
+    ) -> Float[Tensor, "R"]:
+        """The depths of some rows, differentiable in the vertex and the triangle's corners.
+
+        Exact to first order though direction and weights stand still: the closest point is where moving it along the
+        surface changes nothing.
+        """
+        # Not vertices[...]: the adjoint of that sums in parallel, differently from run to run.
+        corners = vertices.index_select(0, self.triangle[rows].flatten()).unflatten(0, (-1, 3))
+        ahead = (self.weights[rows][:, :, None] * corners).sum(1) - vertices.index_select(0, points[rows])
+        return (self.direction[rows] * ahead).sum(-1)
+
+
+@torch.no_grad()
+def depths(vertices: Float[Tensor, "V 3"], watched: Watched) -> Depths:
+    """How deep each watched vertex lies behind the closest point of its triangles."""
+    p = vertices[watched.points][:, None]
+    a, b, c = vertices[watched.triangles].unbind(2)
+    weights = _closest(p, a, b, c)
+    ahead = (weights[..., None] * torch.stack([a, b, c], -2)).sum(-2) - p
+    distance = ahead.norm(dim=-1)
     normal = torch.nn.functional.normalize(torch.linalg.cross(b - a, c - a), dim=-1)
-    return (normal * (a - p)).sum(-1)
+    along = (normal * ahead).sum(-1)
+    # On an edge several triangles are equally close: the one seen most squarely knows which side the vertex is on.
+    best = (distance - 1e-3 * along.abs()).argmin(1)
+    row = torch.arange(len(best), device=best.device)
+    weights, ahead, distance = (t[row, best] for t in (weights, ahead, distance))
+    side = along[row, best].sign()
+    on_rim = (weights * watched.rim[row, best]).sum(-1) > 1 - 1e-5
+    past = on_rim | (along[row, best].abs() < _ALIGNED * distance)
+    return Depths(
+        depth=torch.where(past, -torch.inf, distance * side),
+        triangle=watched.triangles[row, best],
+        weights=weights,
+        direction=ahead * (side / distance.clamp_min(1e-12))[:, None],
+    )
 
 
-class Facing:
-    """Vertices of one surface against triangles of another that hangs together with it."""
+def _closest(p: Tensor, a: Tensor, b: Tensor, c: Tensor) -> Float[Tensor, "M K 3"]:
+    """Barycentrics of the point of each triangle that is closest to its row's point.
+
+    The foot on the plane where it lies inside, else the best of the three edges.
+    """
+    ab, ac, ap = b - a, c - a, p - a
+    d1, d2, d3, d4, d5 = ((s * t).sum(-1) for s, t in ((ab, ab), (ab, ac), (ac, ac), (ab, ap), (ac, ap)))
+    area = (d1 * d3 - d2 * d2).clamp_min(1e-30)
+    v, w = (d3 * d4 - d2 * d5) / area, (d1 * d5 - d2 * d4) / area
+    foot = torch.stack([1 - v - w, v, w], -1)
+    zero = torch.zeros_like(d1)
+    s, t = (d4 / d1.clamp_min(1e-30)).clamp(0, 1), (d5 / d3.clamp_min(1e-30)).clamp(0, 1)
+    along_bc = ((d1 - d2 - d4 + d5) / (d1 - 2 * d2 + d3).clamp_min(1e-30)).clamp(0, 1)
+    sides = torch.stack(
+        [
+            torch.stack([1 - s, s, zero], -1),
+            torch.stack([1 - t, zero, t], -1),
+            torch.stack([zero, 1 - along_bc, along_bc], -1),
+        ]
+    )
+    # Squared distance to p of a + v ab + w ac, but for |ap|^2, which all share.
+    v, w = sides[..., 1], sides[..., 2]
+    cost = v * v * d1 + 2 * v * w * d2 + w * w * d3 - 2 * v * d4 - 2 * w * d5
+    best = cost.argmin(0)[None, ..., None].expand(1, *d1.shape, 3)
+    return torch.where((foot >= 0).all(-1, keepdim=True), foot, sides.gather(0, best)[0])
+
+
+class Solids:
+    """Parts such as teeth, closed but for where they are fixed, against vertices of other parts.
+
+    Parts are looked at one by one: of two that touch, the closer one would hide that a vertex lies in its neighbour.
+    """
 
     def __init__(
         self,
         points: Int[np.ndarray, "P"],
-        triangles: Int[np.ndarray, "F 3"],
-        mesh: Int[np.ndarray, "G 3"],
-        rest: Float[np.ndarray, "V 3"],
+        parts: Sequence[Int[np.ndarray, "_ 3"]],
         *,
-        reach: float,
-        apart: float,
+        inside: float,
+        outside: float,
+        ways: "Ways | None" = None,
     ):
-        """`mesh`: the triangles that both belong to, for normals and for ways along the surface.
+        """Vertices are watched while they are at most `inside` behind and `outside` in front of a part's surface.
 
-        Only triangles closer than `reach`, and at `rest` more than `apart` away along the edges, are considered.
+        `ways`, from the points, for parts that the points' own surface runs on into, as lips do at the mouth's corners.
+        There a vertex has the far side of its own flesh behind it, and only what is far along the surface is a contact.
         """
-        self.points, self.triangles, self._reach = points, triangles, reach
-        self._around = mesh[np.isin(mesh, points).any(1)]
-        self._near = _within(mesh, rest, points, triangles, apart)
+        self.points = points
+        self._parts = [_Patch(part) for part in parts]
+        self._inside, self._outside, self._ways = inside, outside, ways
 
-    def find(self, vertices: Float[np.ndarray, "V 3"]) -> tuple[Int[np.ndarray, "M"], Int[np.ndarray, "M"]]:
-        """Places in `points` and, for each, in `triangles`: the closest one, if the vertex faces it or has crossed it.
-
-        That is so if their normals oppose one another and the closest point is not on the surface's border.
-        """
-        rows = self._hopeful(vertices)
-        if not len(rows):
-            return rows, rows
-        own = vertex_normals(torch.as_tensor(vertices), torch.as_tensor(self._around)).numpy()[self.points[rows]]
-        p = vertices[self.points[rows]]
-        distance, face, barycentric = closest_points(p, vertices, self.triangles)
-        ahead = p - barycentric_points(vertices, self.triangles, face, barycentric)
-        a, b, c = vertices[self.triangles[face]].transpose(1, 0, 2)
-        normal = np.cross(b - a, c - a)
-        normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-30)
-        keep = (distance < self._reach) & ~self._near[rows, face]
-        keep &= (normal * own).sum(1) < _OPPOSING
-        keep &= np.abs((ahead * normal).sum(1)) >= _ALIGNED * distance
-        return rows[keep], face[keep]
-
-    def _hopeful(self, vertices: Float[np.ndarray, "V 3"]) -> Int[np.ndarray, "M"]:
-        """Places of the points that may have a triangle in reach that is far enough along the surface."""
-        if not len(self.points) or not len(self.triangles):
-            return np.empty(0, np.int64)
-        corners = vertices[self.triangles]
-        centres = corners.mean(1)
-        radius = np.linalg.norm(corners - centres[:, None], axis=-1).max()
-        count = min(_LOOKED_AT, len(centres))
-        away, index = cKDTree(centres).query(
-            vertices[self.points], k=range(1, count + 1), distance_upper_bound=self._reach + radius
-        )
-        missing = ~np.isfinite(away)
-        near = np.take_along_axis(self._near, np.where(missing, 0, index), 1)
-        # If all that were looked at are too near along the surface, further ones are no contact to speak of.
-        return np.flatnonzero((~missing & ~near).any(1))
+    def watched(self, vertices: Float[np.ndarray, "V 3"]) -> Watched:
+        """What to watch now: vertices, once for every part that is near."""
+        x = vertices[self.points]
+        found = [_rows(self.points, np.empty(0, int), _Patch(), np.empty((0, _WATCHED), int))]
+        for part in self._parts:
+            corners = vertices[part.triangles]
+            low, high = corners.min((0, 1)) - self._outside, corners.max((0, 1)) + self._outside
+            boxed = np.flatnonzero(((x > low) & (x < high)).all(1))
+            row, around = _around(x[boxed], corners, max(self._inside, self._outside))
+            found.append(_rows(self.points, boxed[row], part, around))
+        watched = Watched.joined(found)
+        now = depths(torch.as_tensor(vertices), watched)
+        near = (now.depth > -self._outside) & (now.depth < self._inside)
+        if self._ways is not None:
+            way = self._ways.least(watched.place.numpy(), now.triangle.numpy())
+            near &= torch.as_tensor(way) > _DETOUR * now.depth.abs()
+        return watched.only(near)
 
 
-def _within(
-    mesh: Int[np.ndarray, "G 3"],
-    rest: Float[np.ndarray, "V 3"],
-    points: Int[np.ndarray, "P"],
-    triangles: Int[np.ndarray, "F 3"],
-    apart: float,
-) -> Bool[np.ndarray, "P F"]:
-    """Whether a way along edges from a point to a corner of a triangle is at most `apart` long."""
-    pairs = edges(mesh).vertices
-    # A way that short stays within `apart` of where it starts: the rest of the mesh need not be looked at.
-    close = np.isfinite(cKDTree(rest[points]).query(rest, distance_upper_bound=apart)[0])
-    local = np.where(close, close.cumsum() - 1, -1)
-    pairs = local[pairs[close[pairs].all(1)]]
-    at = rest[close]
-    length = np.linalg.norm(at[pairs[:, 0]] - at[pairs[:, 1]], axis=1)
-    graph = coo_matrix((length, (pairs[:, 0], pairs[:, 1])), (len(at), len(at)))
-    ways = dijkstra(graph.tocsr(), directed=False, indices=local[points], limit=apart)
-    ways = np.concatenate([np.isfinite(ways), np.zeros((len(points), 1), bool)], 1)  # last: all that is not close
-    return ways[:, local[triangles]].any(-1)
+class Ways:
+    """How long the ways along a surface are at rest, from some vertices to others; inf if longer than a limit."""
+
+    def __init__(
+        self,
+        starts: Int[np.ndarray, "P"],
+        mesh: Int[np.ndarray, "F 3"],
+        rest: Float[np.ndarray, "V 3"],
+        limit: float,
+    ):
+        ends = edges(mesh).vertices
+        # Such a way stays close to where it starts: the rest of the mesh need not be looked at.
+        close = np.isfinite(cKDTree(rest[starts]).query(rest, distance_upper_bound=limit)[0])
+        self._column = np.where(close, close.cumsum() - 1, close.sum())
+        ends = self._column[ends[close[ends].all(1)]]
+        at = rest[close]
+        length = np.linalg.norm(at[ends[:, 0]] - at[ends[:, 1]], axis=1)
+        graph = coo_matrix((length, ends.T), (len(at), len(at))).tocsr()
+        ways = dijkstra(graph, directed=False, indices=self._column[starts], limit=limit)
+        self._ways = np.pad(ways.astype(np.float32), ((0, 0), (0, 1)), constant_values=np.inf)
+
+    def least(self, place: Int[np.ndarray, "M"], ends: Int[np.ndarray, "M N"]) -> Float[np.ndarray, "M"]:
+        """The shortest way from the start at each place to any of its ends."""
+        return self._ways[place[:, None], self._column[ends]].min(1)
+
+
+class _Patch:
+    """Triangles of one surface, and which of their corners lie on its border."""
+
+    def __init__(self, triangles: Int[np.ndarray, "F 3"] | None = None):
+        self.triangles = np.empty((0, 3), int) if triangles is None else triangles
+        self.rim = np.zeros(self.triangles.shape, bool)
+        if len(self.triangles):
+            found = edges(self.triangles)
+            self.rim = np.isin(self.triangles, found.vertices[found.faces[:, 1] < 0])
+
+
+def _rows(points: np.ndarray, place: np.ndarray, patch: _Patch, around: np.ndarray) -> Watched:
+    arrays = {"place": place, "points": points[place], "triangles": patch.triangles[around], "rim": patch.rim[around]}
+    return Watched(**{name: torch.as_tensor(array) for name, array in arrays.items()})
+
+
+def _around(
+    points: Float[np.ndarray, "P 3"], corners: Float[np.ndarray, "F 3 3"], reach: float
+) -> tuple[Int[np.ndarray, "M"], Int[np.ndarray, "M K"]]:
+    """The points that may have a triangle in reach, and the triangles with the nearest centroids; some repeat."""
+    if not len(points) or not len(corners):
+        return np.empty(0, int), np.empty((0, _WATCHED), int)
+    centres = corners.mean(1)
+    radius = np.linalg.norm(corners - centres[:, None], axis=-1).max()
+    away, index = cKDTree(centres).query(points, k=_WATCHED, distance_upper_bound=reach + radius)
+    row = np.flatnonzero(np.isfinite(away[:, 0]))
+    return row, np.where(np.isfinite(away[row]), index[row], index[row, :1])

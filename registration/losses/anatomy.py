@@ -2,287 +2,226 @@
 
 A vertex is penalised by the square of how much deeper it lies in the other part than in the template, beyond a margin:
 contact is the normal state of lids and lips, and the template runs through itself in places. An eyeball is the union of
-two spheres, a tooth or a slice of the tongue is convex, and lips and ears are behind the triangle that they face.
-Eye sockets, the mouth's lining and the lower gums are left out: the model's own lie inside their neighbours.
+two spheres; everything else is a surface that vertices get behind. Eye sockets, the mouth's lining and the lower gums
+are left out: in the model they lie inside their neighbours.
 """
-
-from typing import Protocol
 
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import dijkstra
 from scipy.spatial import cKDTree
 from torch import Tensor
 
 from registration.frames import MM_PER_M
-from registration.geometry.contacts import Facing, plane_depths
-from registration.geometry.hulls import ConvexParts
+from registration.geometry.contacts import Solids, Watched, Ways, depths
 from registration.geometry.quads import triangles_of
 from registration.geometry.spheres import fit_sphere, on_main_sphere
-from registration.geometry.topology import connected_parts
+from registration.geometry.topology import connected_parts, edges
 from registration.model import regions
 from registration.model.gnm_npz import GNMData
 
 # Lengths in mm of the template's size.
 _MARGIN = 0.05  # so much deeper than at rest costs nothing
-_LID_REACH = 6.0  # skin so near to an eyeball in the template can get into it
-_HULL_REACH = 3.0  # vertices so near to a convex part are watched until the next refresh
-_FACING_REACH = 4.0
-_APART = 10.0  # along the skin, for its contacts with itself
-_NEIGHBOURS = 25.0  # skin further away than this in the template never gets in touch
+_OUTSIDE, _INSIDE = 3.0, 8.0  # as far in front of and behind a part's surface vertices are watched
+_BEHIND_EARS = 25.0  # the part of the head that ears can get to
+_FLESH = (
+    4.0  # the same, behind skin, for contacts of the skin with itself: deeper is the far side of a vertex' own flesh
+)
+_WAYS = 12.0  # such contacts are checked to be further along the skin than straight
+_LINING = 6.0  # of the mouth, as far as it belongs to a lip
+_LIDS = 6.0  # from the eyeball
 _LEAST_CORNEA = 8  # vertices; fewer are no second sphere
-_SLICES = 6  # of the tongue, lengthwise
-# The floor of the mouth: a normal's upward share, and where the tongue's underside lies over it.
+# The floor of the mouth: its normals' upward share, and where the tongue's underside lies over it.
 _UPWARDS, _UNDER, _BELOW = 0.3, 3.0, 1.0
-
-# For some of a contact's points, their places in `points`, and how deep they lie, mm.
-Depths = tuple[Int[Tensor, "M"], Float[Tensor, "M"]]
 
 
 class SelfIntersection:
     """How much deeper than in the template the parts of a posed head run into one another.
 
     Works in the mesh's own geometry: any rigid pose and any scale of the head. What may touch what is looked up by
-    `refresh`, every ten steps or so; between two refreshes the penalties are continuous in the vertices.
+    `refresh`, before the first call and then every ten steps or so.
     """
 
     def __init__(self, data: GNMData, device: torch.device):
-        """Reads the template's contacts. Raises InputError if the model lacks a vertex group that names a part."""
+        """Finds the parts, and how deep they overlap at rest.
+
+        Raises InputError if the model lacks a vertex group that names a part.
+        """
+        self._device = device
         self._skin = np.flatnonzero(regions.exterior(data))
-        template = data.template_vertex_positions.astype(np.float64)
+        template = torch.as_tensor(data.template_vertex_positions, dtype=torch.float32, device=device)
         self._size = _spread(template[self._skin])
-        self._origin = torch.zeros(3, device=device)
-        self._scale = 1.0
-        rest = template * MM_PER_M
-        parts = _Parts(data, rest, device)
-        for hulls in parts.hulls:
-            hulls.refresh(rest)
-        self._hulls = parts.hulls
-        self._contacts = {
-            name: [_Allowing(contact, rest, device) for contact in contacts]
-            for name, contacts in parts.contacts.items()
-        }
+        rest = data.template_vertex_positions.astype(np.float64) * MM_PER_M
+        self._eyeballs = [_Eyeball(data, shell, rest, device) for shell in regions.eyeball_shells(data)]
+        self._surfaces = _surfaces(data, rest)
+        self.pairs = ("lids-eyeballs", *dict.fromkeys(name for name, _ in self._surfaces))
+        # Every point of every contact has a slot, which says how deep it may lie.
+        sizes = [len(part.points) for part in (*self._eyeballs, *(surface for _, surface in self._surfaces))]
+        self._slots = np.cumsum([0, *sizes])
+        self._allowed = torch.zeros(self._slots[-1], device=device)
+        self.refresh(template)
+        slot, _, _, depth = self._depths(template)
+        self._allowed = self._allowed.scatter_reduce(0, slot, depth, "amax") + _MARGIN
 
     def refresh(self, vertices: Float[Tensor, "V 3"]) -> None:
-        """Look up the head's size, the parts' hulls, and what is near enough to touch; posed vertices, metres."""
-        points = vertices.detach().cpu().numpy().astype(np.float64)
-        origin = points[self._skin].mean(0)
-        self._scale = float(_spread(points[self._skin]) / self._size)
-        self._origin = torch.as_tensor(origin, dtype=vertices.dtype, device=vertices.device)
-        local = (points - origin) * (MM_PER_M / self._scale)
-        for hulls in self._hulls:
-            hulls.refresh(local)
-        for contacts in self._contacts.values():
-            for contact in contacts:
-                contact.refresh(local)
+        """Look up the head's size and what is near enough to touch. `vertices` are posed, in metres."""
+        vertices = vertices.detach()
+        self._scale = _spread(vertices[self._skin]) / self._size
+        self._origin = vertices[self._skin].mean(0)
+        local = self._local(vertices).cpu().numpy()
+        found = [surface.watched(local) for _, surface in self._surfaces]
+        watched = Watched.joined(found).to(self._device)
+        of = np.repeat(np.arange(len(found)), [len(rows.place) for rows in found])
+        first, pair = self._slots[len(self._eyeballs) + of], np.array([self.pairs.index(n) for n, _ in self._surfaces])
+        self._watched = watched
+        self._slot = watched.place + torch.as_tensor(first, device=self._device)
+        self._pair = torch.as_tensor(pair[of], device=self._device)
 
     def __call__(self, vertices: Float[Tensor, "V 3"]) -> dict[str, Tensor]:
-        """The penalty of each pair of parts: squares of excess depths (mm^2) summed over vertices; scalars.
+        """The penalty of each pair of parts: squares of excess depths summed over vertices; scalars, mm^2.
 
         `vertices` are posed, in metres. Differentiable in both parts; value and gradient are zero for the template.
         """
-        return {
-            name: self._scale**2 * torch.stack([excess.square().sum() for _, excess in excesses]).sum()
-            for name, excesses in self._excesses(vertices).items()
-        }
+        slot, pair, _, depth = self._depths(vertices)
+        excess = torch.relu(depth - self._allowed[slot])
+        total = excess.new_zeros(len(self.pairs)).index_add(0, pair, excess.square())
+        return dict(zip(self.pairs, self._scale**2 * total, strict=True))
 
     @torch.no_grad()
     def excess_mm(self, vertices: Float[Tensor, "V 3"]) -> dict[str, Float[Tensor, "V"]]:
-        """For each pair and each vertex of the mesh by how much it is too deep in the other part, mm."""
-        found = {}
-        for name, excesses in self._excesses(vertices).items():
-            found[name] = torch.zeros(len(vertices), dtype=vertices.dtype, device=vertices.device)
-            for index, excess in excesses:
-                found[name].scatter_reduce_(0, index, self._scale * excess, "amax")
-        return found
+        """For each pair of parts, by how much each vertex of the mesh lies too deep in the other part, mm."""
+        slot, pair, points, depth = self._depths(vertices)
+        excess = self._scale * torch.relu(depth - self._allowed[slot])
+        found = excess.new_zeros(len(self.pairs), len(vertices))
+        found.view(-1).scatter_reduce_(0, pair * len(vertices) + points, excess, "amax")
+        return dict(zip(self.pairs, found, strict=True))
 
-    def _excesses(self, vertices: Tensor) -> dict[str, list[Depths]]:
-        local = (vertices - self._origin) * (MM_PER_M / self._scale)
-        return {name: [contact.excess(local) for contact in contacts] for name, contacts in self._contacts.items()}
+    def _local(self, vertices: Float[Tensor, "V 3"]) -> Float[Tensor, "V 3"]:
+        return (vertices - self._origin) * (MM_PER_M / self._scale)
 
-
-class _Contact(Protocol):
-    """Points against one or several other parts; vertices are in mm of the template's size."""
-
-    points: Int[Tensor, "P"]
-
-    def refresh(self, vertices: Float[np.ndarray, "V 3"]) -> None: ...
-
-    def depths(self, vertices: Float[Tensor, "V 3"]) -> Depths: ...
-
-
-class _Allowing:
-    """A contact with what it allows each point: its depth at rest, and the margin."""
-
-    def __init__(self, contact: _Contact, rest: Float[np.ndarray, "V 3"], device: torch.device):
-        self._contact = contact
-        self.refresh(rest)
-        place, depth = contact.depths(torch.as_tensor(rest, dtype=torch.float32, device=device))
-        deepest = torch.zeros(len(contact.points), device=device).scatter_reduce_(0, place, depth, "amax")
-        self._allowed = deepest + _MARGIN
-
-    def refresh(self, vertices: Float[np.ndarray, "V 3"]) -> None:
-        self._contact.refresh(vertices)
-
-    def excess(self, vertices: Float[Tensor, "V 3"]) -> Depths:
-        """Vertices, not places, and how much too deep they are; zero or more."""
-        place, depth = self._contact.depths(vertices)
-        return self._contact.points[place], torch.relu(depth - self._allowed[place])
+    def _depths(
+        self, vertices: Float[Tensor, "V 3"]
+    ) -> tuple[Int[Tensor, "M"], Int[Tensor, "M"], Int[Tensor, "M"], Float[Tensor, "M"]]:
+        """Slot, pair, vertex and depth (mm of the template's size) of all that is deeper than allowed, and of lids."""
+        local = self._local(vertices)
+        now = depths(local, self._watched)
+        deep = (now.depth > self._allowed[self._slot]).nonzero()[:, 0]
+        points = self._watched.points
+        found = [(self._slot[deep], self._pair[deep], points[deep], now.again(local, points, deep))]
+        for eyeball, start in zip(self._eyeballs, self._slots, strict=False):
+            slot = torch.arange(start, start + len(eyeball.points), device=self._device)
+            found.append((slot, torch.zeros_like(slot), eyeball.lids, eyeball.depths(local)))
+        slot, pair, points, depth = (torch.cat(columns) for columns in zip(*found, strict=True))
+        return slot, pair, points, depth
 
 
-class _InEyeball:
-    """Skin in one eyeball: the union of the spheres of sclera and cornea, found anew from its vertices."""
+class _Eyeball:
+    """The skin around one eyeball, against the union of the spheres of sclera and cornea."""
 
-    def __init__(self, points: Tensor, sclera: Tensor, cornea: Tensor):
-        self.points = points
-        self._shells = [shell for shell in (sclera, cornea) if len(shell)]
-        self._places = torch.arange(len(points), device=points.device)
+    def __init__(
+        self, data: GNMData, shell: Bool[np.ndarray, "V"], rest: Float[np.ndarray, "V 3"], device: torch.device
+    ):
+        index = np.flatnonzero(shell)
+        main = on_main_sphere(rest[index])
+        centre, radius = (value.numpy() for value in fit_sphere(torch.as_tensor(rest[index[main]])))
+        bulge = ~main & (np.linalg.norm(rest[index] - centre, axis=1) > radius)
+        spheres = [index[main], index[bulge]] if bulge.sum() >= _LEAST_CORNEA else [index[main]]
+        self._spheres = [torch.as_tensor(sphere, device=device) for sphere in spheres]
+        self.points = np.flatnonzero(regions.exterior(data) & _near(rest, shell, _LIDS))
+        self.lids = torch.as_tensor(self.points, device=device)
 
-    def refresh(self, vertices: Float[np.ndarray, "V 3"]) -> None:
-        pass
-
-    def depths(self, vertices: Float[Tensor, "V 3"]) -> Depths:
-        x = vertices.index_select(0, self.points)
-        depths = []
-        for shell in self._shells:
-            centre, radius = fit_sphere(vertices.index_select(0, shell))
-            depths.append(radius - (x - centre).norm(dim=-1))
-        return self._places, torch.stack(depths).amax(0)
-
-
-class _InParts:
-    """Points in any of some convex parts."""
-
-    def __init__(self, points: Tensor, parts: ConvexParts):
-        self.points, self._parts = points, parts
-        self._place = self._part = points[:0]
-
-    def refresh(self, vertices: Float[np.ndarray, "V 3"]) -> None:
-        on_device = torch.as_tensor(vertices, dtype=torch.float32, device=self.points.device)
-        self._place, self._part = self._parts.candidates(on_device, self.points, _HULL_REACH)
-
-    def depths(self, vertices: Float[Tensor, "V 3"]) -> Depths:
-        depth, facet = self._parts.deepest(vertices, self.points[self._place], self._part)
-        inside = depth > 0
-        place = self._place[inside]
-        return place, plane_depths(vertices, self.points[place], facet[inside])
+    def depths(self, vertices: Float[Tensor, "V 3"]) -> Float[Tensor, "P"]:
+        """How deep each point lies in the eyeball as its vertices are now; negative outside. Differentiable."""
+        lids = vertices.index_select(0, self.lids)
+        found = []
+        for sphere in self._spheres:
+            centre, radius = fit_sphere(vertices.index_select(0, sphere))
+            found.append(radius - (lids - centre).norm(dim=-1))
+        return torch.stack(found).amax(0)
 
 
-class _Behind:
-    """Points of one surface behind the triangle of another that they face."""
+def _surfaces(data: GNMData, rest: Float[np.ndarray, "V 3"]) -> list[tuple[str, Solids]]:
+    """Vertices and the parts that they can get into, each with the name of its pair."""
+    skin, ears = regions.exterior(data), regions.ears(data)
+    mesh = data.triangles.astype(np.int64)
+    upper, lower = regions.lips(data)
+    inner_upper, inner_lower = _linings(data, rest)
+    body = _tongue_body(data.quads[regions.tongue(data)[data.quads].all(1)].astype(np.int64), rest)
+    in_body = np.isin(np.arange(len(rest)), body)
+    head = skin & ~ears & _near(rest, ears, _BEHIND_EARS)
+    teeth, tongue = _teeth(data), [triangles_of(body)]
 
-    def __init__(self, facing: Facing, device: torch.device):
-        self._facing = facing
-        self.points = torch.as_tensor(facing.points, device=device)
-        self._triangles = torch.as_tensor(facing.triangles, device=device)
-        self._place = self._triangle = self.points[:0]
+    def into(points: np.ndarray, parts: list[np.ndarray]) -> Solids:
+        return Solids(np.flatnonzero(points), parts, inside=_INSIDE, outside=_OUTSIDE)
 
-    def refresh(self, vertices: Float[np.ndarray, "V 3"]) -> None:
-        place, triangle = self._facing.find(vertices)
-        self._place, self._triangle = (torch.as_tensor(index).to(self.points) for index in (place, triangle))
+    def within_skin(points: np.ndarray, part: np.ndarray) -> Solids:
+        start = np.flatnonzero(points)
+        ways = Ways(start, mesh, rest, _WAYS)
+        return Solids(start, [mesh[part[mesh].all(1)]], inside=_FLESH, outside=_OUTSIDE, ways=ways)
 
-    def depths(self, vertices: Float[Tensor, "V 3"]) -> Depths:
-        triangles = self._triangles[self._triangle]
-        return self._place, plane_depths(vertices, self.points[self._place], triangles)
-
-
-class _Parts:
-    """The parts of a model that can run into one another, and their contacts by pair."""
-
-    def __init__(self, data: GNMData, rest: Float[np.ndarray, "V 3"], device: torch.device):
-        skin, ears, body = (
-            regions.exterior(data),
-            regions.ears(data),
-            _tongue_body(data.quads, rest, regions.tongue(data)),
-        )
-        mesh = data.triangles[skin[data.triangles].all(1)].astype(np.int64)
-        upper, lower = regions.lips(data)
-        teeth = ConvexParts(_teeth(data), device)
-        tongue = ConvexParts(_slices(body, rest), device)
-        self.hulls = (teeth, tongue)
-
-        def within(points: np.ndarray, parts: ConvexParts) -> _Contact:
-            return _InParts(torch.as_tensor(np.flatnonzero(points), device=device), parts)
-
-        def facing(points: np.ndarray, others: np.ndarray) -> _Contact:
-            near = [_near(rest, part, _NEIGHBOURS) for part in (points, others)]
-            points, others = points & near[1], others & near[0]
-            other = mesh[others[mesh].all(1)]
-            return _Behind(Facing(np.flatnonzero(points), other, mesh, rest, reach=_FACING_REACH, apart=_APART), device)
-
-        in_body = np.isin(np.arange(len(rest)), body)
-        self.contacts: dict[str, list[_Contact]] = {
-            "lids-eyeballs": [_eyeball(shell, skin, rest, device) for shell in regions.eyeball_shells(data)],
-            "lips-teeth": [within(upper | lower, teeth)],
-            "upper-lower lip": [facing(upper, lower), facing(lower, upper)],
-            "tongue-teeth": [within(in_body, teeth), within(regions.teeth(data), tongue)],
-            "tongue-lips": [within(upper | lower, tongue)],
-            "tongue-palate": [within(regions.palate(data), tongue)],
-            "ears-head": [facing(ears, skin & ~ears), facing(skin & ~ears, ears)],
-        }
+    return [
+        ("lips-teeth", into(upper | lower, teeth)),
+        ("upper-lower lip", within_skin(upper, lower | inner_lower)),
+        ("upper-lower lip", within_skin(lower, upper | inner_upper)),
+        ("tongue-teeth", into(in_body, teeth)),
+        ("tongue-teeth", into(regions.teeth(data), tongue)),
+        ("tongue-lips", into(upper | lower, tongue)),
+        ("tongue-palate", into(regions.palate(data), tongue)),
+        ("ears-head", within_skin(ears, head)),
+        ("ears-head", within_skin(head, ears)),
+    ]
 
 
-def _eyeball(
-    shell: Bool[np.ndarray, "V"], skin: Bool[np.ndarray, "V"], rest: Float[np.ndarray, "V 3"], device: torch.device
-) -> _Contact:
-    """The skin near one eyeball, against it."""
-    index = np.flatnonzero(shell)
-    on_sclera = on_main_sphere(rest[index])
-    sclera, cornea = index[on_sclera], index[~on_sclera]
-    # What lies inside the main sphere is no bulge.
-    centre, radius = (value.numpy() for value in fit_sphere(torch.as_tensor(rest[sclera])))
-    cornea = cornea[np.linalg.norm(rest[cornea] - centre, axis=1) > radius]
-    if len(cornea) < _LEAST_CORNEA:
-        cornea = cornea[:0]
-    points = np.flatnonzero(skin & _near(rest, shell, _LID_REACH))
-    return _InEyeball(*(torch.as_tensor(part, device=device) for part in (points, sclera, cornea)))
+def _linings(data: GNMData, rest: Float[np.ndarray, "V 3"]) -> tuple[Bool[np.ndarray, "V"], Bool[np.ndarray, "V"]]:
+    """What the mouth's lining adds to the upper and the lower lip, so that neither ends where they touch.
+
+    Lips overlap at rest, so what belongs to which is told by the way along the surface.
+    """
+    lining = regions.mouth_lining(data)
+    ends = edges(data.triangles.astype(np.int64)).vertices
+    length = np.linalg.norm(rest[ends[:, 0]] - rest[ends[:, 1]], axis=1)
+    graph = coo_matrix((length, ends.T), (len(rest), len(rest))).tocsr()
+    to_upper, to_lower = (
+        dijkstra(graph, directed=False, indices=np.flatnonzero(lip), min_only=True, limit=_LINING)
+        if lip.any()
+        else np.full(len(rest), np.inf)
+        for lip in regions.lips(data)
+    )
+    return lining & (to_upper < to_lower), lining & (to_lower < to_upper)
 
 
 def _teeth(data: GNMData) -> list[Int[np.ndarray, "_ 3"]]:
-    """The triangles of each tooth: teeth share no vertices, but for those of the gums."""
+    """The triangles of each tooth; what joins teeth is gum."""
     own = data.triangles[regions.teeth(data)[data.triangles].all(1)].astype(np.int64)
     part = connected_parts(own)
     return [own[part == number] for number in np.unique(part)]
 
 
-def _tongue_body(
-    quads: Int[np.ndarray, "Q 4"], rest: Float[np.ndarray, "V 3"], tongue: Bool[np.ndarray, "V"]
-) -> Int[np.ndarray, "B 4"]:
-    """The tongue's quads without the floor of the mouth, where a model joins one to the tongue.
+def _tongue_body(tongue: Int[np.ndarray, "Q 4"], rest: Float[np.ndarray, "V 3"]) -> Int[np.ndarray, "B 4"]:
+    """The tongue's quads without the floor of the mouth, which some models join to it.
 
-    The floor looks up at the tongue's underside, which looks down. A hull around both would hold the lower teeth.
+    The floor looks up at the tongue's underside. It stays behind when the tongue comes out, and no tooth is in it.
     """
-    own = quads[tongue[quads].all(1)].astype(np.int64)
-    a, b, c, d = (rest[own[:, k]] for k in range(4))
-    normal = np.cross(c - a, d - b)
+    corners = rest[tongue]
+    normal = np.cross(corners[:, 2] - corners[:, 0], corners[:, 3] - corners[:, 1])
     up = normal[:, 1] / np.maximum(np.linalg.norm(normal, axis=1), 1e-30)
-    centre = (a + b + c + d) / 4
-    underside, upwards = np.flatnonzero(up < 0), np.flatnonzero(up > _UPWARDS)
-    flat = [0, 2]
-    above = cKDTree(centre[underside][:, flat]).query_ball_point(centre[upwards][:, flat], _UNDER)
-    floor = [
-        face
-        for face, over in zip(upwards, above, strict=True)
-        if (centre[underside[over], 1] > centre[face, 1] + _BELOW).any()
-    ]
-    return np.delete(own, floor, axis=0)
-
-
-def _slices(body: Int[np.ndarray, "B 4"], rest: Float[np.ndarray, "V 3"]) -> list[Int[np.ndarray, "_ 3"]]:
-    """The tongue's body cut from back to front, into triangles."""
-    along = rest[body][:, :, 2].mean(1)
-    low, high = along.min(), along.max()
-    number = np.clip(_SLICES * (along - low) / (high - low), 0, _SLICES - 1).astype(int)
-    return [triangles_of(body[number == k]) for k in np.unique(number)]
+    centre = corners.mean(1)
+    under, floor = centre[up < 0], np.zeros(len(tongue), bool)
+    above = cKDTree(under[:, [0, 2]]).query_ball_point(centre[:, [0, 2]], _UNDER)
+    for quad in np.flatnonzero(up > _UPWARDS):
+        floor[quad] = (under[above[quad], 1] > centre[quad, 1] + _BELOW).any()
+    return tongue[~floor]
 
 
 def _near(rest: Float[np.ndarray, "V 3"], members: Bool[np.ndarray, "V"], distance: float) -> Bool[np.ndarray, "V"]:
-    """What is within a distance of some vertices."""
+    """What lies within a distance of some vertices."""
     if not members.any():
         return np.zeros(len(rest), bool)
     return np.isfinite(cKDTree(rest[members]).query(rest, distance_upper_bound=distance)[0])
 
 
-def _spread(points: Float[np.ndarray, "P 3"]) -> float:
+def _spread(points: Float[Tensor, "P 3"]) -> float:
     """Root mean square distance from the centre."""
-    return float(np.sqrt(np.square(points - points.mean(0)).sum(1).mean()))
+    return float((points - points.mean(0)).square().sum(-1).mean().sqrt())
