@@ -120,3 +120,8 @@ def tongue(data: GNMData) -> Bool[np.ndarray, "V"]:
 def palate(data: GNMData) -> Bool[np.ndarray, "V"]:
     """The upper gums and the roof of the mouth, as far as the model has one."""
     return (group(data, "gums") > _INSIDE) & (group(data, "upper_teeth_and_gums") > _INSIDE)
+
+
+def mouth_lining(data: GNMData) -> Bool[np.ndarray, "V"]:
+    """The inside of lips and cheeks; skin, but not exterior. Empty in a model whose mouth stays shut."""
+    return group(data, "mouth_sock") > _INSIDE
