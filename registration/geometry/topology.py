@@ -11,6 +11,8 @@ from torch import Tensor
 
 from registration.errors import InputError
 
+LEAST_AREA = 1e-12  # m^2, twice a triangle's; below it a triangle has no normal
+
 
 @dataclass(frozen=True, kw_only=True)
 class Edges:
@@ -76,9 +78,22 @@ def connected_parts(triangles: Int[np.ndarray, "F 3"]) -> Int[np.ndarray, "F"]:
 
 
 def vertex_normals(vertices: Float[Tensor, "V 3"], triangles: Int[Tensor, "F 3"]) -> Float[Tensor, "V 3"]:
-    """Area-weighted unit normals; zero where a vertex has no area around it. Differentiable."""
+    """Unit normals, each the mean of the faces' around by their angles there; zero without area around.
+
+    Weighted by angles and not by areas, a vertex' normal does not depend on how quads are cut into triangles (Thuermer
+    and Wuethrich 1998). Differentiable.
+    """
     # Not vertices[...]: the adjoint of that sums in parallel, differently from run to run.
-    a, b, c = (vertices.index_select(0, triangles[:, k]) for k in range(3))
-    normals = torch.linalg.cross(b - a, c - a)
-    total = torch.zeros_like(vertices).index_add(0, triangles.T.reshape(-1), normals.repeat(3, 1))
+    corners = [vertices.index_select(0, triangles[:, k]) for k in range(3)]
+    a, b, c = corners
+    area = torch.linalg.cross(b - a, c - a)
+    squared = area.square().sum(-1)
+    solid = squared > LEAST_AREA**2
+    size = torch.where(solid, squared, 1.0).sqrt()
+    unit = area / size[:, None] * solid[:, None]
+    weighted = []
+    for k in range(3):
+        p, q, r = corners[k], corners[(k + 1) % 3], corners[(k + 2) % 3]
+        weighted.append(unit * torch.atan2(size, ((q - p) * (r - p)).sum(-1))[:, None])
+    total = torch.zeros_like(vertices).index_add(0, triangles.T.reshape(-1), torch.cat(weighted))
     return total / total.norm(dim=-1, keepdim=True).clamp_min(1e-20)

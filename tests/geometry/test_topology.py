@@ -83,14 +83,19 @@ def test_normals_of_a_sphere_point_outwards():
     torch.testing.assert_close(inwards, -normals)
 
 
-def test_normals_are_weighed_by_area():
-    """Two walls of one edge: 1 x 1 facing +z and 1 x 3 facing +y."""
-    vertices = torch.tensor([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 3.0]])
+def test_normals_are_weighed_by_angle():
+    """Two walls of one edge: 1 x 1 facing +z, a right angle at vertex 0, and a steep one facing +y."""
+    vertices = torch.tensor([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 0, 3.0]])
     normals = vertex_normals(vertices, torch.tensor([[0, 1, 2], [1, 0, 3]]))
-    expected = torch.tensor([0.0, 3.0, 1.0])
-    # The second wall's normal is (b - a) x (c - a) = (-1, 0, 0) x (-1, 0, 3) = (0, 3, 0).
+    expected = torch.tensor([0.0, np.arctan(3.0), np.pi / 2], dtype=torch.float32)
     torch.testing.assert_close(normals[0], expected / expected.norm())
     torch.testing.assert_close(normals[2], torch.tensor([0.0, 0, 1]))
+
+
+def test_normals_do_not_depend_on_how_quads_are_cut():
+    box = trimesh.creation.box()
+    normals = vertex_normals(torch.tensor(box.vertices), torch.tensor(np.array(box.faces)))
+    torch.testing.assert_close(normals, torch.nn.functional.normalize(torch.tensor(box.vertices), dim=1))
 
 
 def test_a_vertex_without_area_has_no_normal_and_finite_gradients():
