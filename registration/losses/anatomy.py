@@ -24,12 +24,11 @@ from registration.model.gnm_npz import GNMData
 
 # Lengths in mm of the template's size.
 _MARGIN = 0.05  # so much deeper than at rest costs nothing
-_OUTSIDE, _INSIDE = 3.0, 8.0  # as far in front of and behind a part's surface vertices are watched
+_OUTSIDE, _INSIDE = 3.0, 8.0  # vertices so far in front of and behind a surface are watched
+# Behind the skin, for its contacts with itself: deeper lies the far side of a vertex' own flesh. They are checked to be
+# further along the skin than straight, for which ways up to the next length are known.
+_FLESH, _WAYS = 4.0, 12.0
 _BEHIND_EARS = 25.0  # the part of the head that ears can get to
-_FLESH = (
-    4.0  # the same, behind skin, for contacts of the skin with itself: deeper is the far side of a vertex' own flesh
-)
-_WAYS = 12.0  # such contacts are checked to be further along the skin than straight
 _LINING = 6.0  # of the mouth, as far as it belongs to a lip
 _LIDS = 6.0  # from the eyeball
 _LEAST_CORNEA = 8  # vertices; fewer are no second sphere
@@ -58,8 +57,8 @@ class SelfIntersection:
         self._surfaces = _surfaces(data, rest)
         self.pairs = ("lids-eyeballs", *dict.fromkeys(name for name, _ in self._surfaces))
         # Every point of every contact has a slot, which says how deep it may lie.
-        sizes = [len(part.points) for part in (*self._eyeballs, *(surface for _, surface in self._surfaces))]
-        self._slots = np.cumsum([0, *sizes])
+        points = [eyeball.points for eyeball in self._eyeballs] + [surface.points for _, surface in self._surfaces]
+        self._slots = np.cumsum([0, *(len(index) for index in points)])
         self._allowed = torch.zeros(self._slots[-1], device=device)
         self.refresh(template)
         slot, _, _, depth = self._depths(template)
@@ -72,12 +71,12 @@ class SelfIntersection:
         self._origin = vertices[self._skin].mean(0)
         local = self._local(vertices).cpu().numpy()
         found = [surface.watched(local) for _, surface in self._surfaces]
-        watched = Watched.joined(found).to(self._device)
+        self._watched = Watched.joined(found).to(self._device)
         of = np.repeat(np.arange(len(found)), [len(rows.place) for rows in found])
-        first, pair = self._slots[len(self._eyeballs) + of], np.array([self.pairs.index(n) for n, _ in self._surfaces])
-        self._watched = watched
-        self._slot = watched.place + torch.as_tensor(first, device=self._device)
-        self._pair = torch.as_tensor(pair[of], device=self._device)
+        first = self._slots[len(self._eyeballs) + of]
+        pair = np.array([self.pairs.index(name) for name, _ in self._surfaces])[of]
+        self._slot = self._watched.place + torch.as_tensor(first, device=self._device)
+        self._pair = torch.as_tensor(pair, device=self._device)
 
     def __call__(self, vertices: Float[Tensor, "V 3"]) -> dict[str, Tensor]:
         """The penalty of each pair of parts: squares of excess depths summed over vertices; scalars, mm^2.
