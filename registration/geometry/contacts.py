@@ -141,7 +141,7 @@ class Solids:
         There a vertex has the far side of its own flesh behind it, and only what is far along the surface is a contact.
         """
         self.points = points
-        self._parts = [_Patch(part) for part in parts]
+        self._parts = [_Patch(part) for part in parts if len(part)]
         self._inside, self._outside, self._ways = inside, outside, ways
 
     def watched(self, vertices: Float[np.ndarray, "V 3"]) -> Watched:
@@ -174,6 +174,9 @@ class Ways:
         limit: float,
     ):
         ends = edges(mesh).vertices
+        if not len(starts):
+            self._column, self._ways = np.zeros(len(rest), int), np.empty((0, 1), np.float32)
+            return
         # Such a way stays close to where it starts: the rest of the mesh need not be looked at.
         close = np.isfinite(cKDTree(rest[starts]).query(rest, distance_upper_bound=limit)[0])
         self._column = np.where(close, close.cumsum() - 1, close.sum())

@@ -162,8 +162,8 @@ def _surfaces(data: GNMData, rest: Float[np.ndarray, "V 3"]) -> list[tuple[str, 
 
     return [
         ("lips-teeth", into(upper | lower, teeth)),
-        ("upper-lower lip", within_skin(upper, lower | inner_lower)),
-        ("upper-lower lip", within_skin(lower, upper | inner_upper)),
+        ("upper-lower lip", within_skin(upper & ~lower, lower | inner_lower)),
+        ("upper-lower lip", within_skin(lower & ~upper, upper | inner_upper)),
         ("tongue-teeth", into(in_body, teeth)),
         ("tongue-teeth", into(regions.teeth(data), tongue)),
         ("tongue-lips", into(upper | lower, tongue)),
@@ -188,13 +188,14 @@ def _linings(data: GNMData, rest: Float[np.ndarray, "V 3"]) -> tuple[Bool[np.nda
         else np.full(len(rest), np.inf)
         for lip in regions.lips(data)
     )
-    return lining & (to_upper < to_lower), lining & (to_lower < to_upper)
+    lining &= np.isfinite(np.minimum(to_upper, to_lower))
+    return lining & (to_upper <= to_lower), lining & (to_lower <= to_upper)
 
 
 def _teeth(data: GNMData) -> list[Int[np.ndarray, "_ 3"]]:
     """The triangles of each tooth; what joins teeth is gum."""
     own = data.triangles[regions.teeth(data)[data.triangles].all(1)].astype(np.int64)
-    part = connected_parts(own)
+    part = connected_parts(own) if len(own) else np.empty(0, int)
     return [own[part == number] for number in np.unique(part)]
 
 

@@ -97,11 +97,11 @@ def eyeball_shells(data: GNMData) -> tuple[Bool[np.ndarray, "V"], Bool[np.ndarra
 
 
 def lips(data: GNMData) -> tuple[Bool[np.ndarray, "V"], Bool[np.ndarray, "V"]]:
-    """Upper and lower lip with the skin around them; what belongs to both, at the corners, is in neither."""
+    """Upper and lower lip with the skin around them; they may share the corners of the mouth."""
     upper, lower = (
         (group(data, name) > _INSIDE) | (group(data, f"{name}_region") > _INSIDE) for name in ("upper_lip", "lower_lip")
     )
-    return upper & ~lower, lower & ~upper
+    return upper, lower
 
 
 def ears(data: GNMData) -> Bool[np.ndarray, "V"]:
