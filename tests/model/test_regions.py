@@ -2,6 +2,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.spatial.distance import cdist
 
 from registration.errors import InputError
 from registration.model import gnm_npz, regions
@@ -109,3 +110,39 @@ def test_full_head(full):
     neck = regions.neck_other(full)
     x, y, z = full.template_vertex_positions.T
     assert neck[(part == 0) & (y < 0.15)].all() and not neck[y > 0.19].any() and 2000 < neck.sum() < 2500
+
+
+def test_lids_inner_lips_and_cheeks_are_weights_on_the_exterior(tiny):
+    for role in (regions.lids, regions.inner_lips, regions.blush):
+        weight = role(tiny)
+        assert weight.dtype == np.float32 and 0 <= weight.min() and weight.max() <= 1
+        assert regions.exterior(tiny)[weight > 0].all()
+    # This head has no lining behind its lips, and lids of four vertices.
+    assert not regions.inner_lips(tiny).any() and np.count_nonzero(regions.lids(tiny)) == 4
+
+
+@pytest.mark.parametrize(
+    ("role", "name"),
+    [(regions.lids, "left_eye"), (regions.inner_lips, "mouth_sock"), (regions.blush, "right_zygomatic_region")],
+)
+def test_where_texture_is_not_trusted_needs_its_groups(tiny, role, name):
+    with pytest.raises(InputError, match=f"no vertex group '{name}'"):
+        role(without(tiny, name))
+
+
+@needs_shared
+def test_lids_inner_lips_and_cheeks_of_the_full_head(full):
+    points, lids, lips = full.template_vertex_positions, regions.lids(full), regions.inner_lips(full)
+    balls = points[regions.group(full, "eyes") > 0]
+    exterior = regions.exterior(full)
+    face = np.flatnonzero(exterior & (regions.group(full, "hockey_mask") > 0))
+    near = cdist(points[face], balls).min(1)
+    np.testing.assert_allclose(lids[face], np.interp(near, [3e-3, 9e-3], [1, 0]), atol=1e-5)
+    assert not lids[~exterior].any() and 1100 < np.count_nonzero(lids) < 1300
+    vermilion = regions.group(full, "upper_lip") + regions.group(full, "lower_lip")
+    assert (vermilion[lips > 0] > 0).all() and 50 < (lips == 1).sum() < np.count_nonzero(lips) < vermilion.sum()
+    assert points[lips == 1, 2].mean() < points[(vermilion > 0) & (lips < 0.5), 2].mean()  # further in
+    blush = regions.blush(full)
+    mirrored = blush[full.mirror_indices]
+    np.testing.assert_array_equal(blush, mirrored)
+    assert blush.sum() == 816 and not blush[regions.group(full, "chin_region") > 0].any()
