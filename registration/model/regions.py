@@ -2,6 +2,7 @@
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
+from scipy.spatial import cKDTree
 
 from registration.errors import InputError
 from registration.model.gnm_npz import GNMData
@@ -125,3 +126,31 @@ def palate(data: GNMData) -> Bool[np.ndarray, "V"]:
 def mouth_lining(data: GNMData) -> Bool[np.ndarray, "V"]:
     """The inside of lips and cheeks; skin, but not exterior. Empty in a model whose mouth stays shut."""
     return group(data, "mouth_sock") > _INSIDE
+
+
+def lids(data: GNMData) -> Float[np.ndarray, "V"]:
+    """The skin that slides and folds over the eyeballs: 1 within 3 mm of them, 0 beyond 9 mm."""
+    balls = np.maximum(group(data, "left_eye"), group(data, "right_eye")) > _INSIDE
+    return exterior(data) * _nearness(data, balls, 3e-3, 9e-3)
+
+
+def inner_lips(data: GNMData) -> Float[np.ndarray, "V"]:
+    """The part of the lips that a closed mouth hides: 1 within 2 mm of the mouth's lining, 0 beyond 5 mm."""
+    lips = np.clip(group(data, "upper_lip") + group(data, "lower_lip"), 0, 1)
+    return lips * _nearness(data, group(data, "mouth_sock") > _INSIDE, 2e-3, 5e-3)
+
+
+def blush(data: GNMData) -> Float[np.ndarray, "V"]:
+    """Where skin changes its colour with expression and effort: the cheeks, up to the cheekbones and the eyes."""
+    names = ("cheek", "zygomatic", "infraorbital")
+    groups = [group(data, f"{side}_{name}_region") for side in ("left", "right") for name in names]
+    return np.clip(np.max(groups, axis=0), 0, 1)
+
+
+def _nearness(data: GNMData, members: Bool[np.ndarray, "V"], near: float, far: float) -> Float[np.ndarray, "V"]:
+    """1 up to `near` (metres, in the template) from the nearest member, falling to 0 at `far`."""
+    points = data.template_vertex_positions
+    if not members.any():
+        return np.zeros(len(points), np.float32)
+    distance = cKDTree(points[members]).query(points)[0]
+    return np.clip((far - distance) / (far - near), 0, 1).astype(np.float32)

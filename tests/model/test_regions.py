@@ -145,4 +145,4 @@ def test_lids_inner_lips_and_cheeks_of_the_full_head(full):
     blush = regions.blush(full)
     mirrored = blush[full.mirror_indices]
     np.testing.assert_array_equal(blush, mirrored)
-    assert blush.sum() == 816 and not blush[regions.group(full, "chin_region") > 0].any()
+    assert blush.sum() == 816 and not blush[regions.group(full, "ears") > 0].any()
