@@ -4,7 +4,6 @@ That measure shares nothing with the penalty: winding numbers by solid angles te
 point how deep.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -91,6 +90,10 @@ def recover(data: GNMData, before: Float[Tensor, "V 3"], *, steps: int, rate: fl
     return Recovered(before=before, after=vertices().detach(), history=history["crossing"])
 
 
+def cheeks(data: GNMData) -> Bool[np.ndarray, "V"]:
+    return np.any([regions.group(data, f"{side}_cheek_region") > 0.5 for side in ("left", "right")], axis=0)
+
+
 def lip_depths_mm(data: GNMData, vertices: Float[Tensor, "V 3"]) -> Float[np.ndarray, "V"]:
     """How deep each vertex of a lip lies inside the other lip; 0 for what is in none.
 
@@ -107,7 +110,7 @@ def lip_depths_mm(data: GNMData, vertices: Float[Tensor, "V 3"]) -> Float[np.nda
         distance = np.full(len(points), np.inf)
         lip = lip & ~np.isin(np.arange(len(points)), skin[other[skin].any(1)])
         distance[lip] = closest_points(points[lip], points, skin[patch[skin].all(1)])[0] * MM_PER_M
-        near = np.flatnonzero(distance < 3.0)
+        near = np.flatnonzero(distance < 2.0)
         inside = winding(points[near] + 2e-5 * normals[near], points[skin]) > 0.5
         depth[near[inside]] = distance[near[inside]]
     return depth
@@ -126,16 +129,28 @@ def eyeball_depths_mm(data: GNMData, vertices: Float[Tensor, "V 3"]) -> Float[np
 def tooth_depths_mm(
     points: Float[np.ndarray, "P 3"], vertices: Float[np.ndarray, "V 3"], teeth: list[Int[np.ndarray, "_ 3"]]
 ) -> Float[np.ndarray, "P"]:
-    """How deep points lie in any of some teeth; 0 outside."""
+    """How deep points lie in any of some teeth; 0 outside. Roots may be open: for this they are closed by a cone."""
     depth = np.zeros(len(points))
     for tooth in teeth:
         corners = vertices[tooth]
         boxed = np.flatnonzero(((points > corners.min((0, 1))) & (points < corners.max((0, 1)))).all(1))
         if len(boxed):
-            inside = boxed[winding(points[boxed], corners) > 0.5]
-            found = closest_points(points[inside], vertices, tooth)[0] * MM_PER_M if len(inside) else 0.0
-            depth[inside] = np.maximum(depth[inside], found)
+            inside = winding(points[boxed], np.concatenate([corners, _cone(vertices, tooth)])) > 0.5
+            found = closest_points(points[boxed], vertices, tooth)[0] * MM_PER_M
+            depth[boxed] = np.maximum(depth[boxed], np.where(inside, found, 0.0))
     return depth
+
+
+def _cone(vertices: Float[np.ndarray, "V 3"], part: Int[np.ndarray, "_ 3"]) -> Float[np.ndarray, "_ 3 3"]:
+    """Triangles that close the opening of a part, bulging a little."""
+    ends = {(a, b) for a, b in part[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2).tolist()}
+    rim = vertices[np.array([(b, a) for a, b in ends if (b, a) not in ends], int).reshape(-1, 2)]
+    if not len(rim):
+        return np.empty((0, 3, 3))
+    centre = rim.mean((0, 1))
+    out = centre - vertices[part].mean((0, 1))
+    tip = centre + 0.5 * np.linalg.norm(rim[:, 0] - centre, axis=1).mean() * out / np.linalg.norm(out)
+    return np.stack([rim[:, 0], rim[:, 1], np.broadcast_to(tip, (len(rim), 3))], 1)
 
 
 def winding(points: Float[np.ndarray, "P 3"], corners: Float[np.ndarray, "F 3 3"]) -> Float[np.ndarray, "P"]:
@@ -149,14 +164,6 @@ def winding(points: Float[np.ndarray, "P 3"], corners: Float[np.ndarray, "F 3 3"
         below = la * lb * lc + sum(d * w for d, w in zip(dot, weights, strict=True))
         total[k] = np.arctan2(np.einsum("fc,fc->f", a, np.cross(b, c)), below).sum()
     return total / (2 * np.pi)
-
-
-def slope(
-    value: Callable[[Tensor], Tensor], at: Float[Tensor, "V 3"], along: Float[Tensor, "V 3"], step: float
-) -> float:
-    """Central difference of a scalar along a direction."""
-    with torch.no_grad():
-        return float(value(at + step * along) - value(at - step * along)) / (2 * step)
 
 
 def _skin(data: GNMData) -> Int[np.ndarray, "F 3"]:
