@@ -79,6 +79,17 @@ def components(data: GNMData) -> Int[np.ndarray, "V"]:
     return weights.argmax(0)
 
 
+def solids(data: GNMData) -> dict[str, Int[np.ndarray, "_ 3"]]:
+    """The triangles of what can be run into: skin, left eye, right eye, teeth with their gums, tongue."""
+    upper, lower = "upper_teeth_and_gums", "lower_teeth_and_gums"
+    roles = {"skin": ("skin",), "left eye": ("left_eye",), "right eye": ("right_eye",), "teeth": (upper, lower)}
+    found = {}
+    for role, names in (roles | {"tongue": ("tongue",)}).items():
+        members = np.max([group(data, name) for name in names], axis=0) > _INSIDE
+        found[role] = data.triangles[members[data.triangles].all(1)].astype(np.int64)
+    return found
+
+
 def crossing_parts(data: GNMData) -> Int[np.ndarray, "F"]:
     """For each triangle the number of its part: parts may run through one another, faces of one part do not.
 
