@@ -100,7 +100,7 @@ class _SizeClass:
             hopeful = away - self.radii[index] < best.distance[part, None]
             row, column = np.nonzero(hopeful)
             faces = self.members[index[row, column]]
-            distance, barycentric = _point_triangle(points[part[row]], corners[faces])
+            distance, barycentric = on_triangles(points[part[row]], corners[faces])
             best.offer(part[row], faces, distance, barycentric)
         return reached
 
@@ -112,7 +112,7 @@ def _by_size(radii: np.ndarray) -> list[np.ndarray]:
     return [np.flatnonzero(octave == k) for k in np.unique(octave)]
 
 
-def _point_triangle(
+def on_triangles(
     points: Float[np.ndarray, "M 3"], corners: Float[np.ndarray, "M 3 3"]
 ) -> tuple[Float[np.ndarray, "M"], Float[np.ndarray, "M 3"]]:
     """Distance and barycentrics of the closest point of one triangle per point.

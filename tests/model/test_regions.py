@@ -146,3 +146,15 @@ def test_lids_inner_lips_and_cheeks_of_the_full_head(full):
     mirrored = blush[full.mirror_indices]
     np.testing.assert_array_equal(blush, mirrored)
     assert blush.sum() == 816 and not blush[regions.group(full, "ears") > 0].any()
+
+
+def test_solids_share_out_the_triangles(tiny):
+    solids = regions.solids(tiny)
+    assert list(solids) == ["skin", "left eye", "right eye", "teeth", "tongue"]
+    part = dict(zip(tiny.mesh_component_names.tolist(), range(6), strict=True))
+    own = regions.components(tiny)
+    for role, names in {"skin": ["skin"], "teeth": ["upper_teeth_and_gums", "lower_teeth_and_gums"]}.items():
+        assert set(own[solids[role]].ravel()) == {part[name] for name in names}
+    assert sorted(map(tuple, np.concatenate(list(solids.values())))) == sorted(map(tuple, tiny.triangles))
+    with pytest.raises(InputError, match="no vertex group 'lower_teeth_and_gums'"):
+        regions.solids(without(tiny, "lower_teeth_and_gums"))
