@@ -16,7 +16,6 @@ from torch import Tensor
 
 from registration.frames import MM_PER_M
 from registration.geometry.contacts import Solids, Watched, Ways, depths
-from registration.geometry.quads import triangles_of
 from registration.geometry.spheres import fit_sphere, on_main_sphere
 from registration.geometry.topology import connected_parts, edges
 from registration.model import regions
@@ -32,8 +31,6 @@ _BEHIND_EARS = 25.0  # the part of the head that ears can get to
 _LINING = 6.0  # of the mouth, as far as it belongs to a lip
 _LIDS = 6.0  # from the eyeball
 _LEAST_CORNEA = 8  # vertices; fewer are no second sphere
-# The floor of the mouth: its normals' upward share, and where the tongue's underside lies over it.
-_UPWARDS, _UNDER, _BELOW = 0.3, 3.0, 1.0
 
 
 class SelfIntersection:
@@ -147,10 +144,9 @@ def _surfaces(data: GNMData, rest: Float[np.ndarray, "V 3"]) -> list[tuple[str, 
     mesh = data.triangles.astype(np.int64)
     upper, lower = regions.lips(data)
     inner_upper, inner_lower = _linings(data, rest)
-    body = _tongue_body(data.quads[regions.tongue(data)[data.quads].all(1)].astype(np.int64), rest)
-    in_body = np.isin(np.arange(len(rest)), body)
     head = skin & ~ears & _near(rest, ears, _BEHIND_EARS)
-    teeth, tongue = _teeth(data), [triangles_of(body)]
+    in_tongue, teeth = regions.tongue(data), _teeth(data)
+    tongue = [mesh[in_tongue[mesh].all(1)]]
 
     def into(points: np.ndarray, parts: list[np.ndarray]) -> Solids:
         return Solids(np.flatnonzero(points), parts, inside=_INSIDE, outside=_OUTSIDE)
@@ -164,7 +160,7 @@ def _surfaces(data: GNMData, rest: Float[np.ndarray, "V 3"]) -> list[tuple[str, 
         ("lips-teeth", into(upper | lower, teeth)),
         ("upper-lower lip", within_skin(upper & ~lower, lower | inner_lower)),
         ("upper-lower lip", within_skin(lower & ~upper, upper | inner_upper)),
-        ("tongue-teeth", into(in_body, teeth)),
+        ("tongue-teeth", into(in_tongue, teeth)),
         ("tongue-teeth", into(regions.teeth(data), tongue)),
         ("tongue-lips", into(upper | lower, tongue)),
         ("tongue-palate", into(regions.palate(data), tongue)),
@@ -197,22 +193,6 @@ def _teeth(data: GNMData) -> list[Int[np.ndarray, "_ 3"]]:
     own = data.triangles[regions.teeth(data)[data.triangles].all(1)].astype(np.int64)
     part = connected_parts(own) if len(own) else np.empty(0, int)
     return [own[part == number] for number in np.unique(part)]
-
-
-def _tongue_body(tongue: Int[np.ndarray, "Q 4"], rest: Float[np.ndarray, "V 3"]) -> Int[np.ndarray, "B 4"]:
-    """The tongue's quads without the floor of the mouth, which some models join to it.
-
-    The floor looks up at the tongue's underside. It stays behind when the tongue comes out, and no tooth is in it.
-    """
-    corners = rest[tongue]
-    normal = np.cross(corners[:, 2] - corners[:, 0], corners[:, 3] - corners[:, 1])
-    up = normal[:, 1] / np.maximum(np.linalg.norm(normal, axis=1), 1e-30)
-    centre = corners.mean(1)
-    under, floor = centre[up < 0], np.zeros(len(tongue), bool)
-    above = cKDTree(under[:, [0, 2]]).query_ball_point(centre[:, [0, 2]], _UNDER)
-    for quad in np.flatnonzero(up > _UPWARDS):
-        floor[quad] = (under[above[quad], 1] > centre[quad, 1] + _BELOW).any()
-    return tongue[~floor]
 
 
 def _near(rest: Float[np.ndarray, "V 3"], members: Bool[np.ndarray, "V"], distance: float) -> Bool[np.ndarray, "V"]:

@@ -74,6 +74,21 @@ def test_depth_in_a_blob_is_exact_in_hollows_too():
     np.testing.assert_allclose(scene.depth(), np.where(inside, distance, -distance), atol=1e-9)
 
 
+def test_over_a_sharp_tip_the_side_that_looks_at_a_point_decides():
+    base = [[2, 2, 0], [-2, 2, 0], [-2, -2, 0], [2, -2, 0]]
+    vertices = torch.tensor([[1.0, 0.0, 10.6], [0.0, 0.0, 10.0], *base], dtype=torch.float64)
+    sides = torch.tensor([[1, 2, 3], [1, 3, 4], [1, 4, 5], [1, 5, 2]])
+    for order in ((0, 1, 2, 3), (1, 2, 3, 0), (2, 3, 0, 1), (3, 0, 1, 2)):
+        triangles = sides[list(order)][None]
+        zero = torch.zeros(1, dtype=torch.int64)
+        watched = Watched(
+            place=zero, points=zero, triangles=triangles, rim=torch.zeros(triangles.shape, dtype=torch.bool)
+        )
+        found = depths(vertices, watched)
+        assert found.depth.item() == pytest.approx(-np.hypot(1, 0.6))
+        np.testing.assert_allclose(found.direction[0], np.array([1, 0, 0.6]) / np.hypot(1, 0.6))
+
+
 def test_gradient_reaches_both_sides():
     points = around(np.linspace(7, 10, 60), 1)
     scene = Scene(points, blob())

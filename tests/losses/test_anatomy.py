@@ -29,7 +29,6 @@ PAIRS = (
     "ears-head",
 )
 MARGIN_MM = 0.05
-FLOOR_OF_THE_MOUTH = 0.2225  # height of the official template below which the tongue is joined to the gums, m
 
 
 @pytest.fixture(scope="module")
@@ -151,11 +150,32 @@ def test_excess_is_in_millimetres_of_the_head_at_hand(full, penalty):
         assert float(penalty(elsewhere)["tongue-teeth"]) == pytest.approx(scale**2 * float(cost), rel=2e-3)
 
 
+def outside(data: GNMData, vertices: torch.Tensor, excess: torch.Tensor) -> np.ndarray:
+    """Whether each vertex that has an excess lies outside the skin all the same."""
+    skin = data.triangles[(regions.components(data) == 0)[data.triangles].all(1)].astype(np.int64)
+    deep = excess.nonzero()[:, 0]
+    points = vertices[deep] + 5e-5 * vertex_normals(vertices, torch.as_tensor(skin))[deep]
+    return winding(points.double().numpy(), vertices.double().numpy()[skin]) < 0.5
+
+
+@needs_shared
+def test_skin_at_the_corners_of_the_mouth_is_not_in_the_other_lip(full, penalty):
+    """A face that purses its lips: behind the skin beside them lies the lining of the other lip, through the flesh."""
+    vertices, random = template(full).numpy().astype(np.float64), np.random.default_rng(5)
+    for basis, share in ((full.expression_basis[200:350], 0.5), (full.expression_basis[350:382], 0.3)):
+        vertices = vertices + np.einsum("e,evc->vc", random.normal(size=len(basis)) * share, basis)
+    basis = full.vertex_identity_basis
+    head = torch.as_tensor(vertices + np.einsum("e,evc->vc", random.normal(size=len(basis)), basis)).float()
+    penalty.refresh(head)
+    excess = penalty.excess_mm(head)["upper-lower lip"]
+    wrong = excess[excess > 0].numpy()[outside(full, head, excess)]
+    assert np.square(wrong).sum() < 6  # without a look at the ways along the skin: 37; with depths up to 8 mm: 44
+
+
 @needs_shared
 def test_what_official_faces_do_by_themselves(full, penalty):
     """Every lip vertex that is too deep is indeed inside the head; a wide open mouth costs nothing."""
     samples = np.load(SHARED / "data" / "gnm" / "gnm_real_samples.npz")
-    skin = full.triangles[(regions.components(full) == 0)[full.triangles].all(1)].astype(np.int64)
     names = [*samples["identity_names"].tolist(), *samples["expression_names"].tolist()]
     deepest = {}
     for name, delta in zip(names, [*samples["identity_deltas"], *samples["expression_deltas"]], strict=True):
@@ -163,9 +183,7 @@ def test_what_official_faces_do_by_themselves(full, penalty):
         penalty.refresh(vertices)
         found = penalty.excess_mm(vertices)
         deepest[name] = {pair: float(excess.max()) for pair, excess in found.items()}
-        deep = found["upper-lower lip"].nonzero()[:, 0]
-        points = vertices[deep] + 5e-5 * vertex_normals(vertices, torch.as_tensor(skin))[deep]
-        assert (winding(points.double().numpy(), vertices.double().numpy()[skin]) > 0.5).all(), name
+        assert not outside(full, vertices, found["upper-lower lip"]).any(), name
     assert not any(deepest["surprise"].values())
     assert 0.8 < deepest["pucker"]["upper-lower lip"] < 1.4 and 2.5 < deepest["pucker"]["tongue-palate"] < 3.5
     assert max(found["lips-teeth"] + found["ears-head"] for found in deepest.values()) == 0
@@ -175,7 +193,6 @@ def test_what_official_faces_do_by_themselves(full, penalty):
 @pytest.mark.parametrize("direction", [(1.0, 0.0, 0.0), (-0.7, 0.3, 0.7)])
 def test_a_tongue_pushed_into_the_teeth(full, penalty, direction):
     tongue = regions.tongue(full)
-    asked = tongue & (full.template_vertex_positions[:, 1] > FLOOR_OF_THE_MOUTH)
     mesh = full.triangles[regions.teeth(full)[full.triangles].all(1)].astype(np.int64)
     _, piece = connected_components(
         coo_matrix((np.ones(2 * len(mesh)), (mesh[:, [0, 1]].ravel(), mesh[:, 1:].ravel())))
@@ -186,9 +203,9 @@ def test_a_tongue_pushed_into_the_teeth(full, penalty, direction):
     for push in (0.0, 1.0, 2.0, 3.0, 4.0, 5.0):
         vertices = moved(full, tongue, tuple(push * axis for axis in direction))
         penalty.refresh(vertices)
-        found = penalty.excess_mm(vertices)["tongue-teeth"].numpy()[asked]
+        found = penalty.excess_mm(vertices)["tongue-teeth"].numpy()[tongue]
         points = vertices.numpy().astype(np.float64)
-        truth = tooth_depths_mm(points[asked], points, teeth)
+        truth = tooth_depths_mm(points[tongue], points, teeth)
         np.testing.assert_allclose(found, np.maximum(truth - MARGIN_MM, 0), atol=0.01)
         deepest.append(truth.max())
     assert deepest[0] == 0 and deepest[-1] > 2 and np.all(np.diff(deepest) >= 0)
