@@ -158,8 +158,8 @@ def _surfaces(data: GNMData, rest: Float[np.ndarray, "V 3"]) -> list[tuple[str, 
 
     return [
         ("lips-teeth", into(upper | lower, teeth)),
-        ("upper-lower lip", within_skin(upper & ~lower, lower | inner_lower)),
-        ("upper-lower lip", within_skin(lower & ~upper, upper | inner_upper)),
+        ("upper-lower lip", within_skin(upper, lower | inner_lower)),
+        ("upper-lower lip", within_skin(lower, upper | inner_upper)),
         ("tongue-teeth", into(in_tongue, teeth)),
         ("tongue-teeth", into(regions.teeth(data), tongue)),
         ("tongue-lips", into(upper | lower, tongue)),

@@ -185,6 +185,7 @@ def test_what_official_faces_do_by_themselves(full, penalty):
         deepest[name] = {pair: float(excess.max()) for pair, excess in found.items()}
         assert not outside(full, vertices, found["upper-lower lip"]).any(), name
     assert not any(deepest["surprise"].values())
+    assert 0.4 < deepest["identity_a"]["upper-lower lip"] < 0.8  # lips that end before their lining give 1.7
     assert 0.8 < deepest["pucker"]["upper-lower lip"] < 1.4 and 2.5 < deepest["pucker"]["tongue-palate"] < 3.5
     assert max(found["lips-teeth"] + found["ears-head"] for found in deepest.values()) == 0
 

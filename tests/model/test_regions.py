@@ -158,3 +158,52 @@ def test_solids_share_out_the_triangles(tiny):
     assert sorted(map(tuple, np.concatenate(list(solids.values())))) == sorted(map(tuple, tiny.triangles))
     with pytest.raises(InputError, match="no vertex group 'lower_teeth_and_gums'"):
         regions.solids(without(tiny, "lower_teeth_and_gums"))
+
+
+PARTS_THAT_TOUCH = (regions.ears, regions.teeth, regions.tongue, regions.palate, regions.mouth_lining)
+
+
+def test_parts_that_touch_are_the_groups(tiny):
+    left, right = regions.eyeball_shells(tiny)
+    shells = regions.group(tiny, "eye_exteriors") > 0
+    assert left.sum() == right.sum() == 57 and not (left & right).any() and ((left | right) == shells).all()
+    assert tiny.template_vertex_positions[left, 0].min() > 0 > tiny.template_vertex_positions[right, 0].max()
+    upper, lower = regions.lips(tiny)
+    for lip, name in ((upper, "upper_lip"), (lower, "lower_lip")):
+        named = regions.group(tiny, name) + regions.group(tiny, f"{name}_region") > 0
+        np.testing.assert_array_equal(lip, named)
+    names = ("ears", "teeth", "tongue", None, "mouth_sock")
+    for role, name in zip(PARTS_THAT_TOUCH, names, strict=True):
+        if name is not None:
+            np.testing.assert_array_equal(role(tiny), regions.group(tiny, name) > 0)
+    gums = regions.group(tiny, "gums") * regions.group(tiny, "upper_teeth_and_gums") > 0
+    np.testing.assert_array_equal(regions.palate(tiny), gums)
+
+
+@pytest.mark.parametrize(
+    ("role", "name"),
+    [
+        (regions.eyeball_shells, "eye_exteriors"),
+        (regions.lips, "lower_lip_region"),
+        (regions.ears, "ears"),
+        (regions.teeth, "teeth"),
+        (regions.tongue, "tongue"),
+        (regions.palate, "upper_teeth_and_gums"),
+        (regions.mouth_lining, "mouth_sock"),
+    ],
+)
+def test_parts_that_touch_need_their_groups(tiny, role, name):
+    with pytest.raises(InputError, match=f"no vertex group '{name}'"):
+        role(without(tiny, name))
+
+
+@needs_shared
+def test_parts_that_touch_of_the_full_head(full):
+    exterior, mirror = regions.exterior(full), full.mirror_indices
+    left, right = regions.eyeball_shells(full)
+    assert left.sum() == right.sum() == 386 and (left[mirror] == right).all()
+    upper, lower = regions.lips(full)
+    assert exterior[upper | lower].all() and (upper & lower).sum() == 24 and (upper[mirror] == upper).all()
+    assert full.template_vertex_positions[upper, 1].mean() > full.template_vertex_positions[lower, 1].mean()
+    assert [role(full).sum() for role in PARTS_THAT_TOUCH] == [1054, 1868, 933, 702, 406]
+    assert not exterior[regions.mouth_lining(full)].any()
