@@ -1,7 +1,8 @@
 """The command line, `gnmreg`: every command reads its arguments, calls the library once and prints the outcome.
 
 The library is imported inside the commands, so that help and typing errors never wait for torch or mitsuba.
-Exit codes: 0 done, 1 a registration that failed, 2 arguments or input that cannot be used.
+Exit codes: 0 done; 1 a registration, or some of a subject's, that failed; 2 arguments or input that cannot be used, or
+a subject of which nothing can; 130 interrupted.
 """
 
 import sys
@@ -16,6 +17,7 @@ from registration.errors import InputError
 
 CaptureFolder = Positional[Annotated[Path, arg(metavar="CAPTURE")]]
 RegistrationFolder = Positional[Annotated[Path, arg(metavar="REG")]]
+SubjectFolder = Positional[Annotated[Path, arg(metavar="SUBJECT")]]
 NeutralFolder = Annotated[Path | None, arg(metavar="REG")]
 
 
@@ -69,6 +71,61 @@ def register(
         )
     print(f"{result.status}: {result.reason}\n{out}")
     return 1 if result.status == "failed" else 0
+
+
+def register_subject(
+    subject: SubjectFolder,
+    /,
+    model: Annotated[Path, arg(metavar="NPZ")],
+    out: Annotated[Path, arg(metavar="DIR")],
+    recipe: Literal["draft", "studio"] = "draft",
+    views: Annotated[int | None, arg(metavar="N")] = None,
+    seed: Annotated[int, arg(metavar="S")] = 0,
+    neutral: Annotated[str | None, arg(metavar="NAME")] = None,
+    deterministic: bool = False,
+    force: bool = False,
+    variant: Literal["llvm", "cuda"] = "llvm",
+    landmarks: Annotated[tuple[str, ...], arg(metavar="SCHEME=FILE")] = (),
+) -> int:
+    """Register all captures of a subject: the neutral, then every expression from it. Run again, it goes on.
+
+    Args:
+        subject: The folder whose sub-folders are the captures.
+        model: The head model, a GNM NPZ file.
+        out: The folder to write: a registration for each capture, subject.json and index.html.
+        recipe: draft takes minutes a capture and checks that they work; studio is the full quality.
+        views: Use only this many views of each capture, spread around the head.
+        seed: Seed of everything random.
+        neutral: The sub-folder of the neutral, if it is not the one whose expression is "neutral".
+        deterministic: Make every array the same from run to run; slower.
+        force: Register again what is there already.
+        variant: Render on the CPU (llvm) or on an NVIDIA GPU (cuda).
+        landmarks: The model's vertices of a landmark scheme, instead of the file beside the model.
+    """
+    landmark_files = _landmark_files(landmarks)
+    from registration.progress import shown
+    from workflows.local import register_subject
+
+    with shown() as progress:
+        result = register_subject(
+            subject,
+            model_path=model,
+            out=out,
+            recipe=recipe,
+            views=views,
+            seed=seed,
+            neutral=neutral,
+            deterministic=deterministic,
+            force=force,
+            variant=variant,
+            landmark_files=landmark_files,
+            progress=progress,
+        )
+    for row in result.rows:
+        print(f"{row.name}: {row.status}: {row.reason}")
+    print(out / "index.html")
+    usable = sum(row.usable for row in result.rows)
+    return 0 if usable == len(result.rows) else 1 if usable else 2
 
 
 def evaluate(
@@ -211,6 +268,7 @@ Group = tuple[str, Mapping[str, Command]]  # what the group is about, its comman
 
 COMMANDS: Mapping[str, Command | Group] = {
     "register": register,
+    "subject": register_subject,
     "evaluate": evaluate,
     "capture": (
         "Look at captures, make synthetic ones, spoil good ones.",
@@ -236,6 +294,9 @@ def main(args: Sequence[str] | None = None) -> int:
     except InputError as error:
         print(error, file=sys.stderr)
         return 2
+    except KeyboardInterrupt:
+        print("interrupted", file=sys.stderr)
+        return 130
 
 
 def _choice(commands: Mapping[str, Command | Group]) -> Any:

@@ -6,8 +6,10 @@ from types import SimpleNamespace
 import pytest
 
 import registration.register
+import workflows.local
 from tests.capture.small import make
 from workflows.cli import main
+from workflows.subject_folder import Row, Subject
 
 TINY_MODEL = Path(__file__).parents[1] / "fixtures" / "tiny_gnm.npz"
 HEAVY = {"torch", "mitsuba", "drjit", "numpy", "scipy", "cv2", "pycolmap", "kornia", "trimesh", "matplotlib"}
@@ -16,7 +18,7 @@ HEAVY = {"torch", "mitsuba", "drjit", "numpy", "scipy", "cv2", "pycolmap", "korn
 @pytest.mark.parametrize(
     "command",
     [
-        *("", "register", "evaluate", "capture", "capture check", "capture synth", "capture spoil"),
+        *("", "register", "subject", "evaluate", "capture", "capture check", "capture synth", "capture spoil"),
         *("model", "model info", "model fetch", "model bootstrap"),
     ],
 )
@@ -41,7 +43,10 @@ finally:
     assert HEAVY.isdisjoint(run.stderr.split("MODULES")[1].split())
 
 
-@pytest.mark.parametrize("arguments", ["", "register", "register CAPTURE --model M", "capture", "register C --views x"])
+@pytest.mark.parametrize(
+    "arguments",
+    ["", "register", "register CAPTURE --model M", "subject S --model M", "capture", "register C --views x"],
+)
 def test_wrong_arguments_stop_with_code_2(arguments: str, capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as stop:
         main(arguments.split())
@@ -207,3 +212,66 @@ def test_register_passes_every_argument_on(
     told = capsys.readouterr()
     assert told.out == f"{status}: because\nO\n"
     assert "told" in told.err
+
+
+@pytest.mark.parametrize(
+    ("statuses", "code"),
+    [
+        (("converged", "stopped"), 0),
+        (("stopped", "failed"), 1),
+        (("converged", "error"), 1),
+        (("failed", "skipped"), 2),
+        (("error", "skipped"), 2),
+    ],
+)
+def test_subject_passes_every_argument_on(
+    statuses: tuple, code: int, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The loop itself is tested in test_subject.py."""
+    heard = {}
+
+    def listen(subject: Path, **options) -> Subject:
+        heard.update(options, subject=subject)
+        rows = tuple(Row(name=f"c{i}", expression="", status=s, reason="because") for i, s in enumerate(statuses))
+        return Subject(subject="anna", model="ab", recipe="draft", neutral="c0", rows=rows)
+
+    monkeypatch.setattr(workflows.local, "register_subject", listen)
+    flags = "--recipe studio --views 7 --seed 3 --neutral N --deterministic --force --variant cuda --landmarks 68=a 5=b"
+    assert main(["subject", "S", "--model", "M.npz", "--out", "O", *flags.split()]) == code
+    heard.pop("progress").note("told")
+    assert heard == {
+        "subject": Path("S"),
+        "model_path": Path("M.npz"),
+        "out": Path("O"),
+        "recipe": "studio",
+        "views": 7,
+        "seed": 3,
+        "neutral": "N",
+        "deterministic": True,
+        "force": True,
+        "variant": "cuda",
+        "landmark_files": {"68": Path("a"), "5": Path("b")},
+    }
+    told = capsys.readouterr()
+    assert told.out == f"c0: {statuses[0]}: because\nc1: {statuses[1]}: because\nO/index.html\n"
+    assert "told" in told.err
+
+
+def test_missing_subject(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    missing, out = tmp_path / "missing", tmp_path / "out"
+    assert main(["subject", str(missing), "--model", str(TINY_MODEL), "--out", str(out)]) == 2
+    error = capsys.readouterr().err
+    assert "The subject's folder is missing" in error and str(missing) in error and "fix:" in error
+    assert "Traceback" not in error
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_an_interrupt_is_told_without_a_traceback(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def interrupt(*args, **options) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(workflows.local, "register_subject", interrupt)
+    assert main(["subject", "S", "--model", "M", "--out", "O"]) == 130
+    assert capsys.readouterr().err == "interrupted\n"
