@@ -1,7 +1,7 @@
 """One fit: stages in order on one capture's targets."""
 
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -9,27 +9,31 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from registration.appearance import Appearance
+from registration.confidence import vertex_confidence
 from registration.frames import MM_PER_M
-from registration.geometry.large_steps import LargeSteps, normalised_laplacian, to_torch
+from registration.geometry.large_steps import LargeSteps, normalised_laplacian, spacing
 from registration.losses import geometry, image, landmark
+from registration.losses.anatomy import SelfIntersection
+from registration.losses.texture import TextureSlide
 from registration.model.gnm import GNM
 from registration.model.gnm_npz import GNMData
 from registration.model.landmarks import LandmarkScheme
-from registration.model.regions import crossing_parts, vertex_classes
+from registration.model.regions import crossing_parts, offset_regions, vertex_classes
 from registration.optimize import AdamBlock, AdamUniformBlock, Block, History, minimise
 from registration.render.renderer import Renderer
-from registration.stages import Recipe, Stage, rigid
+from registration.stages import Lengths, Recipe, Stage, rigid
 from registration.start import Candidate, assess
 from registration.targets.classes import ClassMap
-from registration.types import Rendered, Targets
+from registration.trust import Trust, ViewErrors, view_errors
+from registration.types import Registration, Rendered, Targets
 from registration.unknowns import Start, Unknowns, skin_topology, skin_vertices
 
 # Surfaces of their own: a pixel that sees one where the target sees another compares nothing but classes.
 _SEPARATE = ("left_eye", "right_eye", "mouth_interior")
-_GREY = 0.25  # linear; what a texel shows before any view has been unwrapped to it
-_TEXTURE_STEP = 0.5
-_LEAST_DENSITY = 1e-3
 _SETTLED_SHARE = 0.1  # of the last stage's steps, over which vertices must stand still
+_CONTACTS_EVERY = 10  # steps, after which parts that may touch are looked up anew
+_REGION_RINGS = 2  # around a region that belong to it, so that its rim can follow
 
 
 OnStep = Callable[[Stage, int], None]
@@ -68,9 +72,10 @@ class Fit:
         self.landmark_use: dict[str, np.ndarray] = {  # bool (L,)
             name: np.ones(len(scheme.indices), bool) for name, scheme in self.schemes.items()
         }
-        self.texture = torch.full((recipe.texture_px, recipe.texture_px, 3), _GREY, device=self.device)
-        self.gains = torch.zeros(len(pyramid[0].names), 3, 2, device=self.device)  # log gain and bias per channel
-        self._textured = False
+        self.appearance = Appearance(self.renderer, recipe.texture_px, len(pyramid[0].names), self.device)
+        self.trust = Trust.full(len(pyramid[0].names))
+        self._contacts = SelfIntersection(data, self.device)
+        self._slide: TextureSlide | None = None
         self._random = np.random.default_rng(seed)
         self._order: list[int] = []
         self._surfaces = [mapping.names.index(name) for name in _SEPARATE if name in mapping.names]
@@ -80,29 +85,35 @@ class Fit:
     def _read_topology(self) -> None:
         """What the offsets' terms need of the mesh: once, for any start."""
         skin, count = skin_vertices(self.data), len(self.data.template_vertex_positions)
-        self._skin_triangles, edge_list = skin_topology(self.data.triangles, skin, count)
-        points = self.data.template_vertex_positions[skin]
-        lengths = np.linalg.norm(points[edge_list[:, 0]] - points[edge_list[:, 1]], axis=1)
-        self._edge_length = float(np.median(lengths))
-        self._laplacian = to_torch(normalised_laplacian(self._skin_triangles, len(skin)), self.device)
-        self._coupling = geometry.EdgeCoupling(
-            edges=torch.as_tensor(edge_list, device=self.device),
-            weights=torch.ones(len(edge_list), device=self.device),
-        )
+        self._skin_triangles, _ = skin_topology(self.data.triangles, skin, count)
+        self._skin_points = self.data.template_vertex_positions[skin]
+        self._spacing = spacing(self._skin_triangles, self._skin_points)
+        near = normalised_laplacian(self._skin_triangles, len(skin)) != 0
+        found = offset_regions(self.data)
+        self._region = np.zeros(len(skin), np.int64)  # 0 is the rest
+        for number, region in enumerate(self.recipe.regions, start=1):
+            members = found[region.name][skin]
+            for _ in range(_REGION_RINGS):
+                members = members | (near @ members)
+            self._region[members] = number
 
-    def begin(self, start: Start, texture: Float[np.ndarray, "R R 3"] | None = None) -> None:
-        """Set the unknowns, and the texture if one is known."""
+    def begin(self, start: Start, neutral: Registration | None = None) -> None:
+        """Set the unknowns and, for an expression, what its neutral tells of texture and sliding."""
         self.unknowns = Unknowns(self.model, self.data, start)
-        if texture is not None:
-            self.texture = torch.as_tensor(texture, device=self.device)
-            self._textured = True
+        if neutral is not None:
+            self.appearance.begin(neutral.texture)
+            reference = torch.as_tensor(neutral.texture, device=self.device)
+            self._slide = TextureSlide(
+                self.data, neutral.corner_uvs, reference, neutral.confidence, self.recipe.slide_px
+            )
 
     def vertices(self) -> Float[Tensor, "V 3"]:
         with torch.no_grad():
             return self.unknowns.vertices(self.unknowns.skin_offsets())
 
     def run(self, stages: tuple[Stage, ...], outcome: Outcome, on_step: OnStep) -> None:
-        """Run stages until one fails; fills `outcome`."""
+        """Run stages until one fails; fills `outcome`. Views are judged before the first and after each stage."""
+        self.trust = Trust.of(self.view_errors())
         for stage in stages:
             begun = time.perf_counter()
             history, outcome.failure = self._run_stage(stage, outcome, on_step)
@@ -111,27 +122,40 @@ class Fit:
             if outcome.failure:
                 outcome.failure = f"stage {stage.name}: {outcome.failure}"
                 return
+            self.trust = Trust.of(self.view_errors())
+
+    def view_errors(self) -> ViewErrors:
+        """How far each view is from the mesh, at the coarsest level."""
+        targets = self.pyramid[-1].select(range(len(self.trust.geometry)), self.device)
+        vertices = self.vertices()
+        with torch.no_grad():
+            rendered = self.renderer(vertices, None, targets.pixels)
+        distances = [distance for distance, _ in self.landmark_residuals(vertices).values()]
+        landmark_px = (
+            torch.cat(distances, 1).nanmedian(1).values
+            if distances
+            else torch.full((len(self.trust.geometry),), torch.nan)
+        )
+        return view_errors(rendered, targets, landmark_px)
+
+    def landmark_residuals(self, vertices: Float[Tensor, "V 3"]) -> dict[str, tuple[Float[Tensor, "N L"], Tensor]]:
+        """Per scheme, px at 512 px of head height (NaN where not seen or not used), and the points in the world."""
+        finest, found = self.pyramid[0], {}
+        for name, scheme in self.schemes.items():
+            points = scheme.points(vertices)
+            distance, counts = landmark.residuals(
+                finest.pixels.cameras, points, finest.landmarks[name].to(self.device), finest.px_per_head
+            )
+            used = (counts > 0) & torch.as_tensor(self.landmark_use[name], device=self.device)
+            found[name] = (torch.where(used, distance, torch.nan), points)
+        return found
 
     def _run_stage(self, stage: Stage, outcome: Outcome, on_step: OnStep) -> tuple[History, str | None]:
         free = [name for name, _ in stage.free if name != "scale" or self.recipe.scale]
-        steps = None
-        if "offsets" in free:
-            steps = LargeSteps(
-                self._skin_triangles,
-                len(self.unknowns.skin),
-                edge_length_m=self._edge_length,
-                smoothing_m=stage.smoothing_mm / MM_PER_M,
-                device=self.device,
-            )
+        steps = self._bend(stage.lengths) if "offsets" in free and stage.lengths else None
         self.unknowns.free(free, steps)
-        if stage.texture and not self._textured:
-            self._unwrap_all(stage)
-        blocks: list[Block] = []
-        for name, rate in stage.free:
-            if name == "offsets":
-                blocks.append(AdamUniformBlock(self.unknowns[name], rate))
-            elif name in free:
-                blocks.append(AdamBlock([self.unknowns[name]], rate))
+        if stage.texture and not self.appearance.known:
+            self.appearance.unwrap(self.vertices(), self._all_views(stage))
         watch_from = stage.steps - max(1, int(_SETTLED_SHARE * stage.steps))
         before: list[Tensor] = []
 
@@ -140,12 +164,54 @@ class Fit:
                 before.append(self.vertices())
             on_step(stage, step)
 
-        history, failure = minimise(blocks, lambda step: self._terms(stage, step), stage.steps, after)
+        history, failure = minimise(
+            self._blocks(stage, free), lambda step: self._terms(stage, step), stage.steps, after
+        )
         if before:
             motion = (self.vertices() - before[0]).norm(dim=-1) * MM_PER_M
             outcome.motion_mm = float(motion.quantile(0.95))
         self.unknowns.settle()
         return history, failure
+
+    def _bend(self, lengths: Lengths) -> LargeSteps:
+        """The preconditioner and the penalties of a stage's lengths, region by region."""
+        times = np.array([1.0, *(region.length for region in self.recipe.regions)])[self._region]
+        self._elasticity = geometry.Elasticity(
+            self._skin_triangles,
+            self._skin_points,
+            half_gain_m=times * lengths.half_gain_mm / MM_PER_M,
+            decay_m=np.full(len(times), lengths.decay_mm / MM_PER_M),
+            device=self.device,
+        )
+        return LargeSteps(
+            self._skin_triangles,
+            len(times),
+            edge_length_m=self._spacing,
+            smoothing_m=np.maximum(times * lengths.smoothing_mm / MM_PER_M, self._spacing),
+            device=self.device,
+        )
+
+    def _blocks(self, stage: Stage, free: Sequence[str]) -> list[Block]:
+        blocks: list[Block] = []
+        for name, rate in stage.free:
+            if name == "offsets":
+                groups = torch.as_tensor(self._region, device=self.device)
+                pace = (1.0, *(region.pace for region in self.recipe.regions))
+                blocks.append(AdamUniformBlock(self.unknowns[name], rate, groups=groups, pace=pace))
+            elif name in free:
+                blocks.append(AdamBlock([self.unknowns[name]], rate))
+        return blocks
+
+    def _all_views(self, stage: Stage) -> list[tuple[Targets, Tensor]]:
+        """All views in batches, and where they agree with the mesh as it is."""
+        found, count, vertices = [], len(self.trust.colour), self.vertices()
+        for first in range(0, count, stage.views_per_step):
+            views = list(range(first, min(first + stage.views_per_step, count)))
+            batch = self.trust.applied(self.pyramid[stage.level].select(views, self.device), views)
+            with torch.no_grad():
+                rendered = self.renderer(vertices, None, batch.pixels)
+            found.append((batch, image.agreement(rendered, batch, self._surfaces)))
+        return found
 
     def _next_views(self, count: int) -> list[int]:
         """Views in a random order, each once before any comes again."""
@@ -159,13 +225,21 @@ class Fit:
     def _terms(self, stage: Stage, step: int) -> dict[str, Tensor]:
         """The weighted terms of one step."""
         views = self._next_views(stage.views_per_step)
-        batch = self.pyramid[stage.level].select(views, self.device)
+        batch = self.trust.applied(self.pyramid[stage.level].select(views, self.device), views)
         offsets = self.unknowns.skin_offsets()
         vertices = self.unknowns.vertices(offsets)
         colour = stage.weights.rgb > 0 or stage.texture
-        rendered = self.renderer(vertices, self.texture if colour else None, batch.pixels)
+        rendered = self.renderer(vertices, self.appearance.texture if colour else None, batch.pixels)
         terms = self._image_terms(stage, rendered, batch, views)
         terms |= self._landmark_terms(stage, vertices, batch)
+        if stage.weights.contacts > 0:
+            if step % _CONTACTS_EVERY == 0:
+                self._contacts.refresh(vertices)
+            for pair, penalty in self._contacts(vertices).items():
+                terms[f"contact {pair}"] = stage.weights.contacts * penalty
+        if stage.weights.slide > 0 and self._slide is not None:
+            even = replace(batch, rgb=self.appearance.corrected(batch, views))
+            terms["slide"] = stage.weights.slide * self._slide(vertices, even)
         return terms | self._prior_terms(stage, offsets)
 
     def _image_terms(self, stage: Stage, rendered: Rendered, batch: Targets, views: list[int]) -> dict[str, Tensor]:
@@ -177,14 +251,14 @@ class Fit:
             "classes": w.classes * image.classes(rendered, batch, self._class_weights(w.eye_classes)),
         }
         if stage.texture:
-            self._update_gains(rendered, batch, agree, views)
+            self.appearance.fit_exposures(rendered, batch, agree, views)
         if w.rgb > 0:
-            shown = self._expose(rendered, batch, views)
+            shown = self.appearance.expose(rendered, batch, views)
             terms["rgb"] = w.rgb * image.rgb_l1(shown, batch, agree)
             if w.ssim > 0:
                 terms["ssim"] = w.ssim * image.rgb_ssim(shown, batch, agree)
         if stage.texture:
-            self._update_texture(rendered, batch, agree, views)
+            self.appearance.improve(self.vertices(), rendered, batch, agree, views)
         return terms
 
     def _class_weights(self, eyes: float) -> Tensor:
@@ -213,77 +287,14 @@ class Fit:
             eyes = u["eyes"]
             terms["eyes"] = w.eyes * eyes[:, :3].square().sum() + w.eye_scale * eyes[:, 3].square().sum()
         if stage.frees("offsets"):
-            change = offsets - u.reference_offsets
-            terms["offset l2"] = w.offset_l2 * geometry.l2(change)
-            terms["offset laplacian"] = w.offset_laplacian * geometry.laplacian(change, self._laplacian)
-            terms["offset coupling"] = w.offset_coupling * self._coupling(change)
+            for name, penalty in self._elasticity(offsets - u.reference_offsets).items():
+                terms[name] = w.offsets * penalty
         return terms
-
-    def _exposure(self, batch: Targets, views: list[int]) -> tuple[Float[Tensor, "P 3"], Float[Tensor, "P 3"]]:
-        """Gain and bias of every pixel's camera."""
-        gains = self.gains[views][batch.pixels.view.long()]
-        return gains[..., 0].exp(), gains[..., 1]
-
-    def _expose(self, rendered: Rendered, batch: Targets, views: list[int]) -> Rendered:
-        """The rendered colours as each camera would record them."""
-        gain, bias = self._exposure(batch, views)
-        return replace(rendered, rgb=rendered.rgb * gain + bias)
-
-    @torch.no_grad()
-    def _update_gains(self, rendered: Rendered, batch: Targets, agree: Tensor, views: list[int]) -> None:
-        """Closed form: per view and channel, the gain and bias that map rendered to seen colours best."""
-        weight = (batch.rgb_weight * agree)[:, None]
-        view = batch.pixels.view.long()
-
-        def total(value: Tensor) -> Tensor:
-            return value.new_zeros(len(views), value.shape[1]).index_add(0, view, value)
-
-        count = total(weight).clamp_min(1e-6)
-        r, t = (total(c * weight) / count for c in (rendered.rgb, batch.rgb))
-        variance = total(rendered.rgb.square() * weight) / count - r.square()
-        covariance = total(rendered.rgb * batch.rgb * weight) / count - r * t
-        # Priors: gain 1 +- 0.1, bias 0 +- 0.02, against pixel noise of 0.05 over some hundred independent patches.
-        noise = 0.05**2 / 100
-        gain_prior, bias_prior = noise / 0.1**2, noise / 0.02**2
-        shrink = bias_prior / (1 + bias_prior)
-        gain = (covariance + shrink * r * t + gain_prior) / (variance + shrink * r.square() + gain_prior)
-        bias = (t - gain * r) / (1 + bias_prior)
-        self.gains[views] = torch.stack([gain.clamp(0.3, 3.0).log(), bias], -1)
-        # One common gain belongs to the texture.
-        self.gains[..., 0] -= self.gains[..., 0].mean(0)
-
-    @torch.no_grad()
-    def _update_texture(self, rendered: Rendered, batch: Targets, agree: Tensor, views: list[int]) -> None:
-        """Closed form: move every texel half way to what the views of this step saw of it."""
-        gain, bias = self._exposure(batch, views)
-        weight = batch.rgb_weight.square() * agree
-        change = (batch.rgb - bias) / gain - rendered.rgb
-        total, density = self.renderer.unwrap(self.vertices(), change, weight, batch.pixels, self.texture.shape[0])
-        step = torch.where(density > _LEAST_DENSITY, _TEXTURE_STEP / density.clamp_min(_LEAST_DENSITY), 0.0)
-        self.texture = (self.texture + step[..., None] * total).clamp(0, 1)
-
-    @torch.no_grad()
-    def _unwrap_all(self, stage: Stage) -> None:
-        """A first texture: the weighted mean of all views."""
-        size, vertices = self.texture.shape[0], self.vertices()
-        total, density = torch.zeros_like(self.texture), torch.zeros(size, size, device=self.device)
-        for first in range(0, len(self.gains), stage.views_per_step):
-            views = list(range(first, min(first + stage.views_per_step, len(self.gains))))
-            batch = self.pyramid[stage.level].select(views, self.device)
-            rendered = self.renderer(vertices, None, batch.pixels)
-            weight = batch.rgb_weight.square() * image.agreement(rendered, batch, self._surfaces)
-            t, d = self.renderer.unwrap(vertices, batch.rgb, weight, batch.pixels, size)
-            total, density = total + t, density + d
-        seen = density > _LEAST_DENSITY
-        mean = total / density.clamp_min(_LEAST_DENSITY)[..., None]
-        fill = mean[seen].mean(0) if seen.any() else torch.full((3,), _GREY, device=self.device)
-        self.texture = torch.where(seen[..., None], mean, fill)
-        self._textured = True
 
     def assess(self, start: Start) -> Candidate:
         """How well a start covers the coarsest targets, all views."""
         self.begin(start)
-        batch = self.pyramid[-1].select(range(len(self.gains)), self.device)
+        batch = self.pyramid[-1].select(range(len(self.trust.geometry)), self.device)
         with torch.no_grad():
             return assess(start, self.renderer(self.vertices(), None, batch.pixels), batch)
 
@@ -295,9 +306,16 @@ class Fit:
         position, scale = unknowns["position"].detach().cpu().numpy(), float(unknowns["scale"].detach().exp())
         return replace(start, rotation=rotation, position=position, scale=scale)
 
+    def confidence(self) -> Float[np.ndarray, "V"]:
+        """Of every vertex, in [0, 1): see `vertex_confidence`."""
+        trusted = [v for v in range(len(self.trust.geometry)) if self.trust.geometry[v] > 0.5]
+        groups = [trusted[first : first + 4] for first in range(0, len(trusted), 4)]
+        drawn = (self.picture(views) for views in groups)
+        return vertex_confidence(self.vertices().cpu().numpy(), self.data.triangles, drawn)
+
     def picture(self, views: list[int]) -> tuple[Targets, Rendered]:
         """Some views at the finest level, and what the fit shows there, exposed as their cameras would."""
         batch = self.pyramid[0].select(views, self.device)
         with torch.no_grad():
-            rendered = self.renderer(self.vertices(), self.texture, batch.pixels)
-            return batch, self._expose(rendered, batch, views)
+            rendered = self.renderer(self.vertices(), self.appearance.texture, batch.pixels)
+            return batch, self.appearance.expose(rendered, batch, views)

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
 import torch
+from jaxtyping import Int
 from torch import Tensor
 
 History = dict[str, list[float]]
@@ -51,16 +52,28 @@ class AdamUniformBlock:
     """Adam with one step size for all vertices (Nicolet 2021), so that a field's direction is kept.
 
     The paper divides by the largest second moment; here by a high quantile, since one wild vertex would rule it.
+    Vertices may be told apart in `groups`, each with a step size of its own times its `pace`: where images pull
+    weakly everywhere, vertices would else hardly move.
     """
 
     QUANTILE = 0.998
 
-    def __init__(self, latent: Tensor, rate: Rate, betas: tuple[float, float] = (0.9, 0.99)):
+    def __init__(
+        self,
+        latent: Tensor,
+        rate: Rate,
+        betas: tuple[float, float] = (0.9, 0.99),
+        groups: Int[Tensor, "V"] | None = None,
+        pace: Sequence[float] = (1.0,),
+    ):
         self.tensors: Sequence[Tensor] = (latent,)
         self._rate = rate
         self._betas = betas
         self._first = torch.zeros_like(latent)
-        self._second = latent.new_zeros(())
+        self._group = torch.zeros(len(latent), dtype=torch.long, device=latent.device) if groups is None else groups
+        self._members = [(self._group == number).nonzero()[:, 0] for number in range(len(pace))]
+        self._pace = latent.new_tensor(pace)
+        self._second = torch.zeros_like(self._pace)
         self._steps = 0
 
     @torch.no_grad()
@@ -70,9 +83,12 @@ class AdamUniformBlock:
         self._steps += 1
         b1, b2 = self._betas
         self._first.lerp_(latent.grad, 1 - b1)
-        self._second.lerp_(latent.grad.square().sum(-1).quantile(self.QUANTILE), 1 - b2)
+        squared = latent.grad.square().sum(-1)
+        largest = [squared[own].quantile(self.QUANTILE) if len(own) else squared.new_zeros(()) for own in self._members]
+        self._second.lerp_(torch.stack(largest), 1 - b2)
         scale = (self._second / (1 - b2**self._steps)).sqrt() + 1e-12
-        latent -= self._rate.at(progress) / (1 - b1**self._steps) / scale * self._first
+        pace = (self._pace / scale).index_select(0, self._group)
+        latent -= self._rate.at(progress) / (1 - b1**self._steps) * pace[:, None] * self._first
 
 
 def minimise(

@@ -16,11 +16,10 @@ from registration.capture.doctor import validate
 from registration.capture.landmarks3d import triangulate
 from registration.capture.native import read
 from registration.errors import InputError
+from registration.evaluate.audit import audit
 from registration.evaluate.evaluation import Evaluation, evaluate
 from registration.fit import Fit, Outcome
-from registration.geometry.raster import visible
-from registration.geometry.topology import edges, vertex_normals
-from registration.losses.landmark import residuals
+from registration.geometry.topology import edges
 from registration.model import gnm_npz
 from registration.model.atlas import texture_atlas
 from registration.model.gnm import GNM
@@ -34,11 +33,13 @@ from registration.stages import RECIPES, Recipe, Stage, expression_of
 from registration.start import LEAST_LANDMARKS, LEAST_OVERLAP, from_landmarks, from_masks, spread_views
 from registration.targets.classes import BACKGROUND, class_map
 from registration.targets.pyramid import build_pyramid
+from registration.trust import ViewErrors
 from registration.types import Capture, Parameters, Registration, Status
 from registration.unknowns import Start, pivot, start_of
 
 SETTLED_MM = 0.05  # 95th percentile of vertex motion over the last tenth of the last stage
 LANDMARK_PX = 3.0  # median residual at 512 px of head height
+_MANY = 2  # times LANDMARK_PX: views this far off are named
 _REPORT_VIEWS = 8
 
 
@@ -251,7 +252,7 @@ def _fit(inputs: Inputs, seed: int, device: torch.device, progress: Progress) ->
     start = _start(inputs, fit, progress)
     for note in start.notes:
         progress.note(note)
-    fit.begin(start, None if inputs.neutral is None else inputs.neutral.texture)
+    fit.begin(start, inputs.neutral)
     outcome.seconds["start"] = time.perf_counter() - begun
     total, done = sum(stage.steps for stage in recipe.stages), 0
 
@@ -299,9 +300,10 @@ def _parameters(registration: Registration) -> Parameters:
 def _collect(inputs: Inputs, fit: Fit, start: Start, outcome: Outcome) -> Registration:
     """The result as arrays, with its status."""
     parameters, offsets = fit.unknowns.parameters()
-    vertices = fit.vertices().cpu().numpy()
-    landmark_px = {name: _landmark_residual(fit, name, vertices) for name in fit.schemes}
-    status, reason = _status(outcome, landmark_px)
+    positions = fit.vertices()
+    vertices, errors = positions.cpu().numpy(), fit.view_errors()
+    landmark_px = {name: _median(distance) for name, (distance, _) in fit.landmark_residuals(positions).items()}
+    status, reason = _status(outcome, landmark_px, errors)
 
     def array(value: torch.Tensor) -> np.ndarray:
         return value.detach().cpu().numpy().astype(np.float32)
@@ -317,8 +319,8 @@ def _collect(inputs: Inputs, fit: Fit, start: Start, outcome: Outcome) -> Regist
         offsets=array(offsets),
         vertices=vertices,
         triangles=inputs.data.triangles,
-        confidence=_confidence(vertices, inputs),
-        texture=array(fit.texture),
+        confidence=fit.confidence() if np.isfinite(vertices).all() else np.zeros(len(vertices), np.float32),
+        texture=array(fit.appearance.texture),
         corner_uvs=fit.corner_uvs,
         landmarks={name: scheme.points(vertices) for name, scheme in inputs.schemes.items()},
         seconds=outcome.seconds,
@@ -326,7 +328,8 @@ def _collect(inputs: Inputs, fit: Fit, start: Start, outcome: Outcome) -> Regist
         figures={
             "motion_mm": outcome.motion_mm,
             "landmark_residual_px": landmark_px,
-            "camera_gains": fit.gains[..., 0].exp().cpu().numpy().round(4).tolist(),
+            "camera_gains": fit.appearance.gains.cpu().numpy().round(4).tolist(),
+            "views_not_trusted": dict(fit.trust.notes),
             "notes": list(start.notes),
         },
         config=inputs.config,
@@ -334,43 +337,33 @@ def _collect(inputs: Inputs, fit: Fit, start: Start, outcome: Outcome) -> Regist
     )
 
 
-def _landmark_residual(fit: Fit, scheme: str, vertices: Float[np.ndarray, "V 3"]) -> float:
-    """Median over views and landmarks that were used, px at 512 px of head height."""
-    finest = fit.pyramid[0]
-    points = fit.schemes[scheme].points(torch.as_tensor(vertices))
-    distance, counts = residuals(finest.pixels.cameras, points, finest.landmarks[scheme], finest.px_per_head)
-    used = (counts > 0) & torch.as_tensor(fit.landmark_use[scheme])
-    return float(distance[used].median()) if used.any() else float("nan")
+def _median(distance: torch.Tensor) -> float:
+    return float(distance.nanmedian())
 
 
-def _status(outcome: Outcome, landmark_px: Mapping[str, float]) -> tuple[Status, str]:
+def _status(outcome: Outcome, landmark_px: Mapping[str, float], errors: ViewErrors) -> tuple[Status, str]:
     if outcome.failure:
         return "failed", outcome.failure
+    views = errors.disagreement(LANDMARK_PX * _MANY)
     off = {name: px for name, px in landmark_px.items() if px >= LANDMARK_PX}
     if off:
         worst = max(off, key=lambda name: off[name])
-        return "failed", f"landmarks of scheme {worst} are {off[worst]:.1f} px off in the median (limit {LANDMARK_PX})"
+        reason = f"landmarks of scheme {worst} are {off[worst]:.1f} px off in the median (limit {LANDMARK_PX})"
+        return "failed", f"{reason}; {views}" if views else reason
     if outcome.motion_mm >= SETTLED_MM:
-        return "stopped", f"vertices still moved by {outcome.motion_mm:.3f} mm at the end (limit {SETTLED_MM})"
+        reason = f"vertices still moved by {outcome.motion_mm:.3f} mm at the end (limit {SETTLED_MM})"
+        return "stopped", f"{reason}; {views}" if views else reason
     return "converged", f"vertices moved by {outcome.motion_mm:.3f} mm over the last tenth of the last stage"
-
-
-def _confidence(vertices: Float[np.ndarray, "V 3"], inputs: Inputs) -> Float[np.ndarray, "V"]:
-    """How well the views see each vertex: s / (1 + s), s the sum of cosines of incidence over the views that do."""
-    triangles = inputs.data.triangles
-    normals = vertex_normals(torch.as_tensor(vertices), torch.as_tensor(triangles.astype(np.int64))).numpy()
-    total = np.zeros(len(vertices))
-    for view in inputs.capture.views:
-        to_camera = view.camera.centre - vertices
-        cosine = (normals * to_camera).sum(1) / np.linalg.norm(to_camera, axis=1)
-        total += np.clip(cosine, 0, 1) * visible(vertices, vertices, triangles, view.camera)
-    return (total / (1 + total)).astype(np.float32)
 
 
 def _judge(inputs: Inputs, fit: Fit, registration: Registration, progress: Progress) -> tuple[Registration, str]:
     """Figures against the scan, if there is one, and the report."""
     evaluation: Evaluation | None = None
     finite = np.isfinite(registration.vertices).all()
+    if finite:
+        progress.note("auditing parts that may run through one another")
+        found = audit(registration.vertices, inputs.data).figures
+        registration = replace(registration, figures={**registration.figures, "intersections": found})
     if inputs.capture.scan is not None and finite:
         progress.note("measuring against the scan")
         evaluation = evaluate(registration, inputs.capture)

@@ -27,9 +27,27 @@ class Weights:
     rotations: float = 0.1  # joints other than the root, per rad^2
     eyes: float = 5.0  # eyeballs moved out of the model's place, per m^2
     eye_scale: float = 0.05
-    offset_l2: float = 20.0  # per m^2
-    offset_laplacian: float = 2e4  # per m^2
-    offset_coupling: float = 200.0  # per m^2
+    offsets: float = 2e4  # per m^2: how hard images are taken to pull, which the lengths below are balanced against
+    contacts: float = 0.0  # per mm^2, summed over the vertices that lie too deep in another part
+    slide: float = 0.0  # dissimilarity of the neutral's texture and the images unwrapped; expressions only
+
+
+@dataclass(frozen=True, kw_only=True)
+class Lengths:
+    """How free offsets are, in mm (losses/geometry.py and geometry/large_steps.py say what each does)."""
+
+    smoothing_mm: float  # one step moves a patch of about this size: the way there, not where it ends
+    half_gain_mm: float  # of waves of this length the images keep one half, of shorter ones less
+    decay_mm: float = 25.0  # so far an offset reaches into what no image shows
+
+
+@dataclass(frozen=True, kw_only=True)
+class Region:
+    """A part of the skin where offsets have lengths and a step size of their own."""
+
+    name: str  # a key of regions.offset_regions
+    length: float = 1.0  # times a stage's lengths, the decay's excepted
+    pace: float = 1.0  # times a stage's rate, against the largest gradients in the region itself
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -42,7 +60,7 @@ class Stage:
     views_per_step: int = 8
     weights: Weights = Weights()
     free: tuple[tuple[str, Rate], ...] = ()  # unknowns and their rates; all but `offsets` are updated by Adam
-    smoothing_mm: float = 0.0  # length that large steps smooth offsets over; used while `offsets` is free
+    lengths: Lengths | None = None  # needed while `offsets` is free
     texture: bool = False  # estimate texture and camera gains along the way
 
     def frees(self, name: str) -> bool:
@@ -56,7 +74,13 @@ class Recipe:
     finest_head_px: int = 512  # resolution of level 0, as the head's height
     levels: int = 3
     texture_px: int = 1024
+    slide_px: int = 512  # of the textures compared for sliding
     scale: bool = True  # free the overall size: a basis rebuilt from scale-free data holds none
+    regions: tuple[Region, ...] = (
+        Region(name="lips", length=0.6),
+        Region(name="lids", length=0.4),
+        Region(name="nostrils", length=0.5, pace=10.0),
+    )
 
 
 _POSE = (("root", 5e-3), ("joints", 5e-3), ("position", 1e-3), ("eyes", 1e-3))
@@ -66,44 +90,60 @@ def _rates(*pairs: tuple[str, float], end: float = 0.05) -> tuple[tuple[str, Rat
     return tuple((name, Rate(start=rate, end=rate * end, hold=0.5)) for name, rate in pairs)
 
 
+def _model(steps: int) -> Stage:
+    return Stage(
+        name="model",
+        steps=steps,
+        level=2,
+        free=_rates(("identity", 0.1), ("expression", 0.03), ("scale", 3e-3), *_POSE),
+        weights=Weights(contacts=2e-5),
+    )
+
+
 def _offsets(
-    name: str, steps: int, level: int, smoothing_mm: float, start: float, end: float, ssim: float = 0.2
+    smoothing_mm: float, half_gain_mm: float, steps: int, level: int, start: float, end: float, ssim: float = 0.2
 ) -> Stage:
     return Stage(
-        name=name,
+        name=f"offsets {smoothing_mm:g} mm",
         steps=steps,
         level=level,
-        smoothing_mm=smoothing_mm,
+        lengths=Lengths(smoothing_mm=smoothing_mm, half_gain_mm=half_gain_mm),
         free=(("offsets", Rate(start=start, end=end)), ("eyes", Rate(start=start / 10, end=end / 10))),
-        weights=Weights(rgb=1.0, ssim=ssim, classes=0.1, landmarks=0.01),
+        weights=Weights(rgb=1.0, ssim=ssim, classes=0.1, landmarks=0.01, contacts=2e-4, slide=0.5),
         texture=True,
     )
 
 
 def draft(*, scale: bool = True) -> Recipe:
-    """Minutes on a laptop: model, then offsets up to a head of about 512 px."""
-    model = Stage(
-        name="model",
-        steps=100,
-        level=2,
-        free=_rates(("identity", 0.1), ("expression", 0.03), ("scale", 3e-3), *_POSE),
-    )
+    """A minute on a laptop: model, then offsets up to a head of about 512 px."""
     stages = (
-        model,
-        _offsets("offsets 20 mm", 30, 2, 20, 4e-3, 2e-3),
-        _offsets("offsets 8 mm", 40, 1, 8, 1e-3, 5e-4),
-        _offsets("offsets 4 mm", 30, 1, 4, 4e-4, 5e-5),
-        _offsets("offsets 3 mm", 40, 0, 3, 2e-4, 2e-5, ssim=0.0),
+        _model(100),
+        _offsets(20, 12, 30, level=2, start=4e-3, end=2e-3),
+        _offsets(5, 8, 40, level=1, start=1e-3, end=5e-4),
+        _offsets(2.5, 6, 30, level=1, start=4e-4, end=5e-5),
+        _offsets(1.5, 5, 40, level=0, start=2e-4, end=2e-5, ssim=0.0),
     )
     return Recipe(name="draft", stages=stages, scale=scale)
 
 
 def studio(*, scale: bool = True) -> Recipe:
-    """The full quality: all views at every step, longer, up to the images' own resolution."""
-    base = draft(scale=scale)
-    longer = {"model": 150, "offsets 20 mm": 50, "offsets 8 mm": 80, "offsets 4 mm": 60, "offsets 3 mm": 90}
-    stages = tuple(replace(stage, steps=longer[stage.name], views_per_step=12) for stage in base.stages)
-    return replace(base, name="studio", stages=stages, finest_head_px=1024, texture_px=2048)
+    """The full quality: more views at every step, longer, up to the images' own resolution."""
+    stages = (
+        _model(150),
+        _offsets(20, 12, 50, level=2, start=4e-3, end=2e-3),
+        _offsets(5, 8, 80, level=1, start=1e-3, end=5e-4),
+        _offsets(2.5, 6, 60, level=1, start=4e-4, end=5e-5),
+        _offsets(1.5, 4, 90, level=0, start=3e-4, end=1e-5, ssim=0.0),
+    )
+    wider = tuple(replace(stage, views_per_step=12) for stage in stages)
+    return Recipe(name="studio", stages=wider, scale=scale, finest_head_px=1024, texture_px=2048)
+
+
+def in_model(*, scale: bool = True) -> Recipe:
+    """No offsets: the model's own parameters alone, as for testing how much a model can say."""
+    fine = replace(_model(60), name="model, finer", level=1)
+    slow = tuple((name, replace(rate, start=rate.start / 3, end=rate.end / 3)) for name, rate in fine.free)
+    return Recipe(name="in_model", stages=(_model(100), replace(fine, free=slow, texture=True)), scale=scale)
 
 
 def rigid(level: int) -> Stage:
@@ -123,4 +163,4 @@ def expression_of(recipe: Recipe) -> Recipe:
     return replace(recipe, stages=stages)
 
 
-RECIPES: dict[str, Callable[[], Recipe]] = {"draft": draft, "studio": studio}
+RECIPES: dict[str, Callable[[], Recipe]] = {"draft": draft, "studio": studio, "in_model": in_model}

@@ -1,7 +1,8 @@
 """Large steps (Nicolet 2021): smooth displacements through a preconditioner, and quadratic penalties on them.
 
 The unknown is u = M d with M = I + lambda L, L the combinatorial Laplacian; d = M^-1 u and dLoss/du = M^-1 dLoss/dd.
-On a regular triangulation of edge length h this smooths over l = h sqrt(1.5 lambda).
+On a regular triangulation of edge length h this smooths over l = h sqrt(1.5 lambda). Lambda may vary from edge to edge,
+so that l is what was asked for where edges are longer, or where it is asked to be another.
 """
 
 import warnings
@@ -15,9 +16,23 @@ from scipy.sparse import coo_matrix, csr_matrix, diags, identity
 from torch import Tensor
 
 
-def combinatorial_laplacian(triangles: Int[np.ndarray, "F 3"], vertex_count: int) -> csr_matrix:
-    """L = D - A over the mesh's edges, (V, V); every row sums to zero."""
+def spacing(triangles: Int[np.ndarray, "F 3"], points: Float[np.ndarray, "V 3"]) -> Float[np.ndarray, "V"]:
+    """The mean length of each vertex' edges; the median of all for vertices without."""
+    adjacency = _adjacency(triangles, len(points)).tocoo()
+    length = np.linalg.norm(points[adjacency.row].astype(np.float64) - points[adjacency.col], axis=1)
+    count = np.bincount(adjacency.row, minlength=len(points))
+    total = np.bincount(adjacency.row, weights=length, minlength=len(points))
+    return np.where(count > 0, total / np.maximum(count, 1), np.median(length))
+
+
+def combinatorial_laplacian(
+    triangles: Int[np.ndarray, "F 3"], vertex_count: int, strength: Float[np.ndarray, "V"] | None = None
+) -> csr_matrix:
+    """L = D - A over the mesh's edges, (V, V); every row sums to zero. Edges count the mean strength of their ends."""
     adjacency = _adjacency(triangles, vertex_count)
+    if strength is not None:
+        scaled = diags(strength)
+        adjacency = (scaled @ adjacency + adjacency @ scaled) / 2
     return (diags(np.asarray(adjacency.sum(1)).ravel()) - adjacency).tocsr()
 
 
@@ -52,19 +67,19 @@ def to_torch(matrix: csr_matrix, device: torch.device) -> Tensor:
 
 
 class LargeSteps:
-    """M of one mesh and one smoothing length, factorised once."""
+    """M of one mesh, factorised once. Edge and smoothing lengths are one number or one a vertex."""
 
     def __init__(
         self,
         triangles: Int[np.ndarray, "F 3"],
         vertex_count: int,
         *,
-        edge_length_m: float,
-        smoothing_m: float,
+        edge_length_m: float | Float[np.ndarray, "V"],
+        smoothing_m: float | Float[np.ndarray, "V"],
         device: torch.device,
     ):
-        strength = (smoothing_m / edge_length_m) ** 2 / 1.5
-        matrix = identity(vertex_count) + strength * combinatorial_laplacian(triangles, vertex_count)
+        strength = np.broadcast_to(np.square(np.divide(smoothing_m, edge_length_m)) / 1.5, vertex_count)
+        matrix = identity(vertex_count) + combinatorial_laplacian(triangles, vertex_count, strength)
         coo = matrix.tocoo()
         self._matrix = to_torch(matrix.tocsr(), device)
         self._solver = cholespy.CholeskySolverF(

@@ -158,6 +158,25 @@ def blush(data: GNMData) -> Float[np.ndarray, "V"]:
     return np.clip(np.max(groups, axis=0), 0, 1)
 
 
+def nostrils(data: GNMData) -> Bool[np.ndarray, "V"]:
+    """The lining of the nostrils: skin that is neither exterior nor of the mouth nor behind the eyes."""
+    other = (group(data, "mouth_sock") > _INSIDE) | (group(data, "eye_sockets") > _INSIDE)
+    return (group(data, "skin") > _INSIDE) & ~exterior(data) & ~other
+
+
+def offset_regions(data: GNMData) -> dict[str, Bool[np.ndarray, "V"]]:
+    """Parts of the skin whose offsets a recipe may treat on their own, by name."""
+    lips = (group(data, "upper_lip") > _INSIDE) | (group(data, "lower_lip") > _INSIDE)
+    linings = (group(data, "mouth_sock") > _INSIDE) | (group(data, "eye_sockets") > _INSIDE)
+    return {
+        "nostrils": nostrils(data),
+        "lips": lips,
+        "lids": lids(data) > _INSIDE,
+        "ears": ears(data),
+        "linings": linings,
+    }
+
+
 def _nearness(data: GNMData, members: Bool[np.ndarray, "V"], near: float, far: float) -> Float[np.ndarray, "V"]:
     """1 up to `near` (metres, in the template) from the nearest member, falling to 0 at `far`."""
     points = data.template_vertex_positions

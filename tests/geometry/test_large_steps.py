@@ -7,8 +7,13 @@ import numpy as np
 import pytest
 import torch
 
-from registration.geometry.large_steps import LargeSteps, combinatorial_laplacian, normalised_laplacian, to_torch
-from registration.losses.geometry import EdgeCoupling, l2, laplacian
+from registration.geometry.large_steps import (
+    LargeSteps,
+    combinatorial_laplacian,
+    normalised_laplacian,
+    spacing,
+    to_torch,
+)
 from registration.optimize import AdamUniformBlock, Rate, minimise
 
 CPU = torch.device("cpu")
@@ -119,41 +124,29 @@ def test_a_known_displacement_is_recovered_from_a_third_of_the_vertices():
     assert rms_mm < 0.05
 
 
-@pytest.mark.parametrize("turns", [(2, 0), (3, 1), (5, 4)])
-def test_penalties_of_waves(turns):
-    """Of an eigenmode of height A every penalty is a formula, and so is what is left of it after a fit."""
-    columns, rows = 40, 36
+def test_lengths_may_vary_over_the_mesh():
+    """Edges twice as long and lengths that change half way: either half smooths as it was asked to."""
+    columns, rows = 192, 48
     _, triangles = lattice(columns, rows)
-    field, k = wave(columns, rows, turns)
-    value, height = eigenvalue(k), 0.001
-    mode = torch.tensor(np.outer(height * field, [0.6, 0, 0.8]), dtype=torch.float32)
-    operator = to_torch(normalised_laplacian(triangles, columns * rows), CPU)
-    upper = combinatorial_laplacian(triangles, columns * rows).tocoo()
-    pairs = np.stack([upper.row, upper.col], 1)[upper.row < upper.col]
-    coupling = EdgeCoupling(edges=torch.as_tensor(pairs), weights=torch.ones(len(pairs)))
-    square = height**2 / 2
-    assert l2(mode).item() == pytest.approx(square, rel=1e-4)
-    assert coupling(mode).item() == pytest.approx(square * value, rel=1e-3)
-    assert laplacian(mode, operator).item() == pytest.approx(square * (value / 6) ** 2, rel=1e-3)
-
-    a, b, c = 0.1, 0.5, 20.0
-    gain = torch.tensor(0.0, requires_grad=True)
-    rest = (
-        l2(gain * mode - mode) + a * l2(gain * mode) + b * coupling(gain * mode) + c * laplacian(gain * mode, operator)
+    field, k = wave(columns, rows, (8, 0))
+    column = np.arange(columns * rows) % columns
+    asked = np.where(column < columns // 2, 0.004, 0.012)
+    steps = LargeSteps(
+        triangles,
+        columns * rows,
+        edge_length_m=np.full(columns * rows, EDGE_M),
+        smoothing_m=asked,
+        device=CPU,
     )
-    (slope,) = torch.autograd.grad(rest, gain, create_graph=True)
-    (curvature,) = torch.autograd.grad(slope, gain)
-    measured = -slope.item() / curvature.item()
-    assert measured == pytest.approx(1 / (1 + a + b * value + c * (value / 6) ** 2), rel=1e-3)
-    if turns == (2, 0):  # long against an edge: the continuous formula, from which weights are chosen
-        square_k = float(k @ k)
-        assert measured == pytest.approx(1 / (1 + a + 1.5 * b * square_k + c * square_k**2 / 16), rel=0.05)
+    smooth = steps.displacement(torch.tensor(np.outer(field, [1, 0, 0]), dtype=torch.float32))[:, 0].double().numpy()
+    for inside, length_m in (((column > 24) & (column < 72), 0.004), ((column > 120) & (column < 168), 0.012)):
+        gain = smooth[inside] @ field[inside] / (field[inside] @ field[inside])
+        assert np.sqrt(1 / gain - 1) / (np.linalg.norm(k) / EDGE_M) == pytest.approx(length_m, rel=0.1)
 
 
-def test_weights_of_edges_count():
-    coupling = EdgeCoupling(edges=torch.tensor([[0, 1], [1, 2]]), weights=torch.tensor([2.0, 0.5]))
-    offsets = torch.tensor([[0.0, 0, 0], [1, 0, 0], [1, 2, 0], [7, 7, 7]])
-    assert coupling(offsets).item() == pytest.approx((2 * 1 + 0.5 * 4) / 4)
+def test_spacing_is_the_mean_length_of_a_vertex_edges():
+    points = np.array([[0, 0, 0], [3, 0, 0], [0, 4, 0], [9, 9, 9.0]])
+    np.testing.assert_allclose(spacing(np.array([[0, 1, 2]]), points), [3.5, 4, 4.5, 4])
 
 
 def test_no_warning_reaches_the_terminal():
