@@ -38,7 +38,7 @@ class Pair:
     name: str
     vertices: Int[np.ndarray, "N"]
     depth_mm: Float[np.ndarray, "N"]
-    baseline_mm: Float[np.ndarray, "N"]  # the same vertex' depth in the template
+    baseline_mm: Float[np.ndarray, "N"]  # the same vertex' depth in the template, at the mesh's scale
 
     @property
     def excess_mm(self) -> Float[np.ndarray, "N"]:
@@ -76,11 +76,12 @@ class Audit:
         return {BEYOND: len(self.beyond), "pairs": {pair.name: pair.figures for pair in self.pairs}}
 
 
-def audit(vertices: Float[np.ndarray, "V 3"], data: GNMData) -> Audit:
+def audit(vertices: Float[np.ndarray, "V 3"], data: GNMData, scale: float = 1.0) -> Audit:
     """Find what of a posed mesh of this model lies inside what it should not.
 
-    `vertices`: metres, any frame, model order. Tested are the outer skin and the tongue; eye sockets, gums and the
-    mouth's lining are not. The first audit with a model object audits its template too.
+    `vertices`: metres, any frame, model order; `scale`: the registration's, for the template is compared at the same
+    size. Tested are the outer skin and the tongue; eye sockets, gums and the mouth's lining are not. The first audit
+    with a model object audits its template too.
 
     Raises:
         InputError: the vertices are not this model's, or not finite.
@@ -98,8 +99,9 @@ def audit(vertices: Float[np.ndarray, "V 3"], data: GNMData) -> Audit:
     found = parts.depths(np.asarray(vertices, np.float64))
     pairs = []
     for name, depth in found.items():
-        members = np.flatnonzero((depth > 0) | (baseline[name] > 0))
-        pairs.append(Pair(name=name, vertices=members, depth_mm=depth[members], baseline_mm=baseline[name][members]))
+        own = scale * baseline[name]
+        members = np.flatnonzero((depth > 0) | (own > 0))
+        pairs.append(Pair(name=name, vertices=members, depth_mm=depth[members], baseline_mm=own[members]))
     return Audit(pairs=tuple(pairs))
 
 
@@ -118,7 +120,7 @@ def audit_folder(registration_dir: Path, model: Path) -> Audit:
             got="others",
             fix="give the model that the registration was made with",
         )
-    result = audit(registration.vertices, data)
+    result = audit(registration.vertices, data, float(registration.scale))
     update_figures(registration_dir, {"intersections": result.figures})
     print_audit(result.figures, title=f"{registration_dir}: {registration.status}")
     return result

@@ -128,6 +128,17 @@ def test_only_what_exceeds_the_vertex_own_depth_in_the_template_counts():
         assert row["max_excess_mm"] == pytest.approx(more_mm, abs=0.02) and min(row[BEYOND], 1) == count
 
 
+def test_the_template_is_compared_at_the_size_of_the_mesh():
+    data = balls()
+    template = data.template_vertex_positions.copy()
+    template[regions.tongue(data)] -= np.float32([0.009, 0, 0])
+    data = dataclasses.replace(data, template_vertex_positions=template)
+    larger = 1.1 * template.astype(float)
+    assert flagged(audit(larger, data)) == {"tongue in teeth"}
+    row = audit(larger, data, scale=1.1).figures["pairs"]["tongue in teeth"]
+    assert row["max_excess_mm"] < 1e-6 and row["template_max_mm"] == pytest.approx(4.4, abs=0.1)
+
+
 def test_another_place_and_turn_change_nothing():
     data = balls()
     vertices = data.template_vertex_positions.astype(float)
