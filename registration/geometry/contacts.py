@@ -5,7 +5,7 @@ looked up once for some steps; which one does, and where, is found at every step
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 import torch
@@ -37,6 +37,13 @@ class Watched:
     def joined(cls, parts: Sequence["Watched"]) -> "Watched":
         """All rows of some, in their order."""
         return cls(**{f.name: torch.cat([getattr(part, f.name) for part in parts]) for f in fields(cls)})
+
+    def compact(self) -> tuple[Int[Tensor, "U"], "Watched"]:
+        """The vertices that take part, and the same rows in places in that list."""
+        ids = torch.cat([self.points, self.triangles.flatten()])
+        index, place = ids.unique(return_inverse=True)
+        points, triangles = place[: len(self.points)], place[len(self.points) :]
+        return index, replace(self, points=points, triangles=triangles.view_as(self.triangles))
 
     def only(self, rows: Bool[Tensor, "M"]) -> "Watched":
         return Watched(**{f.name: getattr(self, f.name)[rows] for f in fields(self)})
@@ -73,10 +80,11 @@ def depths(vertices: Float[Tensor, "V 3"], watched: Watched) -> Depths:
     """How deep each watched vertex lies behind the closest point of its triangles."""
     p = vertices[watched.points][:, None]
     a, b, c = vertices[watched.triangles].unbind(2)
-    weights = _closest(p, a, b, c)
-    ahead = (weights[..., None] * torch.stack([a, b, c], -2)).sum(-2) - p
+    ab, ac, ap = b - a, c - a, p - a
+    weights = _closest(ab, ac, ap)
+    ahead = weights[..., 1:2] * ab + weights[..., 2:] * ac - ap
     distance = ahead.norm(dim=-1)
-    normal = torch.nn.functional.normalize(torch.linalg.cross(b - a, c - a), dim=-1)
+    normal = torch.nn.functional.normalize(torch.linalg.cross(ab, ac), dim=-1)
     along = (normal * ahead).sum(-1)
     # On an edge several triangles are equally close: the one seen most squarely knows which side the vertex is on.
     best = (distance - 1e-3 * along.abs()).argmin(1)
@@ -93,31 +101,26 @@ def depths(vertices: Float[Tensor, "V 3"], watched: Watched) -> Depths:
     )
 
 
-def _closest(p: Tensor, a: Tensor, b: Tensor, c: Tensor) -> Float[Tensor, "M K 3"]:
-    """Barycentrics of the point of each triangle that is closest to its row's point.
+def _closest(ab: Tensor, ac: Tensor, ap: Tensor) -> Float[Tensor, "M K 3"]:
+    """Barycentrics of the point of a triangle that is closest to p, from two of its sides and the way to p.
 
     The foot on the plane where it lies inside, else the best of the three edges.
     """
-    ab, ac, ap = b - a, c - a, p - a
     d1, d2, d3, d4, d5 = ((s * t).sum(-1) for s, t in ((ab, ab), (ab, ac), (ac, ac), (ab, ap), (ac, ap)))
-    area = (d1 * d3 - d2 * d2).clamp_min(1e-30)
+    tiny = 1e-30
+    area = (d1 * d3 - d2 * d2).clamp_min(tiny)
     v, w = (d3 * d4 - d2 * d5) / area, (d1 * d5 - d2 * d4) / area
-    foot = torch.stack([1 - v - w, v, w], -1)
-    zero = torch.zeros_like(d1)
-    s, t = (d4 / d1.clamp_min(1e-30)).clamp(0, 1), (d5 / d3.clamp_min(1e-30)).clamp(0, 1)
-    along_bc = ((d1 - d2 - d4 + d5) / (d1 - 2 * d2 + d3).clamp_min(1e-30)).clamp(0, 1)
-    sides = torch.stack(
-        [
-            torch.stack([1 - s, s, zero], -1),
-            torch.stack([1 - t, zero, t], -1),
-            torch.stack([zero, 1 - along_bc, along_bc], -1),
-        ]
-    )
-    # Squared distance to p of a + v ab + w ac, but for |ap|^2, which all share.
-    v, w = sides[..., 1], sides[..., 2]
-    cost = v * v * d1 + 2 * v * w * d2 + w * w * d3 - 2 * v * d4 - 2 * w * d5
-    best = cost.argmin(0)[None, ..., None].expand(1, *d1.shape, 3)
-    return torch.where((foot >= 0).all(-1, keepdim=True), foot, sides.gather(0, best)[0])
+    inside = (v >= 0) & (w >= 0) & (v + w <= 1)
+    zero = torch.zeros_like(v)
+    on_ab, on_ac = (d4 / d1.clamp_min(tiny)).clamp(0, 1), (d5 / d3.clamp_min(tiny)).clamp(0, 1)
+    on_bc = ((d1 - d2 - d4 + d5) / (d1 - 2 * d2 + d3).clamp_min(tiny)).clamp(0, 1)
+    best = torch.full_like(v, torch.inf)
+    for s, t in ((on_ab, zero), (zero, on_ac), (1 - on_bc, on_bc)):
+        # Squared distance from p to a + s ab + t ac, but for |ap|^2, which all share.
+        cost = s * s * d1 + 2 * s * t * d2 + t * t * d3 - 2 * s * d4 - 2 * t * d5
+        nearer = ~inside & (cost < best)
+        best, v, w = torch.where(nearer, cost, best), torch.where(nearer, s, v), torch.where(nearer, t, w)
+    return torch.stack([1 - v - w, v, w], -1)
 
 
 class Solids:
@@ -152,7 +155,7 @@ class Solids:
             corners = vertices[part.triangles]
             low, high = corners.min((0, 1)) - self._outside, corners.max((0, 1)) + self._outside
             boxed = np.flatnonzero(((x > low) & (x < high)).all(1))
-            row, around = _around(x[boxed], corners, max(self._inside, self._outside))
+            row, around = _around(x[boxed], corners, self._inside, self._outside)
             found.append(_rows(self.points, boxed[row], part, around))
         watched = Watched.joined(found)
         now = depths(torch.as_tensor(vertices), watched)
@@ -209,13 +212,15 @@ def _rows(points: np.ndarray, place: np.ndarray, patch: _Patch, around: np.ndarr
 
 
 def _around(
-    points: Float[np.ndarray, "P 3"], corners: Float[np.ndarray, "F 3 3"], reach: float
+    points: Float[np.ndarray, "P 3"], corners: Float[np.ndarray, "F 3 3"], inside: float, outside: float
 ) -> tuple[Int[np.ndarray, "M"], Int[np.ndarray, "M K"]]:
-    """The points that may have a triangle in reach, and the triangles with the nearest centroids; some repeat."""
+    """The points that may be near enough to a part, and the triangles with the nearest centroids; some repeat."""
     if not len(points) or not len(corners):
         return np.empty(0, int), np.empty((0, _WATCHED), int)
     centres = corners.mean(1)
     radius = np.linalg.norm(corners - centres[:, None], axis=-1).max()
-    away, index = cKDTree(centres).query(points, k=_WATCHED, distance_upper_bound=reach + radius)
-    row = np.flatnonzero(np.isfinite(away[:, 0]))
+    away, index = cKDTree(centres).query(points, k=_WATCHED, distance_upper_bound=max(inside, outside) + radius)
+    a, b, c = corners[np.minimum(index[:, 0], len(corners) - 1)].transpose(1, 0, 2)
+    behind = (np.cross(b - a, c - a) * (points - a)).sum(1) < 0  # of most that are; others are soon near enough
+    row = np.flatnonzero((away[:, 0] < outside + radius) | (behind & np.isfinite(away[:, 0])))
     return row, np.where(np.isfinite(away[row]), index[row], index[row, :1])

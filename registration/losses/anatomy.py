@@ -68,7 +68,7 @@ class SelfIntersection:
         self._origin = vertices[self._skin].mean(0)
         local = self._local(vertices).cpu().numpy()
         found = [surface.watched(local) for _, surface in self._surfaces]
-        self._watched = Watched.joined(found).to(self._device)
+        self._index, self._watched = Watched.joined(found).to(self._device).compact()
         of = np.repeat(np.arange(len(found)), [len(rows.place) for rows in found])
         first = self._slots[len(self._eyeballs) + of]
         pair = np.array([self.pairs.index(name) for name, _ in self._surfaces])[of]
@@ -94,21 +94,22 @@ class SelfIntersection:
         found.view(-1).scatter_reduce_(0, pair * len(vertices) + points, excess, "amax")
         return dict(zip(self.pairs, found, strict=True))
 
-    def _local(self, vertices: Float[Tensor, "V 3"]) -> Float[Tensor, "V 3"]:
+    def _local(self, vertices: Float[Tensor, "U 3"]) -> Float[Tensor, "U 3"]:
         return (vertices - self._origin) * (MM_PER_M / self._scale)
 
     def _depths(
         self, vertices: Float[Tensor, "V 3"]
     ) -> tuple[Int[Tensor, "M"], Int[Tensor, "M"], Int[Tensor, "M"], Float[Tensor, "M"]]:
         """Slot, pair, vertex and depth (mm of the template's size) of all that is deeper than allowed, and of lids."""
-        local = self._local(vertices)
-        now = depths(local, self._watched)
+        near = self._local(vertices.index_select(0, self._index))
+        now = depths(near, self._watched)
         deep = (now.depth > self._allowed[self._slot]).nonzero()[:, 0]
         points = self._watched.points
-        found = [(self._slot[deep], self._pair[deep], points[deep], now.again(local, points, deep))]
+        found = [(self._slot[deep], self._pair[deep], self._index[points[deep]], now.again(near, points, deep))]
         for eyeball, start in zip(self._eyeballs, self._slots, strict=False):
-            slot = torch.arange(start, start + len(eyeball.points), device=self._device)
-            found.append((slot, torch.zeros_like(slot), eyeball.lids, eyeball.depths(local)))
+            depth = eyeball.depths(self._local(vertices.index_select(0, eyeball.index)))
+            slot = torch.arange(start, start + len(depth), device=self._device)
+            found.append((slot, torch.zeros_like(slot), eyeball.index[: len(depth)], depth))
         slot, pair, points, depth = (torch.cat(columns) for columns in zip(*found, strict=True))
         return slot, pair, points, depth
 
@@ -124,16 +125,16 @@ class _Eyeball:
         centre, radius = (value.numpy() for value in fit_sphere(torch.as_tensor(rest[index[main]])))
         bulge = ~main & (np.linalg.norm(rest[index] - centre, axis=1) > radius)
         spheres = [index[main], index[bulge]] if bulge.sum() >= _LEAST_CORNEA else [index[main]]
-        self._spheres = [torch.as_tensor(sphere, device=device) for sphere in spheres]
         self.points = np.flatnonzero(regions.exterior(data) & _near(rest, shell, _LIDS))
-        self.lids = torch.as_tensor(self.points, device=device)
+        self.index = torch.as_tensor(np.concatenate([self.points, *spheres]), device=device)
+        self._sizes = [len(part) for part in (self.points, *spheres)]
 
-    def depths(self, vertices: Float[Tensor, "V 3"]) -> Float[Tensor, "P"]:
-        """How deep each point lies in the eyeball as its vertices are now; negative outside. Differentiable."""
-        lids = vertices.index_select(0, self.lids)
+    def depths(self, vertices: Float[Tensor, "U 3"]) -> Float[Tensor, "P"]:
+        """How deep each point lies in the eyeball; negative outside. Differentiable in the vertices at `index`."""
+        lids, *spheres = vertices.split(self._sizes)
         found = []
-        for sphere in self._spheres:
-            centre, radius = fit_sphere(vertices.index_select(0, sphere))
+        for sphere in spheres:
+            centre, radius = fit_sphere(sphere)
             found.append(radius - (lids - centre).norm(dim=-1))
         return torch.stack(found).amax(0)
 
