@@ -19,7 +19,7 @@ from registration.losses.texture import TextureSlide
 from registration.model.gnm import GNM
 from registration.model.gnm_npz import GNMData
 from registration.model.landmarks import LandmarkScheme
-from registration.model.regions import crossing_parts, offset_regions, vertex_classes
+from registration.model.regions import crossing_parts, group, offset_regions, vertex_classes
 from registration.optimize import AdamBlock, AdamUniformBlock, Block, History, minimise
 from registration.render.renderer import Renderer
 from registration.stages import Lengths, Recipe, Stage, rigid
@@ -67,7 +67,14 @@ class Fit:
         self.device = model.template.device
         self.corner_uvs = corner_uvs
         classes = vertex_classes(data)[1] @ mapping.from_model
-        self.renderer = Renderer(data.triangles, corner_uvs, classes, parts=crossing_parts(data), seed=seed)
+        self.renderer = Renderer(
+            data.triangles,
+            corner_uvs,
+            classes,
+            parts=crossing_parts(data) * bool(recipe.edge_samples),  # one part alone crosses nothing
+            edge_samples=recipe.edge_samples,
+            seed=seed,
+        )
         self.schemes = {name: scheme for name, scheme in schemes.items() if name in pyramid[0].landmarks}
         self.landmark_use: dict[str, np.ndarray] = {  # bool (L,)
             name: np.ones(len(scheme.indices), bool) for name, scheme in self.schemes.items()
@@ -75,6 +82,8 @@ class Fit:
         self.appearance = Appearance(self.renderer, recipe.texture_px, len(pyramid[0].names), self.device)
         self.trust = Trust.full(len(pyramid[0].names))
         self._contacts = SelfIntersection(data, self.device)
+        eyeballs = np.maximum(group(data, "left_eye"), group(data, "right_eye")) > 0.5
+        self._eyeballs = torch.as_tensor(eyeballs, device=self.device)[:, None]
         self._slide: TextureSlide | None = None
         self._random = np.random.default_rng(seed)
         self._order: list[int] = []
@@ -176,6 +185,9 @@ class Fit:
     def _bend(self, lengths: Lengths) -> LargeSteps:
         """The preconditioner and the penalties of a stage's lengths, region by region."""
         times = np.array([1.0, *(region.length for region in self.recipe.regions)])[self._region]
+        smoothing = times * lengths.smoothing_mm / MM_PER_M
+        if lengths.smoothing_mm > 0:  # less than an edge is no smoothing, and the scalp's are long
+            smoothing = np.maximum(smoothing, self._spacing)
         self._elasticity = geometry.Elasticity(
             self._skin_triangles,
             self._skin_points,
@@ -187,7 +199,7 @@ class Fit:
             self._skin_triangles,
             len(times),
             edge_length_m=self._spacing,
-            smoothing_m=np.maximum(times * lengths.smoothing_mm / MM_PER_M, self._spacing),
+            smoothing_m=smoothing,
             device=self.device,
         )
 
@@ -233,9 +245,11 @@ class Fit:
         terms = self._image_terms(stage, rendered, batch, views)
         terms |= self._landmark_terms(stage, vertices, batch)
         if stage.weights.contacts > 0:
+            # Eyeballs are seen and round: images place them, and lids, most of whose rims no image shows, yield.
+            touching = torch.where(self._eyeballs, vertices.detach(), vertices)
             if step % _CONTACTS_EVERY == 0:
-                self._contacts.refresh(vertices)
-            for pair, penalty in self._contacts(vertices).items():
+                self._contacts.refresh(touching)
+            for pair, penalty in self._contacts(touching).items():
                 terms[f"contact {pair}"] = stage.weights.contacts * penalty
         if stage.weights.slide > 0 and self._slide is not None:
             even = replace(batch, rgb=self.appearance.corrected(batch, views))

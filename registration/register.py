@@ -62,7 +62,7 @@ def register(
     *,
     model_path: Path,
     out: Path,
-    recipe: str = "draft",
+    recipe: str | Recipe = "draft",
     views: int | None = None,
     seed: int = 0,
     neutral: Path | None = None,
@@ -78,7 +78,7 @@ def register(
         capture_path: a native capture folder.
         model_path: an official GNM NPZ file; landmark schemes lie beside it.
         out: replaced if we wrote it before; returned at once if it was made from the same inputs.
-        recipe: "draft" or "studio".
+        recipe: "draft", "studio", "in_model", or one of your own.
         views: use only so many views, spread around the head.
         seed: of view subsets and silhouette samples.
         neutral: folder of the subject's neutral registration: its identity, offsets and texture are the start, and
@@ -122,22 +122,22 @@ def register(
 def _read_inputs(
     capture_path: Path,
     model_path: Path,
-    recipe_name: str,
+    wanted: str | Recipe,
     views: int | None,
     neutral_path: Path | None,
     landmark_files: Mapping[str, Path],
     settings: Mapping[str, Any],
 ) -> Inputs:
     """Read and check everything; only landmarks are triangulated."""
-    if recipe_name not in RECIPES:
+    if isinstance(wanted, str) and wanted not in RECIPES:
         raise InputError(
             "There is no such recipe",
             where="recipe",
             expected=" or ".join(RECIPES),
-            got=recipe_name,
+            got=wanted,
             fix="choose one of them",
         )
-    recipe = RECIPES[recipe_name]()
+    recipe = RECIPES[wanted]() if isinstance(wanted, str) else wanted
     capture = read(capture_path)
     validate(capture)
     if views is not None:

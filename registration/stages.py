@@ -75,6 +75,7 @@ class Recipe:
     levels: int = 3
     texture_px: int = 1024
     slide_px: int = 512  # of the textures compared for sliding
+    edge_samples: float = 1.0  # a pixel of silhouette; 0: silhouettes move nothing, as in renderers without edges
     scale: bool = True  # free the overall size: a basis rebuilt from scale-free data holds none
     regions: tuple[Region, ...] = (
         Region(name="lips", length=0.6),

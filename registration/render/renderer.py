@@ -52,7 +52,8 @@ class Renderer:
             parts: of the mesh that may run through one another, by number; unless told, those that share no vertex.
             pixel_samples: rays per pixel, averaged; 1 is the pixel's centre, which aliases but is enough for a fit. Of
                 more, pixels whose rays differ on whether they meet the mesh have at least 16.
-            edge_samples: silhouette samples per pixel of projected silhouette length, in the adjoint.
+            edge_samples: silhouette samples per pixel of projected silhouette length, in the adjoint; 0 leaves
+                silhouettes out.
             seed: of those samples; every adjoint draws new ones.
 
         Raises:
@@ -214,6 +215,8 @@ class Renderer:
 
     def _edge_gradients(self, drawn: Drawn, adjoint: Adjoint, vertices: RowSum) -> None:
         """Add what the silhouettes give."""
+        if not self._edge_samples:
+            return
         self._seed += 1
         silhouette.backward(
             self._scene,

@@ -1,0 +1,117 @@
+"""What each term of a fit is worth: the draft recipe without it, on a neutral and on an expression from it.
+
+    python bench/ablation.py --model MODEL.npz --neutral CAPTURE --expression CAPTURE --out FOLDER [--only NAME ...]
+
+Registrations are kept in FOLDER, so that a run that was stopped goes on where it was. The expression starts from the
+neutral of the whole recipe throughout: what is left out is left out of its own fit only. mm on the face; "too deep"
+counts vertices more than 0.3 mm deeper in another part than in the template; seconds are those of the stages, on whatever
+else the machine was doing.
+"""
+
+import argparse
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+from rich.table import Table
+
+from registration.artifacts import load_registration
+from registration.capture.native import read
+from registration.evaluate.audit import BEYOND
+from registration.evaluate.evaluation import evaluate
+from registration.progress import shown
+from registration.register import register
+from registration.stages import Recipe, Stage, draft
+from registration.types import Registration
+
+
+def _weights(**changes: float) -> Callable[[Recipe], Recipe]:
+    def change(stage: Stage) -> Stage:
+        return replace(stage, weights=replace(stage.weights, **changes))
+
+    return lambda recipe: replace(recipe, stages=tuple(change(stage) for stage in recipe.stages))
+
+
+def _without_large_steps(recipe: Recipe) -> Recipe:
+    """Every vertex steps on its own."""
+
+    def change(stage: Stage) -> Stage:
+        return stage if stage.lengths is None else replace(stage, lengths=replace(stage.lengths, smoothing_mm=0.0))
+
+    return replace(recipe, stages=tuple(change(stage) for stage in recipe.stages))
+
+
+def _without_colour(recipe: Recipe) -> Recipe:
+    stages = (
+        replace(stage, texture=False, weights=replace(stage.weights, rgb=0.0, ssim=0.0, slide=0.0))
+        for stage in recipe.stages
+    )
+    return replace(recipe, stages=tuple(stages))
+
+
+VARIANTS: Mapping[str, Callable[[Recipe], Recipe]] = {
+    "everything": lambda recipe: recipe,
+    "edges": lambda recipe: replace(recipe, edge_samples=0.0),
+    "UV SSIM": _weights(slide=0.0),
+    "contacts": _weights(contacts=0.0),
+    "large steps": _without_large_steps,
+    "normals": _weights(normals=0.0),
+    "classes": _weights(classes=0.0),
+    "landmarks": _weights(landmarks=0.0),
+    "RGB and UV SSIM": _without_colour,
+}
+
+
+def _row(registration: Registration, drift: Mapping[str, Any] | None) -> list[str]:
+    figures = registration.figures
+    face = figures["scan_to_mesh"]["face"]
+    cells = [f"{face['mean_mm']:.3f}", f"{face['median_mm']:.3f}"]
+    if drift is not None:
+        cells += [f"{drift['mean_mm']:.3f}", f"{drift['p95_mm']:.2f}"]
+    stages = sum(seconds for name, seconds in registration.seconds.items() if name not in ("targets", "start"))
+    return [*cells, str(figures["intersections"][BEYOND]), f"{stages:.0f}"]
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    for name in ("model", "neutral", "expression", "out"):
+        parser.add_argument(f"--{name}", type=Path, required=True)
+    parser.add_argument("--only", nargs="*", choices=VARIANTS, default=list(VARIANTS))
+    options = parser.parse_args()
+    whole = options.out / "everything" / "neutral"
+    heads = ("without", "mean", "median", "too deep", "s")
+    neutral_table = Table(*heads, title=f"{options.neutral.name}, draft")
+    drifting = ("without", "mean", "median", "drift", "p95", "too deep", "s")
+    expression_table = Table(*drifting, title=f"{options.expression.name}, draft, from the whole recipe's neutral")
+    with shown() as progress:
+        for name in dict.fromkeys(["everything", *options.only]):
+            recipe, folder = VARIANTS[name](draft()), options.out / name.replace(" ", "_")
+            recipe = replace(recipe, name=f"draft without {name}" if name != "everything" else "draft")
+            progress.note(f"without {name}" if name != "everything" else name)
+            made = register(
+                options.neutral, model_path=options.model, out=folder / "neutral", recipe=recipe, progress=progress
+            )
+            neutral_table.add_row(name, *_row(made, None))
+            made = register(
+                options.expression,
+                model_path=options.model,
+                out=folder / "expression",
+                recipe=recipe,
+                neutral=whole,
+                progress=progress,
+            )
+            found = evaluate(
+                made,
+                read(options.expression),
+                neutral=load_registration(whole),
+                neutral_capture=read(options.neutral),
+            )
+            expression_table.add_row(name, *_row(made, found.figures["drift"]["face"]))
+    for table in (neutral_table, expression_table):
+        Console(width=100).print(table)
+
+
+if __name__ == "__main__":
+    main()
