@@ -18,6 +18,7 @@ from torch import Tensor
 from registration.geometry.topology import edges
 
 _WATCHED = 24  # triangles around a vertex
+_SELECTING = 6  # of them, the nearest, by which it is chosen what to watch
 # Cosine between the way to the closest point and the normal there; less is past the last triangle that was looked at.
 # Grooves of solids down to 60 degrees stay above it.
 _ALIGNED = 0.5
@@ -44,6 +45,10 @@ class Watched:
         index, place = ids.unique(return_inverse=True)
         points, triangles = place[: len(self.points)], place[len(self.points) :]
         return index, replace(self, points=points, triangles=triangles.view_as(self.triangles))
+
+    def first(self, count: int) -> "Watched":
+        """The same with the first triangles of each row alone."""
+        return replace(self, triangles=self.triangles[:, :count], rim=self.rim[:, :count])
 
     def only(self, rows: Bool[Tensor, "M"]) -> "Watched":
         return Watched(**{f.name: getattr(self, f.name)[rows] for f in fields(self)})
@@ -158,7 +163,7 @@ class Solids:
             row, around = _around(x[boxed], corners, self._inside, self._outside)
             found.append(_rows(self.points, boxed[row], part, around))
         watched = Watched.joined(found)
-        now = depths(torch.as_tensor(vertices), watched)
+        now = depths(torch.as_tensor(vertices), watched.first(_SELECTING))
         near = (now.depth > -self._outside) & (now.depth < self._inside)
         if self._ways is not None:
             way = self._ways.least(watched.place.numpy(), now.triangle.numpy())

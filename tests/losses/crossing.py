@@ -9,6 +9,8 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
 from torch import Tensor
 
 from registration.frames import MM_PER_M
@@ -38,6 +40,13 @@ class Recovered:
     def moved_mm(self, members: Bool[np.ndarray, "V"]) -> float:
         """The largest motion among some vertices."""
         return float((self.after - self.before)[torch.as_tensor(members)].norm(dim=1).max()) * MM_PER_M
+
+
+def moved(data: GNMData, members: Bool[np.ndarray, "V"], by_mm: tuple[float, ...]) -> Float[Tensor, "V 3"]:
+    """The template with some vertices moved as one body."""
+    vertices = torch.as_tensor(data.template_vertex_positions).clone()
+    vertices[torch.as_tensor(members)] += torch.tensor(by_mm) / MM_PER_M
+    return vertices
 
 
 def displaced(data: GNMData, members: Bool[np.ndarray, "V"], move: Float[np.ndarray, "V 3"]) -> Float[Tensor, "V 3"]:
@@ -124,6 +133,14 @@ def eyeball_depths_mm(data: GNMData, vertices: Float[Tensor, "V 3"]) -> Float[np
     depth = np.zeros(len(points))
     depth[near] = closest_points(points[near], points, ball)[0] * MM_PER_M * (winding(points[near], points[ball]) > 0.5)
     return depth
+
+
+def teeth_of(data: GNMData) -> list[Int[np.ndarray, "_ 3"]]:
+    """The triangles of each tooth."""
+    mesh = data.triangles[regions.teeth(data)[data.triangles].all(1)].astype(np.int64)
+    ends = np.concatenate([mesh[:, [0, 1]], mesh[:, [1, 2]]]).T
+    _, piece = connected_components(coo_matrix((np.ones(ends.shape[1]), ends)), directed=False)
+    return [mesh[piece[mesh[:, 0]] == number] for number in np.unique(piece[mesh])]
 
 
 def tooth_depths_mm(

@@ -4,19 +4,24 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from scipy.sparse import coo_matrix
-from scipy.sparse.csgraph import connected_components
 from scipy.spatial.transform import Rotation
 
 from registration.errors import InputError
-from registration.frames import MM_PER_M
 from registration.geometry.topology import vertex_normals
 from registration.losses.anatomy import SelfIntersection
 from registration.model import gnm_npz, regions
 from registration.model.gnm_npz import GNMData
 from tests.conftest import SHARED, needs_shared
 from tests.fixtures.make_fixtures import tiny_model
-from tests.losses.crossing import displaced, pressed_lid, raised_lower_lip, tooth_depths_mm, winding
+from tests.losses.crossing import (
+    displaced,
+    moved,
+    pressed_lid,
+    raised_lower_lip,
+    teeth_of,
+    tooth_depths_mm,
+    winding,
+)
 
 CPU = torch.device("cpu")
 PAIRS = (
@@ -48,13 +53,6 @@ def template(data: GNMData) -> torch.Tensor:
 def posed(vertices: torch.Tensor, scale: float) -> torch.Tensor:
     turn = torch.as_tensor(Rotation.from_rotvec([0.5, -0.8, 0.3]).as_matrix(), dtype=vertices.dtype)
     return scale * vertices @ turn.T + torch.tensor([0.7, -0.3, 1.1], dtype=vertices.dtype)
-
-
-def moved(data: GNMData, members: np.ndarray, by_mm: tuple[float, ...]) -> torch.Tensor:
-    """The template with some vertices moved as one body."""
-    vertices = template(data).clone()
-    vertices[torch.as_tensor(members)] += torch.tensor(by_mm) / MM_PER_M
-    return vertices
 
 
 def squeezed(data: GNMData) -> torch.Tensor:
@@ -194,11 +192,7 @@ def test_what_official_faces_do_by_themselves(full, penalty):
 @pytest.mark.parametrize("direction", [(1.0, 0.0, 0.0), (-0.7, 0.3, 0.7)])
 def test_a_tongue_pushed_into_the_teeth(full, penalty, direction):
     tongue = regions.tongue(full)
-    mesh = full.triangles[regions.teeth(full)[full.triangles].all(1)].astype(np.int64)
-    _, piece = connected_components(
-        coo_matrix((np.ones(2 * len(mesh)), (mesh[:, [0, 1]].ravel(), mesh[:, 1:].ravel())))
-    )
-    teeth = [mesh[piece[mesh[:, 0]] == number] for number in np.unique(piece[mesh])]
+    teeth = teeth_of(full)
     assert len(teeth) == 32
     deepest = []
     for push in (0.0, 1.0, 2.0, 3.0, 4.0, 5.0):

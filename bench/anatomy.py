@@ -1,0 +1,148 @@
+"""Self-intersection: what the penalty costs, how right it is, what comes apart again, what a model does by itself.
+
+    python -m bench.anatomy --model MODEL.npz [--samples FILE.npz]
+
+`--samples` has faces to look at beside random ones: arrays `identity_deltas` and `expression_deltas` (N, V, 3), metres,
+with `identity_names` and `expression_names`. Depths in crossed parts are measured apart from the penalty, by winding
+numbers and closest points (`tests/losses/crossing.py`), and told as an excess over the template's own.
+"""
+
+import argparse
+import statistics
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+import torch
+from rich.console import Console
+from rich.table import Table
+from torch import Tensor
+
+from registration.losses.anatomy import SelfIntersection
+from registration.model import gnm_npz, regions
+from registration.model.gnm_npz import GNMData
+from tests.losses import crossing
+
+REPEATS = 15
+PUSHES_MM = (1.0, 2.0, 3.0, 4.0, 5.0)
+DIRECTIONS = {"sideways": (1.0, 0.0, 0.0), "forwards": (0.0, 0.0, 1.0), "askew": (-0.7, 0.3, 0.7)}
+HEADS = 20  # random ones of each kind
+SIGMA = 0.5  # of random expression coefficients: those of independent components add up to grimaces
+MARGIN_MM = 0.05
+
+
+def cost(data: GNMData) -> Table:
+    """Medians of wall-clock milliseconds, on the template and on a head with crossed lips."""
+    table = Table("head", "construct", "refresh", "call", "call and backward", "a step, refreshed every 10")
+    begun = time.perf_counter()
+    penalty = SelfIntersection(data, torch.device("cpu"))
+    built = 1e3 * (time.perf_counter() - begun)
+    template = torch.as_tensor(data.template_vertex_positions)
+    for name, vertices in {"template": template, "crossed lips": crossing.raised_lower_lip(data, 2.0)}.items():
+        vertices = vertices.clone().requires_grad_(True)
+
+        def backward(vertices: Tensor = vertices) -> None:
+            torch.stack(list(penalty(vertices).values())).sum().backward()
+
+        refresh = median_ms(lambda vertices=vertices: penalty.refresh(vertices))
+        call, both = median_ms(lambda vertices=vertices: penalty(vertices)), median_ms(backward)
+        table.add_row(name, *(f"{ms:.1f}" for ms in (built, refresh, call, both, both + refresh / 10)))
+    return table
+
+
+def median_ms(work: Callable[[], object]) -> float:
+    seconds = []
+    for _ in range(REPEATS):
+        begun = time.perf_counter()
+        work()
+        seconds.append(time.perf_counter() - begun)
+    return 1e3 * statistics.median(seconds)
+
+
+def pushed_tongue(data: GNMData, penalty: SelfIntersection) -> Table:
+    """The tongue's vertices pushed into the teeth."""
+    table = Table("tongue pushed", "by, mm", "vertices inside", "deepest, mm", "largest error, mm")
+    tongue, teeth = regions.tongue(data), crossing.teeth_of(data)
+    for name, direction in DIRECTIONS.items():
+        for push in PUSHES_MM:
+            vertices = crossing.moved(data, tongue, tuple(push * axis for axis in direction))
+            penalty.refresh(vertices)
+            found = penalty.excess_mm(vertices)["tongue-teeth"].numpy()[tongue]
+            points = vertices.numpy().astype(np.float64)
+            truth = crossing.tooth_depths_mm(points[tongue], points, teeth)
+            error = np.abs(found - np.maximum(truth - MARGIN_MM, 0)).max()
+            table.add_row(name, f"{push:g}", f"{(truth > 0).sum()}", f"{truth.max():.2f}", f"{error:.3f}")
+    return table
+
+
+def recovered(data: GNMData) -> Table:
+    """Lips and a lid that crossed, after the penalty was minimised over the skin's offsets."""
+    table = Table("crossed", "by, mm", "too deep, mm", "after", "cheeks moved, mm", "skin moved, mm", "seconds")
+    template = torch.as_tensor(data.template_vertex_positions)
+    for name, cross, measure, rate in (
+        ("lips", crossing.raised_lower_lip, crossing.lip_depths_mm, 2e-4),
+        ("upper lid", crossing.pressed_lid, crossing.eyeball_depths_mm, 4e-5),
+    ):
+        rest = measure(data, template)
+        for by_mm in (1.0, 2.0, 3.0):
+            begun = time.perf_counter()
+            found = crossing.recover(data, cross(data, by_mm), steps=100, rate=rate)
+            seconds = time.perf_counter() - begun
+            before, after = ((measure(data, head) - rest).max() for head in (found.before, found.after))
+            motion = (found.moved_mm(crossing.cheeks(data)), found.moved_mm(regions.exterior(data)))
+            numbers = (before, after, *motion, seconds)
+            table.add_row(name, f"{by_mm:g}", *(f"{number:.2f}" for number in numbers))
+    return table
+
+
+def faces(data: GNMData, samples: Path | None) -> Iterator[tuple[str, Tensor]]:
+    """Heads of the model: given ones, then random ones kind by kind."""
+    template = data.template_vertex_positions.astype(np.float64)
+    if samples is not None:
+        with np.load(samples) as arrays:
+            for kind in ("identity", "expression"):
+                for name, delta in zip(arrays[f"{kind}_names"].tolist(), arrays[f"{kind}_deltas"], strict=True):
+                    yield f"{kind} {name}", torch.as_tensor(template + delta, dtype=torch.float32)
+    random = np.random.default_rng(0)
+    kinds = np.array([name.rsplit("_", 1)[0] for name in data.expression_names.tolist()])
+    bases = {f"random {kind}": SIGMA * data.expression_basis[kinds == kind] for kind in dict.fromkeys(kinds)}
+    for name, basis in {"random identity": data.vertex_identity_basis, **bases}.items():
+        for _ in range(HEADS):
+            move = np.tensordot(random.normal(size=len(basis)), basis.astype(np.float64), 1)
+            yield name, torch.as_tensor(template + move, dtype=torch.float32)
+
+
+def own_overlap(data: GNMData, penalty: SelfIntersection, samples: Path | None) -> Table:
+    """What the model's own faces overlap beyond the template: vertices, and the deepest; medians of random ones."""
+    table = Table("face", *penalty.pairs, title="vertices / deepest, mm; for random faces the median / the worst")
+    found: dict[str, list[dict[str, tuple[int, float]]]] = {}
+    for name, vertices in faces(data, samples):
+        penalty.refresh(vertices)
+        excess = penalty.excess_mm(vertices)
+        figures = {pair: (int((mm > 0).sum()), float(mm.max())) for pair, mm in excess.items()}
+        found.setdefault(name, []).append(figures)
+    for name, heads in found.items():
+        cells = []
+        for pair in penalty.pairs:
+            count, deepest = statistics.median(h[pair][0] for h in heads), max(h[pair][1] for h in heads)
+            middle = f"{statistics.median(h[pair][1] for h in heads):.2f} / " if len(heads) > 1 else ""
+            cells.append(f"{count:g} / {middle}{deepest:.2f}" if deepest > 0 else "")
+        table.add_row(name, *cells)
+    return table
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--model", type=Path, required=True)
+    parser.add_argument("--samples", type=Path)
+    arguments = parser.parse_args()
+    data, console = gnm_npz.read(arguments.model), Console()
+    console.print(cost(data))
+    penalty = SelfIntersection(data, torch.device("cpu"))
+    for table in (pushed_tongue(data, penalty), recovered(data), own_overlap(data, penalty, arguments.samples)):
+        console.print(table)
+
+
+if __name__ == "__main__":
+    main()
