@@ -213,7 +213,8 @@ def _attempt(action: Callable[[], T], progress: Progress) -> tuple[T | None, str
         return None, _line(error)
     except Exception as error:
         progress.note(traceback.format_exc())
-        return None, f"{type(error).__name__}: {error}"
+        first, *_ = str(error).splitlines() or [""]  # the log has it all
+        return None, f"{type(error).__name__}: {first}"
 
 
 def _line(error: InputError) -> str:

@@ -113,7 +113,7 @@ def test_an_unmeasured_drift_is_told(subject: Path, fake: FakeRegister):
     ("outcome", "status", "reason"),
     [
         (REFUSED, "error", "The lens is dirty: cam3; expected a clean one, got dust; wipe it"),
-        (RuntimeError("out of luck"), "error", "RuntimeError: out of luck"),
+        (RuntimeError("out of luck\nand more"), "error", "RuntimeError: out of luck"),
         ("failed", "failed", "it is failed"),
     ],
 )
