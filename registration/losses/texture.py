@@ -38,18 +38,6 @@ _LUMA = (0.2126, 0.7152, 0.0722)
 _CHANNELS = 3  # that are blurred together
 
 
-def trusted(data: GNMData, confidence: Float[np.ndarray, "V"]) -> Float[np.ndarray, "V"]:
-    """How much the neutral's texture tells of each vertex, from 0 to 1.
-
-    Nothing but on the exterior, and where the neutral's `confidence` is low: its texture is a guess there. Less on
-    lids, inner lips and cheeks, which fold or change their colour.
-    """
-    trust = (exterior(data) & (confidence > LEAST_CONFIDENCE)).astype(np.float64)
-    for role, left in _FADE:
-        trust *= 1 - (1 - left) * role(data)
-    return trust
-
-
 @dataclass(frozen=True, kw_only=True)
 class _Look:
     """Which of the points a camera saw when the vertices were these, and how well."""
@@ -68,8 +56,8 @@ class _Scale:
     weight: Float[Tensor, "h w"]  # 0 where nothing is compared
 
 
-class TextureSlide:
-    """The loss of one subject at one resolution of the texture."""
+class SurfaceTexture:
+    """What images show of a surface against its known texture, at one resolution."""
 
     def __init__(
         self,
@@ -83,8 +71,8 @@ class TextureSlide:
         Args:
             triangles: of the mesh; all of them hide what is behind them.
             corner_uvs: of the reference's atlas.
-            reference: the neutral's texture, linear.
-            trust: how much a vertex' surroundings count, as `trusted` has it; where it is 0, nothing is compared.
+            reference: the known texture, linear.
+            trust: how much a vertex' surroundings count; where it is 0, nothing is compared.
             size_px: at which textures are compared, a multiple of 4. Right are texels as large as the images' pixels:
                 an atlas of 512 texels has 1 mm of skin in one.
         """
@@ -205,6 +193,33 @@ class TextureSlide:
         weight = own**2 * camera.intrinsics[0, 0] * camera.intrinsics[1, 1] / depth**2 * 1e-6
         index, weights = (torch.as_tensor(values, device=vertices.device) for values in (point, weight))
         return index, weights.to(vertices)
+
+
+class TextureSlide(SurfaceTexture):
+    """The term for an expression of a subject whose neutral is known."""
+
+    def __init__(
+        self,
+        data: GNMData,
+        corner_uvs: Float[np.ndarray, "F 3 2"],
+        reference: Float[Tensor, "R R 3"],
+        confidence: Float[np.ndarray, "V"],
+        size_px: int,
+    ):
+        """Texture and `confidence` are the neutral's; the rest as for any surface."""
+        super().__init__(data.triangles, corner_uvs, reference, trusted(data, confidence), size_px)
+
+
+def trusted(data: GNMData, confidence: Float[np.ndarray, "V"]) -> Float[np.ndarray, "V"]:
+    """How much the neutral's texture tells of each vertex, from 0 to 1.
+
+    Nothing but on the exterior, and where the neutral's `confidence` is low: its texture is a guess there. Less on
+    lids, inner lips and cheeks, which fold or change their colour.
+    """
+    trust = (exterior(data) & (confidence > LEAST_CONFIDENCE)).astype(np.float64)
+    for role, left in _FADE:
+        trust *= 1 - (1 - left) * role(data)
+    return trust
 
 
 def _grey(linear: Float[Tensor, "*S 3"]) -> Float[Tensor, "*S"]:

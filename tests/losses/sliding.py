@@ -18,7 +18,7 @@ from registration.geometry.large_steps import LargeSteps
 from registration.geometry.raster import visible
 from registration.geometry.texels import texels
 from registration.geometry.topology import edges, vertex_normals
-from registration.losses.texture import TextureSlide, trusted
+from registration.losses.texture import SurfaceTexture, trusted
 from registration.model.atlas import texture_atlas
 from registration.model.gnm import GNM
 from registration.model.gnm_npz import GNMData
@@ -56,8 +56,8 @@ class Problem:
         away, normals = vertices - self.truth, normals_of(self.truth, self.triangles)
         return MM_PER_M * np.linalg.norm(away - (away * normals).sum(1, keepdims=True) * normals, axis=1)[self.judged]
 
-    def loss(self, size_px: int, dtype: torch.dtype = torch.float32) -> TextureSlide:
-        return TextureSlide(self.triangles, self.corner_uvs, self.texture.to(dtype), self.trust, size_px)
+    def loss(self, size_px: int, dtype: torch.dtype = torch.float32) -> SurfaceTexture:
+        return SurfaceTexture(self.triangles, self.corner_uvs, self.texture.to(dtype), self.trust, size_px)
 
     def disturbed(self, gain: float, blush: float) -> Targets:
         """The images with a gain, and with a smooth reddish brightening of the cheek."""
