@@ -362,7 +362,7 @@ def _judge(inputs: Inputs, fit: Fit, registration: Registration, progress: Progr
     finite = np.isfinite(registration.vertices).all()
     if finite:
         progress.note("auditing parts that may run through one another")
-        found = audit(registration.vertices, inputs.data).figures
+        found = audit(registration.vertices, inputs.data, scale=float(registration.scale)).figures
         registration = replace(registration, figures={**registration.figures, "intersections": found})
     if inputs.capture.scan is not None and finite:
         progress.note("measuring against the scan")

@@ -25,8 +25,8 @@ class Weights:
     identity: float = 2e-3
     expression: float = 2e-3
     rotations: float = 0.1  # joints other than the root, per rad^2
-    eyes: float = 5.0  # eyeballs moved out of the model's place, per m^2
-    eye_scale: float = 0.05
+    eyes: float = 1.0  # eyeballs moved out of the model's place, per m^2
+    eye_scale: float = 0.01
     offsets: float = 2e4  # per m^2: how hard images are taken to pull, which the lengths below are balanced against
     contacts: float = 0.0  # per mm^2, summed over the vertices that lie too deep in another part
     slide: float = 0.0  # dissimilarity of the neutral's texture and the images unwrapped; expressions only
@@ -102,7 +102,7 @@ def _model(steps: int) -> Stage:
 
 
 def _offsets(
-    smoothing_mm: float, half_gain_mm: float, steps: int, level: int, start: float, end: float, ssim: float = 0.2
+    smoothing_mm: float, half_gain_mm: float, steps: int, level: int, start: float, end: float, ssim: float = 0.06
 ) -> Stage:
     return Stage(
         name=f"offsets {smoothing_mm:g} mm",
@@ -110,7 +110,7 @@ def _offsets(
         level=level,
         lengths=Lengths(smoothing_mm=smoothing_mm, half_gain_mm=half_gain_mm),
         free=(("offsets", Rate(start=start, end=end)), ("eyes", Rate(start=start / 10, end=end / 10))),
-        weights=Weights(rgb=1.0, ssim=ssim, classes=0.1, landmarks=0.01, contacts=2e-4, slide=0.5),
+        weights=Weights(rgb=0.3, ssim=ssim, classes=0.1, landmarks=0.01, contacts=2e-4, slide=0.5),
         texture=True,
     )
 

@@ -14,7 +14,9 @@ from registration.render.shading import GROUPS, MASK, Surface
 _SAMPLED = 1 << 12  # values of a tensor tell how large it is
 _UNIT = 2.0**-22  # of a sum, in the largest adjoint sampled (per metre): integers below count such units
 _MOST = 2.0**42  # units of one lane: a million such lanes still fit
-_COPIES_BYTES = 1 << 29  # that threads may hold to sum apart
+# That threads may hold to sum apart. With copies of 256 MB (textures of 2048 px) kernels were seen to reach for memory
+# that was gone; sums are the same without copies, only slower.
+_COPIES_BYTES = 1 << 27
 
 
 @dataclass(frozen=True, kw_only=True)

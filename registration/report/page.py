@@ -64,13 +64,28 @@ def headline(registration: Registration) -> str:
     )
 
 
+def remarks(registration: Registration) -> list[str]:
+    """What a person should know beside the headline: views left out, landmarks left out, parts too deep in others."""
+    figures = registration.figures
+    found = [f"View {view} hardly counts: {why}." for view, why in figures.get("views_not_trusted", {}).items()]
+    found += [f"{note[:1].upper()}{note[1:]}." for note in figures.get("notes", [])]
+    for pair, row in figures.get("intersections", {}).get("pairs", {}).items():
+        count = sum(value for name, value in row.items() if name.startswith("vertices_beyond"))
+        if count:
+            deepest = _mm(row["max_excess_mm"])
+            found.append(f"{pair.capitalize()}: {count} vertices deeper than in the template, by up to {deepest} mm.")
+    return found
+
+
 def _header(inputs: ReportInputs) -> str:
     registration = inputs.registration
+    lines = "".join(f"<li>{escape(remark)}</li>" for remark in remarks(registration))
+    told = f"<ul>{lines}</ul>" if lines else ""
     return (
         '<header><div class="top"><div class="eyebrow">Head registration</div>'
         f"<h1>{escape(inputs.subject)} <span>{escape(inputs.expression)}</span>"
         f'<span class="badge {registration.status}" style="color:#fff">{registration.status}</span></h1>'
-        f'<p class="lead">{escape(headline(registration))}</p>{_tiles(inputs)}</div></header>'
+        f'<p class="lead">{escape(headline(registration))}</p>{told}{_tiles(inputs)}</div></header>'
     )
 
 
