@@ -4,8 +4,8 @@
 
 Registrations are kept in FOLDER, so that a run that was stopped goes on where it was. The expression starts from the
 neutral of the whole recipe throughout: what is left out is left out of its own fit only. mm on the face; "too deep"
-counts vertices more than 0.3 mm deeper in another part than in the template; seconds are those of the stages, on whatever
-else the machine was doing.
+counts vertices more than 0.3 mm deeper in another part than in the template; seconds are those of the stages, on
+whatever else the machine was doing.
 """
 
 import argparse

@@ -33,6 +33,7 @@ from registration.unknowns import Start, Unknowns, skin_topology, skin_vertices
 _SEPARATE = ("left_eye", "right_eye", "mouth_interior")
 _SETTLED_SHARE = 0.1  # of the last stage's steps, over which vertices must stand still
 _CONTACTS_EVERY = 10  # steps, after which parts that may touch are looked up anew
+_LONGEST_STEP_MM = 2.0  # of a region with a pace of its own, if the stage itself steps no further
 _REGION_RINGS = 2  # around a region that belong to it, so that its rim can follow
 
 
@@ -208,7 +209,8 @@ class Fit:
         for name, rate in stage.free:
             if name == "offsets":
                 groups = torch.as_tensor(self._region, device=self.device)
-                pace = (1.0, *(region.pace for region in self.recipe.regions))
+                fastest = max(1.0, _LONGEST_STEP_MM / MM_PER_M / rate.start)
+                pace = (1.0, *(min(region.pace, fastest) for region in self.recipe.regions))
                 blocks.append(AdamUniformBlock(self.unknowns[name], rate, groups=groups, pace=pace))
             elif name in free:
                 blocks.append(AdamBlock([self.unknowns[name]], rate))

@@ -187,7 +187,7 @@ def test_light_between_surfaces_bounces():
 
 
 def test_normals_are_the_meshs():
-    """At pixel centres, within one degree of the mesh's normals, weighted by area, at what the NumPy rasteriser finds there."""
+    """At pixel centres, within one degree of area-weighted normals at what the NumPy rasteriser finds there."""
     surface = head()
     cameras = rig(3, (150, 200), 5, centre=HEAD_CENTRE, spread_deg=(80, 30))
     corners = surface.vertices[surface.triangles]
