@@ -137,7 +137,7 @@ def studio(*, scale: bool = True) -> Recipe:
         _offsets(1.5, 4, 90, level=0, start=3e-4, end=1e-5, ssim=0.0),
     )
     wider = tuple(replace(stage, views_per_step=12) for stage in stages)
-    return Recipe(name="studio", stages=wider, scale=scale, finest_head_px=1024, texture_px=2048)
+    return Recipe(name="studio", stages=wider, scale=scale, finest_head_px=1024)
 
 
 def in_model(*, scale: bool = True) -> Recipe:
