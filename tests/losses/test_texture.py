@@ -11,6 +11,7 @@ import pytest
 import torch
 
 from registration.geometry.quads import corner_triangles, triangles_of
+from registration.geometry.texels import eroded, texels
 from registration.losses.texture import trusted
 from registration.model import gnm_npz
 from registration.model.regions import blush, exterior, inner_lips, lids
@@ -146,6 +147,23 @@ def test_resolutions_of_the_reference_agree(problem):
     double = problem.texture.repeat_interleave(2, 0).repeat_interleave(2, 1)
     for texture in (half, double):
         assert cost(problem, problem.start, texture=texture) == pytest.approx(cost(problem, problem.start), rel=1e-4)
+
+
+def test_windows_hold_one_chart(problem):
+    """At every scale: what has a weight is further from all other charts than a window reaches."""
+    loss = replace(problem, trust=np.ones(len(problem.truth))).loss(SIZE_PX)
+    atlas = texels(problem.triangles, problem.corner_uvs, SIZE_PX)
+    charts = atlas.image(atlas.chart, -1)
+    first = [places.min() // 4 * 4 for places in np.nonzero(eroded(charts, 2))]  # where the compared part begins
+    charts = charts[first[0] :, first[1] :]
+    for number, scale in enumerate(loss._scales):
+        block, weight = 2**number, scale.weight.numpy()
+        places = np.argwhere(weight > 0)[:: 16 // block**2]
+        assert len(places) > 900
+        for row, column in places:
+            above, left = (max(0, block * (place - 5)) for place in (row, column))
+            near = charts[above : block * (row + 6), left : block * (column + 6)]
+            assert len(np.unique(near[near >= 0])) == 1
 
 
 def test_sizes_that_cannot_be_halved_are_refused(problem):
