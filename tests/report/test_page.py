@@ -157,7 +157,7 @@ def test_remarks_name_what_was_left_out_and_what_lies_too_deep():
     page = write_report(some_inputs(registration=a_registration(figures=figures)))
     assert "<li>View cam03 hardly counts: silhouette 35 px off the other views.</li>" in page
     assert "<li>Landmarks 2-6 of scheme 68 lie elsewhere" in page
-    assert "<li>Tongue in gums: 2 vertices deeper than in the template, by up to 0.83 mm.</li>" in page
+    assert "<li>Tongue in gums: 2 vertices deeper than in the template, by up to 0.830 mm.</li>" in page
     assert "Ears in skin" not in page
     assert "<ul>" not in write_report(some_inputs())
 
