@@ -10,19 +10,18 @@ from dataclasses import dataclass, fields, replace
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
-from scipy.sparse import coo_matrix
-from scipy.sparse.csgraph import dijkstra
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from registration.geometry.topology import edges
+from registration.geometry.topology import edges, vertex_normals
+from registration.geometry.winding import Winding
 
 _WATCHED = 24  # triangles around a vertex
 _SELECTING = 6  # of them, the nearest, by which it is chosen what to watch
 # Cosine between the way to the closest point and the normal there; less is past the last triangle that was looked at.
 # Grooves of solids down to 60 degrees stay above it.
 _ALIGNED = 0.5
-_DETOUR = 3.0  # a contact is so much further along the surface than straight
+_ABOVE = 0.05  # mm over a vertex its own skin is no longer in the way
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -141,19 +140,22 @@ class Solids:
         *,
         inside: float,
         outside: float,
-        ways: "Ways | None" = None,
+        flesh: "Flesh | None" = None,
     ):
         """Vertices are watched while they are at most `inside` behind and `outside` in front of a part's surface.
 
-        `ways`, from the points, for parts that the points' own surface runs on into, as lips do at the mouth's corners.
-        There a vertex has the far side of its own flesh behind it, and only what is far along the surface is a contact.
+        `flesh`, where parts and points have one surface, as the lips do at the corners of the mouth. There a vertex can
+        be behind a part and yet in nothing: the part's surface is the far side of what lies under the vertex.
         """
         self.points = points
         self._parts = [_Patch(part) for part in parts if len(part)]
-        self._inside, self._outside, self._ways = inside, outside, ways
+        self._inside, self._outside, self._flesh = inside, outside, flesh
 
-    def watched(self, vertices: Float[np.ndarray, "V 3"]) -> Watched:
-        """What to watch now: vertices, once for every part that is near."""
+    def watched(self, vertices: Float[np.ndarray, "V 3"], allowed: Float[np.ndarray, "P"]) -> Watched:
+        """What to watch now: vertices, once for every part that is near.
+
+        The origin is to lie deep inside the head. What is no deeper than `allowed` needs no proof that it is inside.
+        """
         x = vertices[self.points]
         found = [_rows(self.points, np.empty(0, int), _Patch(), np.empty((0, _WATCHED), int))]
         for part in self._parts:
@@ -163,52 +165,46 @@ class Solids:
             row, around = _around(x[boxed], corners, self._inside, self._outside)
             found.append(_rows(self.points, boxed[row], part, around))
         watched = Watched.joined(found)
-        now = depths(torch.as_tensor(vertices), watched.first(_SELECTING))
-        near = (now.depth > -self._outside) & (now.depth < self._inside)
-        if self._ways is not None:
-            way = self._ways.least(watched.place.numpy(), now.triangle.numpy())
-            near &= torch.as_tensor(way) > _DETOUR * now.depth.abs()
-        return watched.only(near)
+        depth = depths(torch.as_tensor(vertices), watched.first(_SELECTING)).depth.numpy()
+        near = (depth > -self._outside) & (depth < self._inside)
+        deep = np.flatnonzero(near & (depth > allowed[watched.place.numpy()]))
+        if self._flesh is not None and len(deep):
+            near[deep] = self._flesh.holds(vertices, watched.points.numpy()[deep])
+        return watched.only(torch.as_tensor(near))
 
 
-class Ways:
-    """How long the ways along a surface are at rest, from some vertices to others; inf if longer than a limit."""
+class Flesh:
+    """What lies under a piece of skin, down to a cone from its border to the origin."""
 
-    def __init__(
-        self,
-        starts: Int[np.ndarray, "P"],
-        mesh: Int[np.ndarray, "F 3"],
-        rest: Float[np.ndarray, "V 3"],
-        limit: float,
-    ):
-        ends = edges(mesh).vertices
-        if not len(starts):
-            self._column, self._ways = np.zeros(len(rest), int), np.empty((0, 1), np.float32)
-            return
-        # Such a way stays close to where it starts: the rest of the mesh need not be looked at.
-        close = np.isfinite(cKDTree(rest[starts]).query(rest, distance_upper_bound=limit)[0])
-        self._column = np.where(close, close.cumsum() - 1, close.sum())
-        ends = self._column[ends[close[ends].all(1)]]
-        at = rest[close]
-        length = np.linalg.norm(at[ends[:, 0]] - at[ends[:, 1]], axis=1)
-        graph = coo_matrix((length, ends.T), (len(at), len(at))).tocsr()
-        ways = dijkstra(graph, directed=False, indices=self._column[starts], limit=limit)
-        self._ways = np.pad(ways.astype(np.float32), ((0, 0), (0, 1)), constant_values=np.inf)
+    def __init__(self, triangles: Int[np.ndarray, "F 3"]):
+        self._patch = _Patch(triangles)
+        self._looked: tuple[np.ndarray, np.ndarray, Winding] | None = None
 
-    def least(self, place: Int[np.ndarray, "M"], ends: Int[np.ndarray, "M N"]) -> Float[np.ndarray, "M"]:
-        """The shortest way from the start at each place to any of its ends."""
-        return self._ways[place[:, None], self._column[ends]].min(1)
+    def holds(self, vertices: Float[np.ndarray, "V 3"], points: Int[np.ndarray, "M"]) -> Bool[np.ndarray, "M"]:
+        """Whether vertices of the skin, or rather points closely above them, lie inside of it."""
+        if self._looked is None or self._looked[0] is not vertices:  # several parts ask about one mesh
+            self._looked = (vertices, *self._look(vertices))
+        _, normals, winding = self._looked
+        return winding.numbers(vertices[points] + _ABOVE * normals[points]) > 0.5
+
+    def _look(self, vertices: Float[np.ndarray, "V 3"]) -> tuple[Float[np.ndarray, "V 3"], Winding]:
+        triangles, border = self._patch.triangles, self._patch.border
+        cone = np.column_stack([border[:, ::-1], np.full(len(border), len(vertices))])
+        closed = np.concatenate([triangles, cone])
+        normals = vertex_normals(torch.as_tensor(vertices), torch.as_tensor(triangles)).numpy()
+        return normals, Winding(np.concatenate([vertices, np.zeros((1, 3))]), closed)
 
 
 class _Patch:
-    """Triangles of one surface, and which of their corners lie on its border."""
+    """Triangles of one surface, the edges at its border, and which corners lie on it."""
 
     def __init__(self, triangles: Int[np.ndarray, "F 3"] | None = None):
         self.triangles = np.empty((0, 3), int) if triangles is None else triangles
-        self.rim = np.zeros(self.triangles.shape, bool)
+        self.border = np.empty((0, 2), int)
         if len(self.triangles):
             found = edges(self.triangles)
-            self.rim = np.isin(self.triangles, found.vertices[found.faces[:, 1] < 0])
+            self.border = found.vertices[found.faces[:, 1] < 0]
+        self.rim = np.isin(self.triangles, self.border)
 
 
 def _rows(points: np.ndarray, place: np.ndarray, patch: _Patch, around: np.ndarray) -> Watched:

@@ -15,7 +15,7 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from registration.frames import MM_PER_M
-from registration.geometry.contacts import Solids, Watched, Ways, depths
+from registration.geometry.contacts import Flesh, Solids, Watched, depths
 from registration.geometry.spheres import fit_sphere, on_main_sphere
 from registration.geometry.topology import connected_parts, edges
 from registration.model import regions
@@ -24,10 +24,8 @@ from registration.model.gnm_npz import GNMData
 # Lengths in mm of the template's size.
 _MARGIN = 0.05  # so much deeper than at rest costs nothing
 _OUTSIDE, _INSIDE = 3.0, 8.0  # vertices so far in front of and behind a surface are watched
-# Behind the skin, for its contacts with itself: deeper lies the far side of a vertex' own flesh. They are checked to be
-# further along the skin than straight, for which ways up to the next length are known.
-_FLESH, _WAYS = 4.0, 12.0
 _BEHIND_EARS = 25.0  # the part of the head that ears can get to
+_AROUND = 5.0  # skin around that and around lips, by which it is told what lies inside
 _LINING = 6.0  # of the mouth, as far as it belongs to a lip
 _LIDS = 6.0  # from the eyeball
 _LEAST_CORNEA = 8  # vertices; fewer are no second sphere
@@ -67,7 +65,8 @@ class SelfIntersection:
         self._scale = _spread(vertices[self._skin]) / self._size
         self._origin = vertices[self._skin].mean(0)
         local = self._local(vertices).cpu().numpy()
-        found = [surface.watched(local) for _, surface in self._surfaces]
+        allowed = np.split(self._allowed.cpu().numpy(), self._slots[1:-1])[len(self._eyeballs) :]
+        found = [surface.watched(local, most) for (_, surface), most in zip(self._surfaces, allowed, strict=True)]
         self._index, self._watched = Watched.joined(found).to(self._device).compact()
         of = np.repeat(np.arange(len(found)), [len(rows.place) for rows in found])
         first = self._slots[len(self._eyeballs) + of]
@@ -141,32 +140,32 @@ class _Eyeball:
 
 def _surfaces(data: GNMData, rest: Float[np.ndarray, "V 3"]) -> list[tuple[str, Solids]]:
     """Vertices and the parts that they can get into, each with the name of its pair."""
-    skin, ears = regions.exterior(data), regions.ears(data)
-    mesh = data.triangles.astype(np.int64)
+    mesh, skin = data.triangles.astype(np.int64), regions.solids(data)["skin"]
     upper, lower = regions.lips(data)
     inner_upper, inner_lower = _linings(data, rest)
-    head = skin & ~ears & _near(rest, ears, _BEHIND_EARS)
-    in_tongue, teeth = regions.tongue(data), _teeth(data)
-    tongue = [mesh[in_tongue[mesh].all(1)]]
+    ears, teeth, tongue = regions.ears(data), _teeth(data), regions.tongue(data)
+    head = regions.exterior(data) & ~ears & _near(rest, ears, _BEHIND_EARS)
 
-    def into(points: np.ndarray, parts: list[np.ndarray]) -> Solids:
-        return Solids(np.flatnonzero(points), parts, inside=_INSIDE, outside=_OUTSIDE)
+    def part(members: np.ndarray) -> list[np.ndarray]:
+        return [mesh[members[mesh].all(1)]]
 
-    def within_skin(points: np.ndarray, part: np.ndarray) -> Solids:
-        start = np.flatnonzero(points)
-        ways = Ways(start, mesh, rest, _WAYS)
-        return Solids(start, [mesh[part[mesh].all(1)]], inside=_FLESH, outside=_OUTSIDE, ways=ways)
+    def into(points: np.ndarray, parts: list[np.ndarray], flesh: Flesh | None = None) -> Solids:
+        return Solids(np.flatnonzero(points), parts, inside=_INSIDE, outside=_OUTSIDE, flesh=flesh)
 
+    around_mouth, around_ears = (
+        Flesh(skin[_near(rest, members, _AROUND)[skin].all(1)])
+        for members in (upper | lower | regions.mouth_lining(data), ears | head)
+    )
     return [
         ("lips-teeth", into(upper | lower, teeth)),
-        ("upper-lower lip", within_skin(upper, lower | inner_lower)),
-        ("upper-lower lip", within_skin(lower, upper | inner_upper)),
-        ("tongue-teeth", into(in_tongue, teeth)),
-        ("tongue-teeth", into(regions.teeth(data), tongue)),
-        ("tongue-lips", into(upper | lower, tongue)),
-        ("tongue-palate", into(regions.palate(data), tongue)),
-        ("ears-head", within_skin(ears, head)),
-        ("ears-head", within_skin(head, ears)),
+        ("upper-lower lip", into(upper, part(lower | inner_lower), around_mouth)),
+        ("upper-lower lip", into(lower, part(upper | inner_upper), around_mouth)),
+        ("tongue-teeth", into(tongue, teeth)),
+        ("tongue-teeth", into(regions.teeth(data), part(tongue))),
+        ("tongue-lips", into(upper | lower, part(tongue))),
+        ("tongue-palate", into(regions.palate(data), part(tongue))),
+        ("ears-head", into(ears, part(head), around_ears)),
+        ("ears-head", into(head, part(ears), around_ears)),
     ]
 
 

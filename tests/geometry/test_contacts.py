@@ -6,7 +6,7 @@ import torch
 import trimesh
 
 from registration.geometry.closest_point import closest_points
-from registration.geometry.contacts import Depths, Solids, Watched, Ways, depths
+from registration.geometry.contacts import Depths, Flesh, Solids, Watched, depths
 from tests.losses.crossing import winding
 
 
@@ -23,7 +23,8 @@ class Scene:
         self.vertices = np.concatenate([points, *(solid.vertices for solid in solids)])
 
     def look(self, inside: float = 20.0, outside: float = 20.0) -> tuple[Watched, Depths]:
-        watched = Solids(self.points, self.parts, inside=inside, outside=outside).watched(self.vertices)
+        solids = Solids(self.points, self.parts, inside=inside, outside=outside)
+        watched = solids.watched(self.vertices, np.zeros(len(self.points)))
         return watched, depths(torch.as_tensor(self.vertices), watched)
 
     def depth(self) -> np.ndarray:
@@ -137,38 +138,39 @@ def test_nothing_to_watch():
         assert len(watched.place) == len(found.depth) == 0
 
 
-def hairpin(length: int, gap: float) -> tuple[np.ndarray, np.ndarray]:
-    """A sheet of flesh: a grid of unit steps that runs out, turns around an edge and comes back `gap` below.
+def pin_in_a_block() -> tuple[np.ndarray, np.ndarray, int]:
+    """Vertices, triangles and how many of the vertices are the block's: a pin, open at its far end, stuck into it.
 
-    Upper rows are vertices 0 .. 5 * length - 1, row by row towards the turn; lower ones follow, away from it.
+    The block reaches from x = -9 to 1, the pin from -1 to 9; the origin is inside of both.
     """
-    along = np.concatenate([np.arange(length), np.arange(length)[::-1]]).astype(float)
-    height = np.repeat([gap, 0.0], length)
-    vertices = np.stack([np.broadcast_to(c[:, None], (2 * length, 5)) for c in (along, height)], -1).reshape(-1, 2)
-    vertices = np.column_stack([vertices, np.tile(np.arange(5.0), 2 * length)])
-    corner = (5 * np.arange(2 * length - 1)[:, None] + np.arange(4)).ravel()
-    a, b, c, d = corner, corner + 1, corner + 6, corner + 5
-    return vertices, np.concatenate([np.stack([a, b, c], 1), np.stack([a, c, d], 1)])
+    block, pin = box(-9, 1), box(-1, 9, subdivisions=1)
+    pin.vertices *= (1, 0.4, 0.4)
+    pin.update_faces(~(pin.triangles_center[:, 0] > 9 - 1e-9))
+    count = len(block.vertices)
+    triangles = np.concatenate([block.faces, np.asarray(pin.faces) + count]).astype(np.int64)
+    return np.concatenate([block.vertices, pin.vertices]), triangles, count
 
 
-def test_ways_run_along_the_surface():
-    vertices, triangles = hairpin(10, gap=1.0)
-    turn, start = 5 * 9 + 2, 5 * 5 + 2
-    ways = Ways(np.array([start, turn]), triangles, vertices, limit=6.5)
-    below = 5 * np.array([14, 12, 11, 10]) + 2  # the start, further towards the turn, and the turn itself
-    assert [float(ways.least(np.array([0]), np.array([[end]]))[0]) for end in below] == [np.inf, np.inf, 6, 5]
-    assert ways.least(np.array([1]), below[None]).tolist() == [1]
-    np.testing.assert_allclose(ways.least(np.array([0, 1]), np.array([[start], [start]])), [0, 4])
+def test_flesh_holds_what_is_inside_of_another_part_and_nothing_on_the_outside():
+    vertices, triangles, block = pin_in_a_block()
+    flesh = Flesh(triangles)
+    stuck = (np.arange(len(vertices)) >= block) & (vertices[:, 0] < 1)
+    assert 5 < stuck.sum() < len(vertices) - block
+    np.testing.assert_array_equal(flesh.holds(vertices, np.arange(len(vertices))), stuck)
+    assert flesh.holds(vertices, np.empty(0, int)).shape == (0,)
 
 
 def test_the_far_side_of_ones_own_flesh_is_no_contact():
-    vertices, triangles = hairpin(10, gap=1.0)
-    lower = triangles[(triangles >= 50).all(1)]
-    points = np.arange(10) * 5 + 2  # of the upper side, inwards to the turn
-    ways = Ways(points, triangles, vertices, limit=12.0)
-    options = {"inside": 2.0, "outside": 2.0}
-    plain = Solids(points, [lower], **options).watched(vertices)
-    checked = Solids(points, [lower], **options, ways=ways).watched(vertices)
-    assert plain.place.tolist() == list(range(1, 9))  # the ends lie over the border
-    # From place k the way around the turn to what is straight below is 2 (9 - k) + 1 long, the depth is 1.
-    assert checked.place.tolist() == list(range(1, 8))
+    vertices, triangles, block = pin_in_a_block()
+    left = triangles[(vertices[triangles][:, :, 0] < -9 + 1e-9).all(1)]
+    right = np.flatnonzero(np.isclose(vertices, (1, 2.5, 2.5)).all(1))  # the block's own, right across from `left`
+    tip = block + np.flatnonzero(vertices[block:, 0] < -1 + 1e-9)
+    points = np.concatenate([right, tip])
+    assert len(right) == 1 and len(tip) >= 9
+    options = {"parts": [left], "inside": 20.0, "outside": 20.0}
+    everything, none = list(range(len(points))), np.zeros(len(points))
+    assert Solids(points, **options).watched(vertices, none).place.tolist() == everything
+    checked = Solids(points, **options, flesh=Flesh(triangles))
+    assert checked.watched(vertices, none).place.tolist() == everything[1:]
+    # What is no deeper than allowed is watched all the same.
+    assert checked.watched(vertices, np.full(len(points), 11.0)).place.tolist() == everything

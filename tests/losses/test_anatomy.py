@@ -166,8 +166,8 @@ def test_skin_at_the_corners_of_the_mouth_is_not_in_the_other_lip(full, penalty)
     head = torch.as_tensor(vertices + np.einsum("e,evc->vc", random.normal(size=len(basis)), basis)).float()
     penalty.refresh(head)
     excess = penalty.excess_mm(head)["upper-lower lip"]
-    wrong = excess[excess > 0].numpy()[outside(full, head, excess)]
-    assert np.square(wrong).sum() < 6  # without a look at the ways along the skin: 37; with depths up to 8 mm: 44
+    # By the closest surface alone, 16 vertices of the skin beside the mouth would be up to 7 mm too deep.
+    assert 0 < excess.count_nonzero() < 10 and not outside(full, head, excess).any()
 
 
 @needs_shared
