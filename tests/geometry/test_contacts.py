@@ -130,6 +130,18 @@ def test_only_what_is_near_is_watched():
     assert watched.place.tolist() == watched.points.tolist() == [1, 2]
     np.testing.assert_allclose(found.depth.numpy(), [-0.5, 0.5], atol=1e-12)
     assert len(Scene(points[:1], box(0, 10)).look(inside=1, outside=1)[0].place) == 0
+    fine = Scene(np.array([[4.0, 0.2, 0.1]]), box(0, 10, subdivisions=4))
+    assert [len(fine.look(inside, outside=1)[0].place) for inside in (3, 8)] == [0, 1]
+
+
+def test_a_vertex_that_left_what_it_watched_is_nowhere():
+    scene = Scene(np.array([[0.1, -2, -2], [0.1, 1, 1]]), box(0, 10, subdivisions=4))
+    watched, found = scene.look()
+    np.testing.assert_allclose(found.depth, 0.1)
+    moved = torch.as_tensor(scene.vertices).clone()
+    moved[:2] += torch.tensor([0.0, 4.0, 2.0])
+    assert (depths(moved, watched).depth == -torch.inf).all()
+    np.testing.assert_allclose(Scene(moved[:2].numpy(), box(0, 10)).depth(), 0.1)
 
 
 def test_nothing_to_watch():
