@@ -139,7 +139,7 @@ def test_a_vertex_that_left_what_it_watched_is_nowhere():
     watched, found = scene.look()
     np.testing.assert_allclose(found.depth, 0.1)
     moved = torch.as_tensor(scene.vertices).clone()
-    moved[:2] += torch.tensor([0.0, 4.0, 2.0])
+    moved[:2] += torch.tensor([0.0, 3.5, 2.0])
     assert (depths(moved, watched).depth == -torch.inf).all()
     np.testing.assert_allclose(Scene(moved[:2].numpy(), box(0, 10)).depth(), 0.1)
 
