@@ -80,14 +80,14 @@ def recovered(data: GNMData) -> Table:
     """Lips and a lid that crossed, after the penalty was minimised over the skin's offsets."""
     table = Table("crossed", "by, mm", "too deep, mm", "after", "cheeks moved, mm", "skin moved, mm", "seconds")
     template = torch.as_tensor(data.template_vertex_positions)
-    for name, cross, measure, rate in (
-        ("lips", crossing.raised_lower_lip, crossing.lip_depths_mm, 2e-4),
+    for name, cross, measure, rate in (  # the rate is per mm of what is to be undone
+        ("lips", crossing.raised_lower_lip, crossing.lip_depths_mm, 1e-4),
         ("upper lid", crossing.pressed_lid, crossing.eyeball_depths_mm, 4e-5),
     ):
         rest = measure(data, template)
         for by_mm in (1.0, 2.0, 3.0):
             begun = time.perf_counter()
-            found = crossing.recover(data, cross(data, by_mm), steps=100, rate=rate)
+            found = crossing.recover(data, cross(data, by_mm), steps=100, rate=rate * by_mm)
             seconds = time.perf_counter() - begun
             before, after = ((measure(data, head) - rest).max() for head in (found.before, found.after))
             motion = (found.moved_mm(crossing.cheeks(data)), found.moved_mm(regions.exterior(data)))
