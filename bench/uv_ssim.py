@@ -40,8 +40,9 @@ from tests.losses.sliding import OnSurface, Problem, Term
 VIEWS = ((-75, 0), (-45, -20), (-25, 15), (-8, -30), (8, 25), (25, -15), (50, 15), (75, -5))  # yaw, pitch
 STAGES = ((40, 20.0, 4e-3, 2e-3), (60, 8.0, 2e-3, 1e-3), (60, 4.0, 1e-3, 5e-5))  # steps, smoothing mm, rates m
 STILL = STAGES[1:]  # from the truth
-SURFACE = 0.02  # weights
-SLIDE = 0.5
+SLIDE = 0.5  # weights
+SURFACE = 0.02
+HELD = 0.3  # of the surface, where vertices should stay
 NOISE = 0.01  # of the pixels, linear
 REPEATS = 20
 
@@ -69,10 +70,12 @@ class Photo:
         return loss
 
 
-def terms(problem: Problem, size_px: int, batches: Sequence[Targets] = (), photo: bool = False) -> dict[str, Term]:
+def terms(
+    problem: Problem, size_px: int, batches: Sequence[Targets] = (), photo: bool = False, held: float = SURFACE
+) -> dict[str, Term]:
     """The surface, and what else is asked for; batches are taken in turn."""
     surface, loss, steps = OnSurface(problem), problem.loss(size_px), iter(range(10**9))
-    found: dict[str, Term] = {"surface": lambda vertices: SURFACE * surface(vertices)}
+    found: dict[str, Term] = {"surface": lambda vertices: held * surface(vertices)}
     if photo:
         found["photo"] = Photo(problem, size_px)
     if batches:
@@ -100,7 +103,7 @@ def recovery(table: Table, name: str, problem: Problem, size_px: int, photo: boo
 
 def disturbances(problem: Problem, size_px: int) -> Table:
     table = Table("from the truth", "median mm", "p99", "max", title="moved against the undisturbed, all vertices")
-    still = sliding.fit(problem, terms(problem, size_px, [problem.batch]), problem.truth, STILL)
+    still = sliding.fit(problem, terms(problem, size_px, [problem.batch], held=HELD), problem.truth, STILL)
 
     def moves(name: str, from_: np.ndarray, to: np.ndarray) -> None:
         length = MM_PER_M * np.linalg.norm(to - from_, axis=1)[problem.moves]
@@ -109,7 +112,8 @@ def disturbances(problem: Problem, size_px: int) -> Table:
     moves("undisturbed, against the truth", problem.truth, still)
     for name, gain, blush in (("gain +20 %", 1.2, 0.0), ("blush +30 %", 1.0, 0.3), ("both", 1.2, 0.3)):
         batch = problem.disturbed(gain, blush)
-        moves(name, still, sliding.fit(problem, terms(problem, size_px, [batch]), problem.truth, STILL))
+        used = terms(problem, size_px, [batch], held=HELD)
+        moves(name, still, sliding.fit(problem, used, problem.truth, STILL))
     return table
 
 
