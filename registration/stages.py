@@ -26,7 +26,7 @@ class Weights:
     expression: float = 2e-3
     rotations: float = 0.1  # joints other than the root, per rad^2
     eyes: float = 1.0  # eyeballs moved out of the model's place, per m^2
-    eye_scale: float = 0.01
+    eye_scale: float = 2e-3
     offsets: float = 2e4  # per m^2: how hard images are taken to pull, which the lengths below are balanced against
     contacts: float = 0.0  # per mm^2, summed over the vertices that lie too deep in another part
     slide: float = 0.0  # dissimilarity of the neutral's texture and the images unwrapped; expressions only
@@ -97,7 +97,7 @@ def _model(steps: int) -> Stage:
         steps=steps,
         level=2,
         free=_rates(("identity", 0.1), ("expression", 0.03), ("scale", 3e-3), *_POSE),
-        weights=Weights(contacts=2e-5),
+        weights=Weights(contacts=2e-4),
     )
 
 
@@ -109,8 +109,12 @@ def _offsets(
         steps=steps,
         level=level,
         lengths=Lengths(smoothing_mm=smoothing_mm, half_gain_mm=half_gain_mm),
-        free=(("offsets", Rate(start=start, end=end)), ("eyes", Rate(start=start / 10, end=end / 10))),
-        weights=Weights(rgb=0.3, ssim=ssim, classes=0.1, landmarks=0.01, contacts=2e-4, slide=0.5),
+        free=(
+            ("offsets", Rate(start=start, end=end)),
+            ("eyes", Rate(start=start / 10, end=end / 10)),
+            ("joints", Rate(start=start, end=end)),  # where eyes look
+        ),
+        weights=Weights(rgb=0.3, ssim=ssim, classes=0.1, landmarks=0.01, contacts=1e-3, slide=0.5),
         texture=True,
     )
 
@@ -134,7 +138,7 @@ def studio(*, scale: bool = True) -> Recipe:
         _offsets(20, 12, 50, level=2, start=4e-3, end=2e-3),
         _offsets(5, 8, 80, level=1, start=1e-3, end=5e-4),
         _offsets(2.5, 6, 60, level=1, start=4e-4, end=5e-5),
-        _offsets(1.5, 4, 90, level=0, start=3e-4, end=1e-5, ssim=0.0),
+        _offsets(1.5, 5, 90, level=0, start=3e-4, end=1e-5, ssim=0.0),
     )
     wider = tuple(replace(stage, views_per_step=12) for stage in stages)
     return Recipe(name="studio", stages=wider, scale=scale, finest_head_px=1024)
