@@ -78,7 +78,7 @@ class Recipe:
     edge_samples: float = 1.0  # a pixel of silhouette; 0: silhouettes move nothing, as in renderers without edges
     scale: bool = True  # free the overall size: a basis rebuilt from scale-free data holds none
     regions: tuple[Region, ...] = (
-        Region(name="lips", length=0.6),
+        Region(name="lips", length=0.8),
         Region(name="lids", length=0.4),
         Region(name="nostrils", length=0.5, pace=10.0),
     )
@@ -114,7 +114,7 @@ def _offsets(
             ("eyes", Rate(start=start / 10, end=end / 10)),
             ("joints", Rate(start=start, end=end)),  # where eyes look
         ),
-        weights=Weights(rgb=0.3, ssim=ssim, classes=0.1, landmarks=0.01, contacts=1e-3, slide=0.5),
+        weights=Weights(rgb=0.3, ssim=ssim, classes=0.1, landmarks=0.01, contacts=2e-4, slide=0.5),
         texture=True,
     )
 
@@ -138,7 +138,7 @@ def studio(*, scale: bool = True) -> Recipe:
         _offsets(20, 12, 50, level=2, start=4e-3, end=2e-3),
         _offsets(5, 8, 80, level=1, start=1e-3, end=5e-4),
         _offsets(2.5, 6, 60, level=1, start=4e-4, end=5e-5),
-        _offsets(1.5, 5, 90, level=0, start=3e-4, end=1e-5, ssim=0.0),
+        _offsets(1.5, 4, 90, level=0, start=3e-4, end=1e-5, ssim=0.0),
     )
     wider = tuple(replace(stage, views_per_step=12) for stage in stages)
     return Recipe(name="studio", stages=wider, scale=scale, finest_head_px=1024)
