@@ -261,14 +261,7 @@ class Fit:
         rendered = self.renderer(vertices, self.appearance.texture if colour else None, batch.pixels)
         terms = self._image_terms(stage, rendered, batch, views)
         terms |= self._landmark_terms(stage, vertices, batch)
-        if stage.weights.contacts > 0:
-            touching = self.unknowns.yielding(offsets)
-            if step % _CONTACTS_EVERY == 0:
-                # How a person's tongue fills the mouth at rest is the model's own making, and seen by nobody.
-                self._contacts.accept(self.unknowns.at_rest(), OF_THE_TONGUE)
-                self._contacts.refresh(touching)
-            for pair, penalty in self._contacts(touching).items():
-                terms[f"contact {pair}"] = stage.weights.contacts * penalty
+        terms |= self._contact_terms(stage, step, offsets)
         if stage.weights.slide > 0 and self._slide is not None:
             even = replace(batch, rgb=self.appearance.corrected(batch, views))
             terms["slide"] = stage.weights.slide * self._slide(vertices, even)
@@ -292,6 +285,18 @@ class Fit:
         if stage.texture:
             self.appearance.improve(self.vertices(), rendered, batch, agree, views)
         return terms
+
+    def _contact_terms(self, stage: Stage, step: int, offsets: Tensor) -> dict[str, Tensor]:
+        w = stage.weights
+        if not (w.contacts or w.tongue):
+            return {}
+        touching = self.unknowns.yielding(offsets)
+        if step % _CONTACTS_EVERY == 0:
+            # How a person's tongue fills the mouth at rest is the model's own making, and seen by nobody.
+            self._contacts.accept(self.unknowns.at_rest(), OF_THE_TONGUE)
+            self._contacts.refresh(touching)
+        found = self._contacts(touching).items()
+        return {f"contact {pair}": (w.tongue if pair in OF_THE_TONGUE else w.contacts) * cost for pair, cost in found}
 
     def _class_weights(self, eyes: float) -> Tensor:
         return torch.tensor([eyes if "eye" in name else 1.0 for name in self._class_names], device=self.device)
