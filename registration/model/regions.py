@@ -177,6 +177,36 @@ def offset_regions(data: GNMData) -> dict[str, Bool[np.ndarray, "V"]]:
     }
 
 
+def skull_skin(data: GNMData) -> Bool[np.ndarray, "V"]:
+    """Skin that may lie on the skull: the exterior without the neck and the nape, which stay with the body."""
+    return exterior(data) & ~neck_other(data)
+
+
+STEADY_REGIONS = ("nose", "neck_back")  # of `stabilization_regions`: where expressions move the skin least
+
+
+def stabilization_regions(data: GNMData) -> dict[str, Bool[np.ndarray, "V"]]:
+    """The five regions in which a person looks for motion of the whole head (paper, Head Expression); all exterior.
+
+    They may overlap, where cheeks meet lower lids, and leave ears and forehead out.
+    """
+    sides = [f"{side}_{name}_region" for name in ("infraorbital", "cheek") for side in ("left", "right")]
+    mouth = ("upper_lip", "lower_lip", "upper_lip_region", "lower_lip_region", "chin_region", *sides)
+    face = ("hockey_mask", "ears", "forehead_region")
+    sources = {
+        "left_periocular": ("expression_basis_left_eye",),
+        "right_periocular": ("expression_basis_right_eye",),
+        "nose": ("nose_region",),
+        "mouth": mouth,
+    }
+    found = {name: _any(data, groups) & exterior(data) for name, groups in sources.items()}
+    return found | {"neck_back": exterior(data) & ~_any(data, face)}
+
+
+def _any(data: GNMData, names: tuple[str, ...]) -> Bool[np.ndarray, "V"]:
+    return np.max([group(data, name) for name in names], axis=0) > _INSIDE
+
+
 def _nearness(data: GNMData, members: Bool[np.ndarray, "V"], near: float, far: float) -> Float[np.ndarray, "V"]:
     """1 up to `near` (metres, in the template) from the nearest member, falling to 0 at `far`."""
     points = data.template_vertex_positions
