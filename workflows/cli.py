@@ -18,6 +18,7 @@ from registration.errors import InputError
 CaptureFolder = Positional[Annotated[Path, arg(metavar="CAPTURE")]]
 RegistrationFolder = Positional[Annotated[Path, arg(metavar="REG")]]
 SubjectFolder = Positional[Annotated[Path, arg(metavar="SUBJECT")]]
+RunFolder = Positional[Annotated[Path, arg(metavar="RUN")]]
 NeutralFolder = Annotated[Path | None, arg(metavar="REG")]
 
 
@@ -149,6 +150,85 @@ def evaluate(
     return 0
 
 
+def stabilize(
+    run: RunFolder,
+    /,
+    decisions: Annotated[Path | None, arg(metavar="FILE")] = None,
+    model: Annotated[Path | None, arg(metavar="NPZ")] = None,
+    out: Annotated[Path | None, arg(metavar="DIR")] = None,
+    skip_failed: bool = False,
+    force: bool = False,
+) -> int:
+    """Take the head's motion out of expressions, so that the skull stands still: automatically, then over all subjects.
+
+    Args:
+        run: A folder of subject folders that `gnmreg subject` wrote, or one such folder.
+        decisions: A log that `gnmreg stabilize review` saved; without one, what is flagged is subtracted.
+        model: The head model of the registrations; not needed if it is the first or the official one.
+        out: The folder to write, RUN/stabilized by default.
+        skip_failed: Leave registrations out that failed.
+        force: Stabilize again although the folder holds the result of the same input.
+    """
+    from registration.progress import shown
+    from workflows.stabilize_folder import known_model
+    from workflows.stabilize_run import stabilize_run
+
+    with shown() as progress:
+        outcome = stabilize_run(
+            run,
+            model_path=model or known_model(run),
+            out=out,
+            decisions=decisions,
+            skip_failed=skip_failed,
+            force=force,
+            progress=progress,
+        )
+    figures = outcome.figures
+    print(f"{figures['samples']} expressions; {figures['residual_median_mm']:.2f} mm of skin on the skull, median")
+    print(f"the second stage turned by {figures['regional_turn_deg']:.2f} degrees, moved by", end=" ")
+    print(f"{figures['regional_rms_mm']:.2f} mm, rms")
+    print(outcome.out / "index.html")
+    return 0
+
+
+def review_stabilization(
+    run: RunFolder,
+    /,
+    decisions: Annotated[Path | None, arg(metavar="FILE")] = None,
+    model: Annotated[Path | None, arg(metavar="NPZ")] = None,
+    out: Annotated[Path | None, arg(metavar="DIR")] = None,
+    skip_failed: bool = False,
+    port: Annotated[int, arg(metavar="PORT")] = 8080,
+) -> int:
+    """Look at the components of a stabilized run in the browser and decide about each; stops with Ctrl-C.
+
+    Args:
+        run: As for `gnmreg stabilize`, which is done first where needed.
+        decisions: The log to go on from and to save into, RUN/decisions.jsonl by default.
+        model: The head model of the registrations; not needed if it is the first or the official one.
+        out: The folder of the stabilized set, RUN/stabilized by default.
+        skip_failed: Leave registrations out that failed.
+        port: Where to serve, on this machine only; from elsewhere: ssh -L PORT:127.0.0.1:PORT HOST.
+    """
+    from registration.progress import shown
+    from workflows.stabilize_folder import known_model
+    from workflows.web.review import review
+
+    with shown() as progress:
+        page = review(
+            run,
+            model_path=model or known_model(run),
+            out=out,
+            decisions=decisions,
+            skip_failed=skip_failed,
+            port=port,
+            progress=progress,
+        )
+    print(f"Open http://127.0.0.1:{page.port} in a browser; Ctrl-C ends.", flush=True)
+    page.wait()
+    return 0
+
+
 def check_capture(capture: CaptureFolder, /, out: Annotated[Path | None, arg(metavar="PNG")] = None) -> int:
     """Check a capture folder before any fitting.
 
@@ -270,6 +350,8 @@ COMMANDS: Mapping[str, Command | Group] = {
     "register": register,
     "subject": register_subject,
     "evaluate": evaluate,
+    "stabilize": stabilize,
+    "stabilize review": review_stabilization,
     "capture": (
         "Look at captures, make synthetic ones, spoil good ones.",
         {"check": check_capture, "synth": synth_capture, "spoil": spoil_capture},
@@ -283,6 +365,9 @@ COMMANDS: Mapping[str, Command | Group] = {
 
 def main(args: Sequence[str] | None = None) -> int:
     """Run one command; `args` replaces the process' own. Returns the exit code."""
+    args = list(sys.argv[1:] if args is None else args)
+    if args[:2] == ["stabilize", "review"]:  # a command that has both an argument and a command below it
+        args[:2] = ["stabilize review"]
     try:
         return tyro.cli(
             _choice(COMMANDS),

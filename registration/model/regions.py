@@ -178,10 +178,14 @@ def offset_regions(data: GNMData) -> dict[str, Bool[np.ndarray, "V"]]:
 
 
 def skull_skin(data: GNMData) -> Bool[np.ndarray, "V"]:
-    """Skin that may lie on the skull: the exterior without the neck and the nape, which stay with the body."""
-    return exterior(data) & ~neck_other(data)
+    """Skin that may lie still on the skull: the exterior without the neck and the nape, which stay with the body, and
+    without what jaw, mouth and cheeks move: lips, chin, cheeks up to the eye's rim, and the skin before the ears."""
+    sides = [f"{side}_{name}_region" for name in ("infraorbital", "cheek", "parotid") for side in ("left", "right")]
+    moving = _any(data, (*_MOUTH, *sides))
+    return exterior(data) & ~neck_other(data) & ~moving
 
 
+_MOUTH = ("upper_lip", "lower_lip", "upper_lip_region", "lower_lip_region", "chin_region")
 STEADY_REGIONS = ("nose", "neck_back")  # of `stabilization_regions`: where expressions move the skin least
 
 
@@ -191,13 +195,12 @@ def stabilization_regions(data: GNMData) -> dict[str, Bool[np.ndarray, "V"]]:
     They may overlap, where cheeks meet lower lids, and leave ears and forehead out.
     """
     sides = [f"{side}_{name}_region" for name in ("infraorbital", "cheek") for side in ("left", "right")]
-    mouth = ("upper_lip", "lower_lip", "upper_lip_region", "lower_lip_region", "chin_region", *sides)
     face = ("hockey_mask", "ears", "forehead_region")
     sources = {
         "left_periocular": ("expression_basis_left_eye",),
         "right_periocular": ("expression_basis_right_eye",),
         "nose": ("nose_region",),
-        "mouth": mouth,
+        "mouth": (*_MOUTH, *sides),
     }
     found = {name: _any(data, groups) & exterior(data) for name, groups in sources.items()}
     return found | {"neck_back": exterior(data) & ~_any(data, face)}

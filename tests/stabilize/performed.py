@@ -1,7 +1,7 @@
 """Subjects of the population whose expressions are known, and what a registration of them would look like: turned and
 shifted heads with smooth and white noise, and patches that no camera sees."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -19,6 +19,7 @@ NAMES = (
     *("sadness", "fear", "anger", "tongue_out", "jaw_open", "jaw_left", "jaw_right", "wink_left", "brows_up"),
     *("brows_down", "cheeks_blown"),
 )
+COUNT = len(NAMES)
 JAW, BROWS = ("jaw_open", "jaw_left", "jaw_right"), ("brows_up", "brows_down")
 _STRENGTH = (0.7, 1.0)  # no two people do the same: each unit of an expression has a strength of its own
 _WAVES = 200  # of a random smooth field
@@ -133,3 +134,9 @@ def meshes(truth: Performed, seen: Seen) -> SubjectMeshes:
         vertices=seen.vertices,
         confidence=seen.confidence,
     )
+
+
+def moved(meshes: SubjectMeshes, motions: np.ndarray) -> SubjectMeshes:
+    """The expressions turned and shifted, one motion each."""
+    heads = [transform_points(T, head) for T, head in zip(motions, meshes.vertices, strict=True)]
+    return replace(meshes, vertices=np.stack(heads).astype(np.float32))
