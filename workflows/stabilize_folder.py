@@ -18,7 +18,7 @@ from registration.errors import InputError
 from registration.model import gnm_npz
 from registration.model.fetch import cache_folder, cached_path
 from registration.model.gnm_npz import GNMData
-from registration.stabilize.decisions import Decision
+from registration.stabilize.decisions import ACTIONS, Decision
 from registration.stabilize.meshes import SkullSkin, SubjectMeshes, subject_meshes
 from workflows.subject_folder import KIND, MANIFEST
 
@@ -180,8 +180,12 @@ def read_decisions(file: Path, dataset: str) -> list[Decision]:
     """
     try:
         entries = [json.loads(line) for line in Path(file).read_text("utf-8").splitlines() if line.strip()]
+        if unknown := [e["action"] for e in entries if e["action"] not in ACTIONS]:
+            raise ValueError(f"the action {unknown[0]!r}")
         decisions = [
-            Decision(region=e["region"], component=int(e["component"]), action=e["action"], reason=e["reason"])
+            Decision(
+                region=str(e["region"]), component=int(e["component"]), action=e["action"], reason=str(e["reason"])
+            )
             for e in entries
         ]
         datasets = {str(e["dataset"]) for e in entries}

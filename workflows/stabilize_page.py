@@ -44,7 +44,7 @@ def write_stabilize_page(
         f'<p class="lead">Dataset <span class="mono">{escape(manifest["dataset"][:16])}</span></p>'
         f'<div class="tiles">{cells}</div></div></header><main>'
         "<h2>What stays with the skull</h2><p>Median distance of the skin from the neutral over a subject's expressions, "
-        "once these are aligned: what is steady is trusted. Curves: the distance after each round, weighted by that trust."
+        "once these are aligned: what is steady is trusted. Curves: the distance after each round, weighted as in the last."
         f"</p>{_bar()}{''.join(cards)}{rest}<h2>Components</h2><p>Of each region, what 99 % of its motion is made of. "
         "Flagged is what looks like motion of the whole head: rigid, whatever the expression, shared by nose and neck.</p>"
         f'<div class="panel">{_table(components, head)}</div><footer></footer></main>'

@@ -27,7 +27,7 @@ def align(
     return found
 
 
-def angle_deg(transform: Float[np.ndarray, "*S 4 4"]) -> Float[np.ndarray, "*S"]:
+def angle_deg(transform: Float[np.ndarray, "S 4 4"]) -> Float[np.ndarray, "S"]:
     """By how much transforms turn, degrees; exact also for small angles."""
     rotation = transform[..., :3, :3]
     axis = np.stack(

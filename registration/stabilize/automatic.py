@@ -31,7 +31,7 @@ class Stabilized:
     T_neutral_expression: Float[np.ndarray, "S 4 4"]  # p_neutral = T_neutral_expression @ p_expression
     vertices: Float[np.ndarray, "S V 3"]  # float32, metres, the neutral's world
     confidence_map: Float[np.ndarray, "V"]  # in [0, 1]: 1 never moves, 0 moves much, is unseen, or is no skin
-    residual_mm: Float[np.ndarray, "S R"]  # after each round: rms distance from the neutral, weighted by the last map
+    residual_mm: Float[np.ndarray, "S R"]  # after each round: rms distance from the neutral, weighted as in the last round
 
 
 def stabilize_subject(
@@ -66,7 +66,7 @@ def stabilize_subject(
             kernel = 1 / (1 + squared / settings.scale_mm**2) ** 2
         found = align(source, target, base * trust * kernel)
     history.append(_squared_mm(found, source, target))
-    weights = base * trust
+    weights = base * trust * kernel
     confidence_map = np.zeros(len(meshes.neutral), np.float32)
     confidence_map[rows] = trust * (seen > 0).any(0)
     return Stabilized(

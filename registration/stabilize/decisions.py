@@ -76,8 +76,7 @@ def decided_actions(
 ) -> dict[tuple[str, int], Action]:
     """The default actions with a person's decisions in their place; the last one about a component counts.
 
-    Raises InputError for a decision about a component that there is not, and for one to subtract where the steady
-    regions do not share the motion: it would not be the head's.
+    Raises InputError for a decision about a component that there is not, or for an action that there is not.
     """
     actions = default_actions(components)
     for decision in decisions:
