@@ -47,9 +47,7 @@ class Run:
     def meshes(self) -> Iterator[SubjectMeshes]:
         """Subject after subject. Raises InputError for registrations that cannot be read."""
         for one in self.subjects:
-            expressions = (
-                (name, label, load_registration(one.folder / name)) for name, label in one.expressions
-            )
+            expressions = ((name, label, load_registration(one.folder / name)) for name, label in one.expressions)
             yield subject_meshes(one.subject, load_registration(one.folder / one.neutral), expressions, self.skin)
 
 
@@ -131,16 +129,15 @@ def _subject(folder: Path, skip_failed: bool) -> RunSubject:
         subject = str(manifest["subject"])
     except (KeyError, TypeError) as error:
         raise _bad("The subject's record cannot be read", folder / MANIFEST, "entries as documented", error) from error
-    if named.get(neutral, ("", "missing", ""))[1] not in USABLE:
-        got = named.get(neutral, ("", "no such registration", ""))
-        raise _bad("A subject has no neutral", folder, f"a usable registration {neutral!r}", f"{got[1]} {got[2]}")
-    lost = {name: why for name, (_, status, why) in named.items() if status not in USABLE}
+    _, status, reason = named.get(neutral, ("", "no such registration", ""))
+    if status not in USABLE:
+        raise _bad("A subject has no neutral", folder, f"a usable registration {neutral!r}", f"{status} {reason}")
+    lost = {name: why for name, (_, state, why) in named.items() if state not in USABLE}
     if lost and not skip_failed:
-        name = next(iter(lost))
-        status = named[name][1]
-        got = f"{name}: {status}: {lost[name]}" + (f", and {len(lost) - 1} more" if len(lost) > 1 else "")
+        first = next(iter(lost))
+        got = f"{first}: {named[first][1]}: {lost[first]}" + (f", and {len(lost) - 1} more" if len(lost) > 1 else "")
         raise _bad("A subject has registrations that failed", folder, "all converged or stopped", got)
-    expressions = tuple((name, label) for name, (label, status, _) in named.items() if name != neutral and status in USABLE)
+    expressions = tuple((name, label) for name, (label, _, _) in named.items() if name != neutral and name not in lost)
     if not expressions:
         raise _bad("A subject has no expression to stabilize", folder, "at least one beside the neutral", "none")
     return RunSubject(

@@ -43,10 +43,11 @@ def write_stabilize_page(
         '<header><div class="top"><div class="eyebrow">Stabilization</div><h1>The skull stands still</h1>'
         f'<p class="lead">Dataset <span class="mono">{escape(manifest["dataset"][:16])}</span></p>'
         f'<div class="tiles">{cells}</div></div></header><main>'
-        "<h2>What stays with the skull</h2><p>Median distance of the skin from the neutral over a subject's expressions, "
-        "once these are aligned: what is steady is trusted. Curves: the distance after each round, weighted as in the last."
-        f"</p>{_bar()}{''.join(cards)}{rest}<h2>Components</h2><p>Of each region, what 99 % of its motion is made of. "
-        "Flagged is what looks like motion of the whole head: rigid, whatever the expression, shared by nose and neck.</p>"
+        "<h2>What stays with the skull</h2><p>Median distance of the skin from the neutral over a subject's "
+        "expressions, once these are aligned: what is steady is trusted. Curves: the distance after each round, "
+        f"weighted as in the last.</p>{_bar()}{''.join(cards)}{rest}<h2>Components</h2><p>Of each region, what 99 % of "
+        "its motion is made of. Flagged is what looks like motion of the whole head: rigid, whatever the expression, "
+        "shared by nose and neck.</p>"
         f'<div class="panel">{_table(components, head)}</div><footer></footer></main>'
         f"<dialog><img alt=''><p></p></dialog><script>{SCRIPT}</script></body></html>"
     )

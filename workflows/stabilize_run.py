@@ -1,6 +1,6 @@
 """`gnmreg stabilize`: both stages over a run's registrations, subject after subject on disk."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -115,10 +115,8 @@ def _write_subjects(
     components, correction = regional_stage(steady, head, settings, decisions)
     names = [(s.subject, name, label) for s in steady() for name, label in zip(s.names, s.labels, strict=True)]
     subjects, files, labels = (tuple(row[k] for row in names) for k in range(3))
-    along = _along(Displacements(steady), components)
-    stored = StoredComponents(
-        components=tuple(components), subjects=subjects, names=files, labels=labels, along=along
-    )
+    moves = along(Displacements(steady), components)
+    stored = StoredComponents(components=tuple(components), subjects=subjects, names=files, labels=labels, along=moves)
     ids = {disk.COMPONENTS: disk.write_components(stored, fresh)}
     first = 0
     for number in range(count):
@@ -128,7 +126,7 @@ def _write_subjects(
     return ids, components, change(correction, head)
 
 
-def _along(displacements: Displacements, components: Sequence[Components]) -> dict[str, np.ndarray]:
+def along(displacements: Iterable[np.ndarray], components: Sequence[Components]) -> dict[str, np.ndarray]:
     """What the whole head does, on average, along with a coefficient of one: coefficients have a mean square of one."""
     sums: dict[str, np.ndarray] = {}
     count = 0

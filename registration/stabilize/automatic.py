@@ -1,4 +1,4 @@
-"""The automatic stage: the skull's rigid motion between a subject's neutral and its expressions (algorithms, section 6).
+"""The automatic stage: the skull's motion between a subject's neutral and its expressions (algorithms, section 6).
 
 A confidence map tells which skin stays with the skull: what moves least over all of a subject's expressions. Each
 expression is then aligned by it, robustly, since even the steadiest skin moves in some.
@@ -31,12 +31,12 @@ class Stabilized:
     T_neutral_expression: Float[np.ndarray, "S 4 4"]  # p_neutral = T_neutral_expression @ p_expression
     vertices: Float[np.ndarray, "S V 3"]  # float32, metres, the neutral's world
     confidence_map: Float[np.ndarray, "V"]  # in [0, 1]: 1 never moves, 0 moves much, is unseen, or is no skin
-    residual_mm: Float[np.ndarray, "S R"]  # after each round: rms distance from the neutral, weighted as in the last round
+    residual_mm: Float[
+        np.ndarray, "S R"
+    ]  # after each round: rms distance from the neutral, weighted as in the last round
 
 
-def stabilize_subject(
-    meshes: SubjectMeshes, skin: SkullSkin, settings: Automatic | None = None
-) -> Stabilized:
+def stabilize_subject(meshes: SubjectMeshes, skin: SkullSkin, settings: Automatic | None = None) -> Stabilized:
     """Find the skull's motion in each expression and undo it.
 
     Alternates the confidence map w_v = s^2 / (s^2 + median over expressions of |d_v|^2), s = `still_mm`, with weighted

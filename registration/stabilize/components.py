@@ -131,8 +131,8 @@ def label_part(coefficients: Float[np.ndarray, "S K"], labels: Sequence[str]) ->
 def free_of_label(coefficients: Float[np.ndarray, "S K"], labels: Sequence[str]) -> Float[np.ndarray, "K"]:
     """S3: one minus the share of variance that labels explain, corrected for what chance lets them explain.
 
-    Section 6 has 1 - eta^2, which falls with the number of labels though nothing depends on them: here it is 1 - epsilon^2
-    (Kelley 1935), 1 on average then. With one sample a label nothing can be told: 0.
+    Section 6 has 1 - eta^2, which falls with the number of labels though nothing depends on them: here it is
+    1 - epsilon^2 (Kelley 1935), 1 on average then. With one sample a label nothing can be told: 0.
     """
     group, _, counts, within = _by_label(coefficients, labels)
     samples, kinds = len(group), len(counts)

@@ -71,9 +71,7 @@ def default_actions(components: Sequence[Components]) -> dict[tuple[str, int], A
     }
 
 
-def decided_actions(
-    components: Sequence[Components], decisions: Sequence[Decision]
-) -> dict[tuple[str, int], Action]:
+def decided_actions(components: Sequence[Components], decisions: Sequence[Decision]) -> dict[tuple[str, int], Action]:
     """The default actions with a person's decisions in their place; the last one about a component counts.
 
     Raises InputError for a decision about a component that there is not, or for an action that there is not.
@@ -100,11 +98,11 @@ def corrections(
     """What the actions take from every sample.
 
     *Subtract*: the rigid parts of these components, all regions', are one motion of one head: the rigid motion that
-    fits them best over their regions' skin is undone for the whole head, and the face keeps its shape. Section 6 subtracts
-    c r region by region instead; against known truth (bench/stabilize.py) that removes less of the spurious motion
-    (90 to 95 % against 97 to 99 %, the mouth's share being hidden by the jaw) and takes up to a quarter of small
-    expressions (brows) along, against 7 %. Of the coefficients, what the labels explain is not subtracted
-    (`label_part`): that is expression, which chance correlation mixes into a component.
+    fits them best over their regions' skin is undone for the whole head, and the face keeps its shape. Section 6
+    subtracts c r region by region instead; against known truth (injected motions, as in bench/stabilize.py) that takes
+    away less of the spurious motion (74 to 96 % against 85 to 99 %: the jaw hides the mouth's share) and up to a quarter
+    of a small expression (brows) along with it, against 7 %. Of the coefficients, what the labels explain is not
+    subtracted (`label_part`): that is expression, which chance correlation mixes into a component.
 
     *Drop*: the component as a whole, in its region, fading in over 10 mm from the border.
     """

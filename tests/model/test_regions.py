@@ -207,3 +207,25 @@ def test_parts_that_touch_of_the_full_head(full):
     assert full.template_vertex_positions[upper, 1].mean() > full.template_vertex_positions[lower, 1].mean()
     assert [role(full).sum() for role in PARTS_THAT_TOUCH] == [1054, 1868, 933, 702, 406]
     assert not exterior[regions.mouth_lining(full)].any()
+
+
+def test_stabilization_regions_are_exterior_and_mirrored(tiny):
+    found = regions.stabilization_regions(tiny)
+    assert list(found) == ["left_periocular", "right_periocular", "nose", "mouth", "neck_back"]
+    assert set(regions.STEADY_REGIONS) < set(found)
+    exterior, mirror = regions.exterior(tiny), tiny.mirror_indices
+    for mask in found.values():
+        assert mask.any() and exterior[mask].all()
+    np.testing.assert_array_equal(found["left_periocular"][mirror], found["right_periocular"])
+    assert not found["neck_back"][regions.group(tiny, "hockey_mask") > 0].any()
+    skull = regions.skull_skin(tiny)
+    assert skull.any() and exterior[skull].all() and not skull[regions.neck_other(tiny)].any()
+    assert not skull[regions.lips(tiny)[0] | (regions.group(tiny, "chin_region") > 0)].any()
+
+
+@pytest.mark.parametrize(
+    "name", ["expression_basis_left_eye", "nose_region", "chin_region", "left_cheek_region", "forehead_region", "ears"]
+)
+def test_stabilization_regions_need_their_groups(tiny, name):
+    with pytest.raises(InputError, match=f"no vertex group '{name}'"):
+        regions.stabilization_regions(without(tiny, name))

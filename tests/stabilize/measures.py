@@ -31,7 +31,10 @@ def residual(motions: np.ndarray, points: np.ndarray) -> np.ndarray:
 
 
 def lost_by_label(
-    subjects: Sequence[StabilizedSubject], truths: Sequence[Performed], head: Head, labels: tuple[str, ...] = JAW + BROWS
+    subjects: Sequence[StabilizedSubject],
+    truths: Sequence[Performed],
+    head: Head,
+    labels: tuple[str, ...] = JAW + BROWS,
 ) -> dict[str, float]:
     """1 - <d', d> / <d, d> over the exterior skin and all subjects: d true displacements, d' what came out."""
     inner, own = dict.fromkeys(labels, 0.0), dict.fromkeys(labels, 0.0)
@@ -55,14 +58,22 @@ class Injected:
 
 
 def injected(
-    truths: Sequence[Performed], data: GNMData, seed: int, *, kinds: int = 2, turn_deg: float = 1.0, shift_mm: float = 2.0
+    truths: Sequence[Performed],
+    data: GNMData,
+    seed: int,
+    *,
+    kinds: int = 2,
+    turn_deg: float = 1.0,
+    shift_mm: float = 2.0,
 ) -> Injected:
     """Rigid motions of some kinds (standard deviations as given), each sample's strengths at random."""
     head, rng = Head.of(data), np.random.default_rng(seed)
     true = np.concatenate([truth.vertices - truth.neutral for truth in truths])
     labels = [label for truth in truths for label in truth.labels]
     twists = rng.normal(size=(kinds, 2, 3))
-    twists *= np.array([np.radians(turn_deg), shift_mm / MM_PER_M])[:, None] / np.linalg.norm(twists, axis=2, keepdims=True)
+    twists *= np.array([np.radians(turn_deg), shift_mm / MM_PER_M])[:, None] / np.linalg.norm(
+        twists, axis=2, keepdims=True
+    )
     chosen = rng.permutation(len(true)) % 3 == 0
     strengths = rng.normal(size=(len(true), kinds)) * chosen[:, None]
     spurious = strengths @ twists.reshape(kinds, 6)

@@ -48,7 +48,9 @@ def test_a_pure_motion_of_the_head_is_all_subtracted(head):
     labels = [f"label {k % 4}" for k in range(40)]
     parts = regional_components(list(moved), labels, head)
     assert all(part.flagged[:2].all() for part in parts)
-    found = corrections(parts, decided_actions(parts, [keep_labels(p.region, k) for p in parts for k in (0, 1)]), labels, head)
+    found = corrections(
+        parts, decided_actions(parts, [keep_labels(p.region, k) for p in parts for k in (0, 1)]), labels, head
+    )
     # What the four labels explain by chance stays.
     assert np.linalg.norm(found.twists - spurious) < 0.25 * np.linalg.norm(spurious)
     assert change(found, head).rms_mm > 0.5

@@ -1,4 +1,4 @@
-"""The review page in a headless Chromium with software WebGL: what a person does there is what the function call does."""
+"""The review page in a headless Chromium with software WebGL: what is done there is what the function call does."""
 
 import shutil
 from collections.abc import Iterator
@@ -124,7 +124,9 @@ def test_a_swinging_head_is_a_glb():
 
     rng = np.random.default_rng(0)
     sphere = trimesh.creation.icosphere(subdivisions=2)
-    blob = swinging_head(sphere.vertices, rng.normal(size=sphere.vertices.shape), sphere.faces, 255 * (sphere.vertices > 0))
+    blob = swinging_head(
+        sphere.vertices, rng.normal(size=sphere.vertices.shape), sphere.faces, 255 * (sphere.vertices > 0)
+    )
     assert len(blob) % 4 == 0 and int.from_bytes(blob[8:12], "little") == len(blob)
     (found,) = trimesh.load(io.BytesIO(blob), file_type="glb", process=False).geometry.values()
     np.testing.assert_allclose(found.vertices, sphere.vertices, atol=1e-6)

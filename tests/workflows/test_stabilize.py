@@ -52,7 +52,7 @@ def test_the_folder_holds_what_the_function_returns(run, outcome, model):  # noq
     assert [part.region for part in stored.components] == [part.region for part in expected.components]
     assert stored.labels == 2 * NAMES and stored.names == 2 * NAMES
     page = (outcome.out / "index.html").read_text()
-    assert "src=\"http" not in page and "synth_0000" in page and page.count("<img") >= 6
+    assert 'src="http' not in page and "synth_0000" in page and page.count("<img") >= 6
     assert not list(outcome.out.parent.glob(".*.tmp"))
 
 

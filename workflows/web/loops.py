@@ -51,7 +51,8 @@ def _glb(blobs: dict[str, np.ndarray]) -> bytes:
     views, accessors, offset = [], [], 0
     for name, array in blobs.items():
         target = _ELEMENTS if name == "faces" else None if name in ("times", "weights") else _ARRAY
-        views.append({"buffer": 0, "byteOffset": offset, "byteLength": array.nbytes} | ({"target": target} if target else {}))
+        view = {"buffer": 0, "byteOffset": offset, "byteLength": array.nbytes}
+        views.append(view | ({"target": target} if target else {}))
         kind = "VEC3" if array.ndim == 2 else "SCALAR"
         accessor = {"bufferView": number[name], "count": len(array), "type": kind}
         accessor["componentType"] = _UINT if name == "faces" else _FLOAT

@@ -46,8 +46,9 @@ def about(part: Components, k: int, action: str, head: Head) -> str:
 def colour_bar(limit_mm: float) -> str:
     stops = ", ".join(f"rgb{colour}" for colour in SCALE)
     return (
-        f'{_STYLE}<div class="rv"><h4>Displacement at 3 σ</h4><i class="bar" style="background:linear-gradient(90deg,'
-        f'{stops})"></i><span class="soft">0 mm</span><span class="soft" style="float:right">{limit_mm:g} mm</span></div>'
+        f'{_STYLE}<div class="rv"><h4>Displacement at 3 σ</h4>'
+        f'<i class="bar" style="background:linear-gradient(90deg,{stops})"></i><span class="soft">0 mm</span>'
+        f'<span class="soft" style="float:right">{limit_mm:g} mm</span></div>'
     )
 
 

@@ -14,7 +14,7 @@ from registration.progress import Progress
 from registration.report.heat import scale_limit_mm
 from registration.report.pictures import scale_colours
 from registration.stabilize import folder as disk
-from registration.stabilize.components import Head
+from registration.stabilize.components import Components, Head
 from registration.stabilize.decisions import ACTIONS
 from workflows.stabilize_folder import read_decisions
 from workflows.stabilize_run import LOG, stabilize_run
@@ -90,7 +90,7 @@ class Page:
         self._server.stop()
 
     @property
-    def _part(self) -> Any:
+    def _part(self) -> Components:
         return self._parts[self._region.value.replace(" ", "_")]
 
     @property
@@ -100,7 +100,13 @@ class Page:
     def _build(self) -> None:
         """The scene and all controls, empty."""
         server, gui = self._server, self._server.gui
-        gui.configure_theme(control_layout="fixed", control_width="large", brand_color=(31, 122, 116), show_logo=False, show_share_button=False)
+        gui.configure_theme(
+            control_layout="fixed",
+            control_width="large",
+            brand_color=(31, 122, 116),
+            show_logo=False,
+            show_share_button=False,
+        )
         server.scene.set_up_direction("+y")
         server.scene.configure_default_lights(False)
         server.scene.configure_environment_map(None)  # colours mean millimetres: light must not wash them out
@@ -112,12 +118,13 @@ class Page:
         samples, subjects = len(self.review.stored.labels), len(set(self.review.stored.subjects))
         gui.add_markdown(f"### Does the head move?\n{samples} expressions of {subjects} subjects")
         names = tuple(region.replace("_", " ") for region in self._parts)
-        self._region = gui.add_dropdown("Region", names)
-        self._number = gui.add_slider("Component", min=1, max=2, step=1, initial_value=1)
+        # viser's setters have types of their own that type checkers take for read-only properties.
+        self._region: Any = gui.add_dropdown("Region", names)
+        self._number: Any = gui.add_slider("Component", min=1, max=2, step=1, initial_value=1)
         steps = gui.add_button_group("Step", ("previous", "next"))
         self._about = gui.add_html("")
-        self._action = gui.add_button_group("Action", ACTIONS)
-        self._reason = gui.add_text("Reason", "")
+        self._action: Any = gui.add_button_group("Action", ACTIONS)
+        self._reason: Any = gui.add_text("Reason", "")
         self._error = gui.add_html("")
         undo, save = gui.add_button("Undo"), gui.add_button("Save decisions")
         self._said = gui.add_markdown("")
