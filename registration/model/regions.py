@@ -185,6 +185,47 @@ def skull_skin(data: GNMData) -> Bool[np.ndarray, "V"]:
     return exterior(data) & ~neck_other(data) & ~moving
 
 
+def head_skin(data: GNMData) -> Bool[np.ndarray, "V"]:
+    """Skin that head shape is measured on: the exterior without the neck, which turns at a joint of its own."""
+    return exterior(data) & ~neck_other(data)
+
+
+def head_regions(data: GNMData) -> dict[str, Bool[np.ndarray, "V"]]:
+    """Parts of `head_skin` that figures are split by; they may overlap and need not cover it."""
+    parts = stabilization_regions(data)
+    back = parts.pop("neck_back")
+    found = {
+        "face": group(data, "hockey_mask") > _INSIDE,
+        **parts,
+        "forehead": group(data, "forehead_region") > _INSIDE,
+        "chin": group(data, "chin_region") > _INSIDE,
+        "ears": ears(data),
+        "back": back,
+    }
+    return {name: members & head_skin(data) for name, members in found.items()}
+
+
+_EXPRESSION_GROUPS = {  # region of an expression component's name -> the group that holds its soft mask
+    "left_eye_region": "expression_basis_left_eye",
+    "right_eye_region": "expression_basis_right_eye",
+    "lower_face_region": "expression_basis_mouth_nose_ears",
+}
+
+
+def expression_regions(data: GNMData) -> dict[str, tuple[Int[np.ndarray, "K"], Float[np.ndarray, "V"]]]:
+    """Of each region of the skin that expressions are modelled in: its components, by number, and its soft mask.
+
+    Left eye, right eye, lower face; a region of which the file names no component is left out.
+    """
+    names = data.expression_names.tolist()
+    found = {}
+    for region, source in _EXPRESSION_GROUPS.items():
+        members = [k for k, name in enumerate(names) if name.startswith(region)]
+        if members:
+            found[region.removesuffix("_region")] = (np.array(members), np.clip(group(data, source), 0, 1))
+    return found
+
+
 _MOUTH = ("upper_lip", "lower_lip", "upper_lip_region", "lower_lip_region", "chin_region")
 STEADY_REGIONS = ("nose", "neck_back")  # of `stabilization_regions`: where expressions move the skin least
 
