@@ -44,7 +44,7 @@ class Settings:
     """What is evaluated, resolved. All components of a model, or of a region, are evaluated besides."""
 
     components: tuple[int, ...] = (5, 10, 20, 40)
-    samples: int = 300  # random heads for specificity; 0: none
+    samples: int = 200  # random heads for specificity; 0: none
     shortlist: int = 3  # real heads that each is compared with exactly
     draws: int = DRAWS  # of subjects, for intervals
     seed: int = 0
@@ -217,7 +217,6 @@ def _model(
         progress.at(len(held_out), len(held_out), f"{name}: {settings.samples} random heads")
         distance = specificity_mm(
             part,
-            _local_triangles(data, part),
             np.stack([one.neutral[part.rows] for one in held_out]),
             counts,
             samples=settings.samples,
@@ -248,7 +247,6 @@ class _Subjects:
         self.settings = settings
         self.identity, self.whole = general.identity_part(data), general.whole_part(data)
         self.outside = general.identity_part(data, regions.exterior(data))
-        self.outside_triangles = _local_triangles(data, self.outside)
         self.expressions = general.expression_parts(data)
         self.regions = {name: members[self.identity.rows] for name, members in regions.head_regions(data).items()}
         self.counts = self._counts(len(self.identity.basis))
@@ -278,13 +276,13 @@ class _Subjects:
         self.by_region.append({name: float(tabled[m].mean()) for name, m in self.regions.items() if m.any()})
         scanned = []
         if one.scan is not None:
-            scanned = fit_scan(self.outside, self.outside_triangles, one.scan, fits, seed=self.settings.seed)
+            scanned = fit_scan(self.outside, one.scan, fits, seed=self.settings.seed)
         self.scans_mm.append([float(found.distance_mm.mean()) for found in scanned] or [np.nan] * len(self.counts))
         turn = fits[-1].T_model_world[:3, :3].T
         displacements = (one.expressions.astype(np.float64) - one.neutral) @ turn
-        for region, found in self.expressions.items():
-            columns = self.counts_of(found)
-            distance = found.errors_mm(displacements, columns)
+        for region, part in self.expressions.items():
+            columns = self.counts_of(part)
+            distance = part.errors_mm(displacements, columns)
             self.expressions_mm[region].append(distance.mean(0) if len(distance) else np.full(len(columns), np.nan))
         everything = [len(self.whole.basis)]
         meshes = [one.neutral, *one.expressions]
@@ -294,14 +292,6 @@ class _Subjects:
         for category, found in zip((NEUTRAL, *one.categories), wholes, strict=True):
             grouped.setdefault(category, []).append(float(found.distance_mm.mean()))
         self.by_category.append({category: float(np.mean(values)) for category, values in grouped.items()})
-
-
-def _local_triangles(data: GNMData, part: LinearPart) -> Int[np.ndarray, "F 3"]:
-    """The triangles whose corners are all of the part, as indices into it."""
-    place = np.full(len(data.template_vertex_positions), -1)
-    place[part.rows] = np.arange(len(part.rows))
-    local = place[data.triangles]
-    return local[(local >= 0).all(1)]
 
 
 def _curve(components: tuple[int, ...], values: Float[np.ndarray, "N k"], settings: Settings) -> Curve:

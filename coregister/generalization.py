@@ -20,6 +20,7 @@ from registration.model.gnm_npz import GNMData
 
 _SETTLED = 1e-9  # metres: no vertex of a step moves farther
 _MOST_STEPS = 60
+_NOTHING = 1e-24  # of the largest: a column's square sum that is rounding, and must not be scaled up
 _DEPENDENT = 1e-10  # of the largest eigenvalue, columns scaled to one: below it a direction is not determined
 
 
@@ -30,6 +31,7 @@ class LinearPart:
     rows: Int[np.ndarray, "P"]  # of the model's vertices
     rest: Float[np.ndarray, "P 3"]
     basis: Float[np.ndarray, "K P 3"]
+    triangles: Int[np.ndarray, "F 3"]  # between the part's own vertices
 
     @cached_property
     def gram(self) -> Float[np.ndarray, "K K"]:
@@ -71,7 +73,16 @@ def _part(data: GNMData, members: Bool[np.ndarray, "V"], *bases: Float[np.ndarra
         rows=rows,
         rest=data.template_vertex_positions[rows].astype(np.float64),
         basis=np.concatenate(moving).astype(np.float64),
+        triangles=_between(data, rows),
     )
+
+
+def _between(data: GNMData, rows: Int[np.ndarray, "P"]) -> Int[np.ndarray, "F 3"]:
+    """The triangles whose corners are all among these vertices, as indices into them."""
+    place = np.full(len(data.template_vertex_positions), -1)
+    place[rows] = np.arange(len(rows))
+    local = place[data.triangles]
+    return local[(local >= 0).all(1)]
 
 
 def fit(part: LinearPart, target: Float[np.ndarray, "P 3"], components: Sequence[int]) -> list[Fit]:
@@ -120,9 +131,9 @@ def _nearest(
 
 
 def solve(matrix: Float[np.ndarray, "N N"], right: Float[np.ndarray, "N S"]) -> Float[np.ndarray, "N S"]:
-    """Normal equations, columns scaled to one; directions that they leave open get the least solution."""
-    scale = np.sqrt(np.diag(matrix))
-    scale = np.where(scale > 0, scale, 1)[:, None]
+    """Normal equations, columns scaled to one; columns of zeros, and directions left open, get the least solution."""
+    size = np.diag(matrix)
+    scale = np.sqrt(np.where(size > _NOTHING * size.max(initial=0), size, np.inf))[:, None]
     inverse = np.linalg.pinv(matrix / (scale * scale.T), rcond=_DEPENDENT, hermitian=True)
     return np.asarray(inverse @ (right / scale) / scale)
 
@@ -167,7 +178,7 @@ def expression_parts(data: GNMData) -> dict[str, ExpressionPart]:
     for region, (members, mask) in regions.expression_regions(data).items():
         rows = np.flatnonzero(mask > 0)
         basis = data.expression_basis[members][:, rows].astype(np.float64)
-        part = LinearPart(rows=rows, rest=np.zeros((len(rows), 3)), basis=basis)
+        part = LinearPart(rows=rows, rest=np.zeros((len(rows), 3)), basis=basis, triangles=_between(data, rows))
         found[region] = ExpressionPart(mask=mask[rows].astype(np.float64), part=part)
     return found
 

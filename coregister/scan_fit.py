@@ -46,7 +46,6 @@ class _State:
 
 def fit_scan(
     part: LinearPart,
-    triangles: Int[np.ndarray, "F 3"],
     points: Float[np.ndarray, "N 3"],
     starts: Sequence[Fit],
     *,
@@ -54,16 +53,16 @@ def fit_scan(
 ) -> list[Fit]:
     """The nearest heads to a scan's points (m, any frame), from each start: what a fit in correspondence found.
 
-    `triangles` index the part's vertices. Only points that the model should explain are given: the face, say. A fit's
-    `distance_mm` is of every point, unsigned, nothing dropped.
+    Only points that the model should explain are given: the face, say. A fit's `distance_mm` is of every point,
+    unsigned, nothing dropped.
     """
     rng = np.random.default_rng(seed)
     chosen = points if len(points) <= _POINTS else points[np.sort(rng.choice(len(points), _POINTS, replace=False))]
     found = []
     for start in starts:
-        state, converged = _nearest(part, triangles, chosen.astype(np.float64), start)
+        state, converged = _nearest(part, chosen.astype(np.float64), start)
         shape = part.shape(state.coefficients)
-        distance = closest_points(transform_points(state.pose, points.astype(np.float64)), shape, triangles)[0]
+        distance = closest_points(transform_points(state.pose, points.astype(np.float64)), shape, part.triangles)[0]
         found.append(
             Fit(
                 coefficients=state.coefficients,
@@ -75,20 +74,18 @@ def fit_scan(
     return found
 
 
-def _nearest(
-    part: LinearPart, triangles: Int[np.ndarray, "F 3"], points: Float[np.ndarray, "P 3"], start: Fit
-) -> tuple[_State, bool]:
-    state = _meet(part, triangles, points, start.coefficients, start.T_model_world)
+def _nearest(part: LinearPart, points: Float[np.ndarray, "P 3"], start: Fit) -> tuple[_State, bool]:
+    state = _meet(part, points, start.coefficients, start.T_model_world)
     count, damping = len(start.coefficients), _DAMPING
     for _ in range(_MOST_STEPS):
         if state.cost < _NOTHING:
             return state, True
-        matrix, right = _normal_equations(part, triangles, state)
+        matrix, right = _normal_equations(part, state)
         while True:
             damped = matrix + damping * np.diag(np.diag(matrix))
             step = solve(damped, right[:, None])[:, 0]
             pose = twisted(step[count:]) @ state.pose
-            tried = _meet(part, triangles, points, state.coefficients + step[:count], pose)
+            tried = _meet(part, points, state.coefficients + step[:count], pose)
             if tried.cost < state.cost:
                 break
             damping *= 10
@@ -102,15 +99,14 @@ def _nearest(
 
 def _meet(
     part: LinearPart,
-    triangles: Int[np.ndarray, "F 3"],
     points: Float[np.ndarray, "P 3"],
     coefficients: Float[np.ndarray, "k"],
     pose: Float[np.ndarray, "4 4"],
 ) -> _State:
     shape, placed = part.shape(coefficients), transform_points(pose, points)
-    distance, face, barycentric = closest_points(placed, shape, triangles)
-    away = placed - barycentric_points(shape, triangles, face, barycentric)
-    a, b, c = (shape[triangles[face, k]] for k in range(3))
+    distance, face, barycentric = closest_points(placed, shape, part.triangles)
+    away = placed - barycentric_points(shape, part.triangles, face, barycentric)
+    a, b, c = (shape[part.triangles[face, k]] for k in range(3))
     normal = np.cross(b - a, c - a)
     normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-300)
     direction = np.where(distance[:, None] > _TOUCHING, away / np.maximum(distance, _TOUCHING)[:, None], normal)
@@ -125,16 +121,14 @@ def _meet(
     )
 
 
-def _normal_equations(
-    part: LinearPart, triangles: Int[np.ndarray, "F 3"], state: _State
-) -> tuple[Float[np.ndarray, "N N"], Float[np.ndarray, "N"]]:
+def _normal_equations(part: LinearPart, state: _State) -> tuple[Float[np.ndarray, "N N"], Float[np.ndarray, "N"]]:
     """J'J and -J'r of the signed distances r along `direction`; N: coefficients, then the twist of the points."""
     count = len(state.coefficients)
     matrix, right = np.zeros((count + 6, count + 6)), np.zeros(count + 6)
     for first in range(0, len(state.points), _BATCH):
         part_of = slice(first, first + _BATCH)
         direction = state.direction[part_of]
-        corners = part.basis[:count, triangles[state.face[part_of]]]
+        corners = part.basis[:count, part.triangles[state.face[part_of]]]
         moves = np.einsum("kpjc,pj,pc->kp", corners, state.barycentric[part_of], direction, optimize=True)
         turns = np.einsum("kpc,pc->kp", motion_fields(state.points[part_of]), direction)
         rows = np.concatenate([-moves, turns])

@@ -14,12 +14,11 @@ from registration.frames import MM_PER_M, transform_points
 from registration.geometry.closest_point import barycentric_points, closest_points
 from registration.geometry.rigid import align
 
-_POINTS = 1000  # spread evenly over the surface of each random head
+_POINTS = 400  # spread evenly over the surface of each random head
 
 
 def specificity_mm(
     part: LinearPart,
-    triangles: Int[np.ndarray, "F 3"],
     real: Float[np.ndarray, "N P 3"],
     components: Sequence[int],
     *,
@@ -31,12 +30,11 @@ def specificity_mm(
 
     Coefficients are drawn from N(0, I); a head of k components has the first k of one and the same draw. Of the real
     neutrals (the part's vertices, m, any frames) those nearest by vertices make a shortlist; among them counts the
-    distance from 1,000 points of the random head, aligned rigidly, to the real one's surface. `triangles` index the
-    part's vertices.
+    distance from 400 points of the random head, aligned rigidly, to the real one's surface.
     """
     rng = np.random.default_rng(seed)
     drawn = rng.standard_normal((samples, max(components)))
-    face, barycentric = _spread(part.rest, triangles, rng)
+    face, barycentric = _spread(part.rest, part.triangles, rng)
     every = np.ones((1, len(part.rows)))
     placed = np.stack([transform_points(align(one[None], part.rest, every)[0], one) for one in real.astype(np.float64)])
     flat = placed.reshape(len(placed), -1)
@@ -49,11 +47,11 @@ def specificity_mm(
             candidates = np.argsort(sizes - 2 * flat @ head.ravel())[:shortlist]  # squared distance, less a constant
             for one in candidates:
                 T_real_head = align(head[None], placed[one], every)[0]
-                points = barycentric_points(head, triangles, face, barycentric)
+                points = barycentric_points(head, part.triangles, face, barycentric)
                 heads.append(transform_points(T_real_head, points).astype(np.float32))
                 nearest.append(one)
             taken.append(len(candidates))
-    distance = _distances_mm(heads, np.array(nearest), placed, triangles)
+    distance = _distances_mm(heads, np.array(nearest), placed, part.triangles)
     best = np.minimum.reduceat(distance, np.cumsum([0, *taken[:-1]]))
     return best.reshape(len(components), samples).T
 
