@@ -161,13 +161,13 @@ class ExpressionPart:
         The region models the displacement times its mask, so the mean divides by the mask's sum: where a vertex is
         shared among regions, each is asked for its share only.
         """
-        wanted = (displacements[:, self.part.rows] * self.mask[:, None]).reshape(len(displacements), -1)
+        wanted = (displacements[:, self.part.rows] * self.mask[:, None]).reshape(len(displacements), 3 * len(self.mask))
         flat = self.part.basis.reshape(len(self.part.basis), -1)
         right = flat @ wanted.T
         found = np.empty((len(displacements), len(components)))
         for column, count in enumerate(components):
             left = wanted - solve(self.part.gram[:count, :count], right[:count]).T @ flat[:count]
-            distance = np.linalg.norm(left.reshape(len(left), -1, 3), axis=2)
+            distance = np.linalg.norm(left.reshape(len(left), len(self.mask), 3), axis=2)
             found[:, column] = distance.sum(1) / self.mask.sum() * MM_PER_M
         return found
 
