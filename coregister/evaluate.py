@@ -7,7 +7,7 @@ of components.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from typing import Any
 
 import numpy as np
@@ -91,6 +91,7 @@ class ModelFigures:
     compactness: Mapping[str, Compactness]  # "identity" and the expression regions
     specificity: Curve | None
     rows: tuple[Row, ...]
+    vertex_mm: Float[np.ndarray, "V"]  # of the neutrals, mean over subjects, as in the tables; NaN off the head's skin
     unconverged: int  # fits that ended before they settled
 
 
@@ -106,13 +107,21 @@ class Gain:
 
 @dataclass(frozen=True, kw_only=True)
 class Evaluation:
-    """All models on all subjects; `registration.hashes.plain` makes a manifest's entries of it."""
+    """All models on all subjects."""
 
     subjects: tuple[str, ...]
     vertices: int  # that figures in correspondence are taken at: the head's skin
     models: Mapping[str, ModelFigures]
     gains: tuple[Gain, ...]
     settings: Settings
+
+    @property
+    def figures(self) -> dict[str, Any]:
+        """For a manifest: everything but the distances of single vertices."""
+        models = {name: {f.name: getattr(one, f.name) for f in fields(one)} for name, one in self.models.items()}
+        for one in models.values():
+            one.pop("vertex_mm")
+        return {"subjects": self.subjects, "vertices": self.vertices, "models": models, "gains": self.gains}
 
 
 def evaluate(
@@ -236,6 +245,7 @@ def _model(
         compactness={region: _compactness(found) for region, found in compact.items()},
         specificity=specific,
         rows=tuple(_rows(subjects, held_out, settings)),
+        vertex_mm=subjects.vertex_mm,
         unconverged=subjects.unconverged,
     )
 
@@ -256,6 +266,8 @@ class _Subjects:
         self.by_region: list[dict[str, float]] = []
         self.by_category: list[dict[str, float]] = []
         self.unconverged = 0
+        self._sum_mm = np.full(len(data.template_vertex_positions), np.nan)
+        self._sum_mm[self.identity.rows] = 0
 
     def _counts(self, most: int) -> tuple[int, ...]:
         return (*(k for k in self.settings.components if k < most), most)
@@ -269,10 +281,15 @@ class _Subjects:
         """The number of components that tables by region and tag are of."""
         return self.settings.components[-1]
 
+    @property
+    def vertex_mm(self) -> Float[np.ndarray, "V"]:
+        return self._sum_mm / len(self.identity_mm)
+
     def add(self, one: HeldOut) -> None:
         fits = general.fit(self.identity, one.neutral[self.identity.rows], self.counts)
         self.identity_mm.append([float(found.distance_mm.mean()) for found in fits])
         tabled = fits[self.counts.index(self.table)].distance_mm
+        self._sum_mm[self.identity.rows] += tabled
         self.by_region.append({name: float(tabled[m].mean()) for name, m in self.regions.items() if m.any()})
         scanned = []
         if one.scan is not None:

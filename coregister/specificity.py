@@ -66,7 +66,7 @@ def _distances_mm(
     found = np.empty(len(heads))
     for one in np.unique(nearest):
         members = np.flatnonzero(nearest == one)
-        points = np.concatenate([heads[k] for k in members])
+        points = np.concatenate([heads[k] for k in members.tolist()])
         distance = closest_points(points, real[one], triangles)[0]
         found[members] = distance.reshape(len(members), -1).mean(1) * MM_PER_M
     return found

@@ -323,6 +323,48 @@ def describe_model(
     return 0
 
 
+def evaluate_model(
+    models: Positional[Annotated[tuple[Path, ...], arg(metavar="MODEL")]],
+    /,
+    held_out: Annotated[Path, arg(metavar="RUN|NPZ")],
+    out: Annotated[Path, arg(metavar="DIR")],
+    captures: Annotated[Path | None, arg(metavar="DIR")] = None,
+    components: Annotated[tuple[int, ...], arg(metavar="K")] = (5, 10, 20, 40),
+    samples: Annotated[int, arg(metavar="N")] = 200,
+    seed: Annotated[int, arg(metavar="S")] = 0,
+    force: bool = False,
+) -> int:
+    """Measure head models on people that they were not made from; others are compared with the first one.
+
+    Args:
+        models: The head models, GNM NPZ files of one topology.
+        held_out: A folder of subject folders that `gnmreg subject` wrote, or an NPZ file of meshes.
+        out: The folder to write; one that this command wrote before is replaced.
+        captures: The folder of the run's subjects with their captures: adds scans, categories and tags.
+        components: Numbers of components to measure with; all are, besides.
+        samples: Random heads of each model, for specificity; 0 leaves it out.
+        seed: Seed of everything random.
+        force: Measure again although the folder holds the result of the same input.
+    """
+    from coregister.evaluate import Settings
+    from registration.progress import shown
+    from workflows.evaluate_models import PAGE, evaluate_models, lines
+
+    settings = Settings(components=components, samples=samples, seed=seed)
+    with shown() as progress:
+        manifest = evaluate_models(
+            models,
+            held_out=held_out,
+            out=out,
+            captures=captures,
+            settings=settings,
+            force=force,
+            progress=progress,
+        )
+    print("\n".join((*lines(manifest), str(out / PAGE))))
+    return 0
+
+
 def fetch_model() -> int:
     """Download Google's GNM head weights into the cache and print where they lie."""
     from registration.model.fetch import fetch
@@ -357,8 +399,8 @@ COMMANDS: Mapping[str, Command | Group] = {
         {"check": check_capture, "synth": synth_capture, "spoil": spoil_capture},
     ),
     "model": (
-        "Look at head models, make the first one, get the official one.",
-        {"info": describe_model, "bootstrap": bootstrap_model, "fetch": fetch_model},
+        "Look at head models, measure them, make the first one, get the official one.",
+        {"info": describe_model, "evaluate": evaluate_model, "bootstrap": bootstrap_model, "fetch": fetch_model},
     ),
 }
 

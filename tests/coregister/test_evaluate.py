@@ -59,6 +59,9 @@ def test_a_model_on_its_own_samples(model, found):
     assert own.scans is not None and own.scans.at(12).max() < 1e-2
     assert (own.scans.at(2) <= own.identity.at(2) + 1e-9).all()  # the surface is nearer than the vertex
     assert own.unconverged == 0
+    skin = regions.head_skin(model)
+    assert own.vertex_mm[skin].mean() == pytest.approx(own.identity.at(8).mean())
+    assert np.isnan(own.vertex_mm[~skin]).all()
     share = np.cumsum(DEVIATIONS_MM**2) / (DEVIATIONS_MM**2).sum()
     np.testing.assert_allclose(own.compactness["identity"].share, share, rtol=1e-6)
     assert own.compactness["identity"].rms_mm[-1] == pytest.approx(np.sqrt((DEVIATIONS_MM**2).sum()), rel=1e-6)
@@ -125,8 +128,8 @@ def test_gains_are_paired_and_of_the_same_number_of_components(model):
 
 def test_equal_seeds_make_equal_figures_that_fit_into_a_manifest(model, found):
     again = evaluate({"own": model}, people(model), model.triangles, SETTINGS)
-    text = json.dumps(plain(found), allow_nan=False)
-    assert text == json.dumps(plain(again), allow_nan=False)
+    text = json.dumps(plain(found.figures), allow_nan=False)
+    assert text == json.dumps(plain(again.figures), allow_nan=False)
     other = evaluate({"own": model}, people(model), model.triangles, replace(SETTINGS, seed=1))
     assert other.models["own"].specificity.values_mm.tolist() != found.models["own"].specificity.values_mm.tolist()
 
