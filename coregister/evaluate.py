@@ -6,6 +6,7 @@ subjects and tables by region, category and tag. Several models are compared on 
 of components.
 """
 
+import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from typing import Any
@@ -329,7 +330,10 @@ def _rows(subjects: _Subjects, held_out: Sequence[HeldOut], settings: Settings) 
     neutrals = np.array(subjects.identity_mm)[:, subjects.counts.index(subjects.table)]
     for tag in dict.fromkeys(tag for one in held_out for tag in one.tags if tag != _CATEGORY):
         groups = [_group(one.tags[tag]) if tag in one.tags else None for one in held_out]
-        for name in sorted({group for group in groups if group is not None}):
+        names = sorted({group for group in groups if group is not None})
+        if all(groups.count(name) == 1 for name in names):  # a name or a note: it groups nobody
+            continue
+        for name in names:
             yield _row(tag, name, neutrals[[group == name for group in groups]], settings)
 
 
@@ -340,7 +344,7 @@ def _row(kind: str, name: str, values: Float[np.ndarray, "N"], settings: Setting
 
 def _group(value: Any) -> str:
     """Numbers are grouped by tens: an age of its own would be a table of single subjects."""
-    if isinstance(value, (int, float)) and not isinstance(value, bool):
+    if isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value):
         low = int(value // 10 * 10)
         return f"{low} to {low + 9}"
     return str(value)

@@ -12,7 +12,8 @@ from coregister import expressions, population
 from coregister.evaluate import HeldOut, Settings, evaluate
 from registration.errors import InputError
 from registration.hashes import plain
-from registration.model import regions
+from registration.model import gnm_npz, regions
+from tests.conftest import SHARED, needs_shared
 from tests.coregister.spectrum import DEVIATIONS_MM, heads, spectrum_model, with_identity
 
 SETTINGS = Settings(components=(2, 4, 8), samples=5, draws=500)
@@ -37,7 +38,12 @@ def people(model, count=4, seed=0):
                 neutral=neutral,
                 expressions=neutral + acts,
                 categories=("jaw", "lips"),
-                tags={"gender": ("female", "male")[number % 2], "age": AGES[number % 4], "category": "neutral"},
+                tags={
+                    "gender": ("female", "male")[number % 2],
+                    "age": AGES[number % 4],
+                    "category": "neutral",
+                    "note": f"{number}",
+                },
                 scan=neutral[regions.head_skin(model)],
             )
         )
@@ -97,6 +103,7 @@ def test_tables_count_subjects_and_split_them_by_what_they_share(model, found):
     assert {name for kind, name in rows if kind == "age"} == {"20 to 29", "30 to 39", "60 to 69"}
     assert rows["age", "30 to 39"].subjects == 2 and rows["age", "20 to 29"].subjects == 1
     assert rows["age", "20 to 29"].distance_mm.low is None
+    assert "note" not in {kind for kind, _ in rows}  # everybody has another one
     neutrals = own.identity.at(8)
     assert rows["gender", "female"].distance_mm.mean == pytest.approx(neutrals[::2].mean())
     assert rows["gender", "male"].distance_mm.mean == pytest.approx(neutrals[1::2].mean())
@@ -204,10 +211,29 @@ def test_what_cannot_be_evaluated_is_refused_before_any_work(model, name, monkey
     assert all((error.value.where, error.value.expected, error.value.got, error.value.fix))
 
 
+@needs_shared
+@pytest.mark.slow
+def test_a_model_of_the_official_size_on_its_own_samples():
+    data = gnm_npz.read(SHARED / "data" / "gnm" / "gnm_head_reconstructed.npz")
+    rng = np.random.default_rng(0)
+    members = np.concatenate([members for members, _ in regions.expression_regions(data).values()])
+    subjects = []
+    for number in range(2):
+        neutral = heads(data, rng.standard_normal((1, len(data.vertex_identity_basis))))[0]
+        move = np.tensordot(rng.standard_normal(len(members)), data.expression_basis[members].astype(np.float64), 1)
+        both = {"expressions": (neutral + move)[None], "categories": ("any",)}
+        subjects.append(HeldOut(subject=f"{number}", neutral=neutral, **both))
+    settings = Settings(components=(10, 20, 40), samples=0)
+    found = evaluate({"own": data}, subjects, data.triangles, settings).models["own"]
+    means = [interval.mean for interval in found.identity.intervals]
+    assert found.unconverged == 0 and means == sorted(means, reverse=True)
+    assert means[0] > 0.2 and means[-1] < 1e-5
+    rows = {(row.kind, row.name): row.distance_mm.mean for row in found.rows}
+    assert rows["category", "any"] < 1e-5 and rows["category", "neutral"] < 1e-5
+
+
 @pytest.mark.slow
 def test_people_beyond_the_first_models_span(anatomy, model, model_file):
-    from registration.model import gnm_npz
-
     data, source = gnm_npz.read(model_file), anatomy.source
     rng = np.random.default_rng(12345)
     acts = [expressions.named(name) for name in ("smile", "jaw_open", "brows_up")]

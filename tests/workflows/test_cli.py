@@ -30,7 +30,7 @@ HEAVY = {"torch", "mitsuba", "drjit", "numpy", "scipy", "cv2", "pycolmap", "korn
             "capture synth",
             "capture spoil",
         ),
-        *("model", "model info", "model fetch", "model bootstrap"),
+        *("model", "model info", "model evaluate", "model fetch", "model bootstrap"),
     ],
 )
 def test_every_command_explains_itself(command: str, capsys: pytest.CaptureFixture[str]) -> None:
