@@ -229,3 +229,30 @@ def test_stabilization_regions_are_exterior_and_mirrored(tiny):
 def test_stabilization_regions_need_their_groups(tiny, name):
     with pytest.raises(InputError, match=f"no vertex group '{name}'"):
         regions.stabilization_regions(without(tiny, name))
+
+
+def test_the_heads_skin_has_no_neck_and_its_regions_are_mirrored(tiny):
+    skin, mirror = regions.head_skin(tiny), tiny.mirror_indices
+    assert skin.any() and regions.exterior(tiny)[skin].all() and not skin[regions.neck_other(tiny)].any()
+    found = regions.head_regions(tiny)
+    assert {"face", "nose", "mouth", "ears", "forehead", "chin", "back"} < set(found)
+    for name, mask in found.items():
+        assert mask.any() and skin[mask].all()
+        twin = {"left_periocular": "right_periocular", "right_periocular": "left_periocular"}.get(name, name)
+        np.testing.assert_array_equal(mask[mirror], found[twin])
+
+
+@needs_shared
+def test_expression_regions_are_components_with_their_mask(full, tiny):
+    found = regions.expression_regions(full)
+    assert {name: len(members) for name, (members, _) in found.items()} == {
+        "left_eye": 100,
+        "right_eye": 100,
+        "lower_face": 150,
+    }
+    np.testing.assert_array_equal(found["left_eye"][1][full.mirror_indices], found["right_eye"][1])
+    inside = found["left_eye"][1] > 0
+    energy = (full.expression_basis[found["left_eye"][0]].astype(np.float32) ** 2).sum((0, 2))
+    assert energy[inside].sum() > 0.9 * energy.sum()
+    names = np.array(["pupils" if n.startswith("left_eye") else n for n in tiny.expression_names.tolist()])
+    assert set(regions.expression_regions(replace(tiny, expression_names=names))) == {"right_eye", "lower_face"}
