@@ -4,8 +4,8 @@
 
 Held-out people that the first model does not span, with five expressions each, evaluated as `gnmreg model evaluate`
 does. Beside the first model stand models of the true meshes of other people: what a rebuilt model could reach, if
-registrations were perfect. A line's three figures: vertex to vertex; scan to surface, of 20,000 points of the true face;
-specificity. One file, no timed test: seconds are wall-clock.
+registrations were perfect. A line's three figures: vertex to vertex; scan to surface, of 20,000 points of the true
+face; specificity. One file, no timed test: seconds are wall-clock.
 """
 
 import argparse
