@@ -5,10 +5,10 @@
 
 Subjects that the first model does not span perform 20 expressions; their heads are turned by up to 5 degrees and moved
 by up to 10 mm, with noise of 0.3 mm (smooth over 15 mm) and 0.1 mm (white) in each coordinate, and a tenth of the
-vertices unseen and wrong. mm: rms displacement of the face mask by the motion that is left. Then rigid motions of two
-kinds (1 degree and 2 mm, one standard deviation) are put into a third of the true samples, which the second stage is
-to find; the worst of five draws. `body_stays`: heads that turn on their necks, not whole busts. `--run` takes a subject's registrations, as `gnmreg subject` wrote them, and applies
-50 motions to their vertices. One file, no timed test: seconds are wall-clock.
+vertices unseen and wrong. mm: rms displacement of the face mask by the motion that is left; body_stays: of heads that
+turn on their necks. Then rigid motions of two kinds (1 degree and 2 mm, one standard deviation) are put into a third
+of the true samples, which the second stage is to find; the worst of five draws. `--run` takes a subject's
+registrations, as `gnmreg subject` wrote them, and applies 50 motions to their vertices. Seconds are wall-clock.
 """
 
 import argparse
