@@ -26,9 +26,10 @@ class Weights:
     expression: float = 2e-3
     rotations: float = 0.1  # joints other than the root, per rad^2
     eyes: float = 1.0  # eyeballs moved out of the model's place, per m^2
-    eye_scale: float = 0.01
+    eye_scale: float = 2e-3
     offsets: float = 2e4  # per m^2: how hard images are taken to pull, which the lengths below are balanced against
     contacts: float = 0.0  # per mm^2, summed over the vertices that lie too deep in another part
+    tongue: float = 1e-5  # the same of the tongue, which is mostly unseen: little more than its prior's pull
     slide: float = 0.0  # dissimilarity of the neutral's texture and the images unwrapped; expressions only
 
 
@@ -97,19 +98,32 @@ def _model(steps: int) -> Stage:
         steps=steps,
         level=2,
         free=_rates(("identity", 0.1), ("expression", 0.03), ("scale", 3e-3), *_POSE),
-        weights=Weights(contacts=2e-5),
     )
 
 
 def _offsets(
-    smoothing_mm: float, half_gain_mm: float, steps: int, level: int, start: float, end: float, ssim: float = 0.06
+    smoothing_mm: float,
+    half_gain_mm: float,
+    steps: int,
+    level: int,
+    start: float,
+    end: float,
+    ssim: float = 0.06,
+    expression: float = 0.0,
 ) -> Stage:
+    """Offsets on the model's head; at a rate of `expression` its face still moves, and with it teeth and tongue."""
+    face = (("expression", Rate(start=expression, end=expression / 5)),) if expression else ()
     return Stage(
         name=f"offsets {smoothing_mm:g} mm",
         steps=steps,
         level=level,
         lengths=Lengths(smoothing_mm=smoothing_mm, half_gain_mm=half_gain_mm),
-        free=(("offsets", Rate(start=start, end=end)), ("eyes", Rate(start=start / 10, end=end / 10))),
+        free=(
+            ("offsets", Rate(start=start, end=end)),
+            ("eyes", Rate(start=start / 10, end=end / 10)),
+            ("joints", Rate(start=start, end=end)),  # where eyes look
+            *face,
+        ),
         weights=Weights(rgb=0.3, ssim=ssim, classes=0.1, landmarks=0.01, contacts=2e-4, slide=0.5),
         texture=True,
     )
@@ -119,8 +133,8 @@ def draft(*, scale: bool = True) -> Recipe:
     """A minute on a laptop: model, then offsets up to a head of about 512 px."""
     stages = (
         _model(100),
-        _offsets(20, 12, 30, level=2, start=4e-3, end=2e-3),
-        _offsets(5, 8, 40, level=1, start=1e-3, end=5e-4),
+        _offsets(20, 12, 30, level=2, start=4e-3, end=2e-3, expression=0.01),
+        _offsets(5, 8, 40, level=1, start=1e-3, end=5e-4, expression=0.01),
         _offsets(2.5, 6, 30, level=1, start=4e-4, end=5e-5),
         _offsets(1.5, 5, 40, level=0, start=2e-4, end=2e-5, ssim=0.0),
     )
@@ -131,8 +145,8 @@ def studio(*, scale: bool = True) -> Recipe:
     """The full quality: more views at every step, longer, up to the images' own resolution."""
     stages = (
         _model(150),
-        _offsets(20, 12, 50, level=2, start=4e-3, end=2e-3),
-        _offsets(5, 8, 80, level=1, start=1e-3, end=5e-4),
+        _offsets(20, 12, 50, level=2, start=4e-3, end=2e-3, expression=0.01),
+        _offsets(5, 8, 80, level=1, start=1e-3, end=5e-4, expression=0.01),
         _offsets(2.5, 6, 60, level=1, start=4e-4, end=5e-5),
         _offsets(1.5, 4, 90, level=0, start=3e-4, end=1e-5, ssim=0.0),
     )
@@ -151,7 +165,7 @@ def rigid(level: int) -> Stage:
     """Pose and size alone, to judge a start."""
     rates = (("root", 2e-2), ("position", 3e-3), ("scale", 1e-2))
     free = tuple((name, Rate(start=rate, end=rate * 0.2)) for name, rate in rates)
-    return Stage(name="rigid", steps=30, level=level, free=free, weights=Weights(mask=1.0, landmarks=0.0))
+    return Stage(name="rigid", steps=30, level=level, free=free, weights=Weights(mask=1.0, landmarks=0.0, tongue=0.0))
 
 
 def expression_of(recipe: Recipe) -> Recipe:
