@@ -102,28 +102,15 @@ def _model(steps: int) -> Stage:
 
 
 def _offsets(
-    smoothing_mm: float,
-    half_gain_mm: float,
-    steps: int,
-    level: int,
-    start: float,
-    end: float,
-    ssim: float = 0.06,
-    expression: float = 0.0,
+    smoothing_mm: float, half_gain_mm: float, steps: int, level: int, start: float, end: float, ssim: float = 0.06
 ) -> Stage:
-    """Offsets on the model's head; at a rate of `expression` its face still moves, and with it teeth and tongue."""
-    face = (("expression", Rate(start=expression, end=expression / 5)),) if expression else ()
+    # Pose and expression stand still: offsets would make up for what they drift, and teeth would be left behind.
     return Stage(
         name=f"offsets {smoothing_mm:g} mm",
         steps=steps,
         level=level,
         lengths=Lengths(smoothing_mm=smoothing_mm, half_gain_mm=half_gain_mm),
-        free=(
-            ("offsets", Rate(start=start, end=end)),
-            ("eyes", Rate(start=start / 10, end=end / 10)),
-            ("joints", Rate(start=start, end=end)),  # where eyes look
-            *face,
-        ),
+        free=(("offsets", Rate(start=start, end=end)), ("eyes", Rate(start=start / 10, end=end / 10))),
         weights=Weights(rgb=0.3, ssim=ssim, classes=0.1, landmarks=0.01, contacts=2e-4, slide=0.5),
         texture=True,
     )
@@ -133,8 +120,8 @@ def draft(*, scale: bool = True) -> Recipe:
     """A minute on a laptop: model, then offsets up to a head of about 512 px."""
     stages = (
         _model(100),
-        _offsets(20, 12, 30, level=2, start=4e-3, end=2e-3, expression=0.01),
-        _offsets(5, 8, 40, level=1, start=1e-3, end=5e-4, expression=0.01),
+        _offsets(20, 12, 30, level=2, start=4e-3, end=2e-3),
+        _offsets(5, 8, 40, level=1, start=1e-3, end=5e-4),
         _offsets(2.5, 6, 30, level=1, start=4e-4, end=5e-5),
         _offsets(1.5, 5, 40, level=0, start=2e-4, end=2e-5, ssim=0.0),
     )
@@ -145,8 +132,8 @@ def studio(*, scale: bool = True) -> Recipe:
     """The full quality: more views at every step, longer, up to the images' own resolution."""
     stages = (
         _model(150),
-        _offsets(20, 12, 50, level=2, start=4e-3, end=2e-3, expression=0.01),
-        _offsets(5, 8, 80, level=1, start=1e-3, end=5e-4, expression=0.01),
+        _offsets(20, 12, 50, level=2, start=4e-3, end=2e-3),
+        _offsets(5, 8, 80, level=1, start=1e-3, end=5e-4),
         _offsets(2.5, 6, 60, level=1, start=4e-4, end=5e-5),
         _offsets(1.5, 4, 90, level=0, start=3e-4, end=1e-5, ssim=0.0),
     )
