@@ -55,7 +55,7 @@ VARIANTS: Mapping[str, Callable[[Recipe], Recipe]] = {
     "everything": lambda recipe: recipe,
     "edges": lambda recipe: replace(recipe, edge_samples=0.0),
     "UV SSIM": _weights(slide=0.0),
-    "contacts": _weights(contacts=0.0),
+    "contacts": _weights(contacts=0.0, tongue=0.0),
     "large steps": _without_large_steps,
     "normals": _weights(normals=0.0),
     "classes": _weights(classes=0.0),

@@ -14,18 +14,18 @@ from registration.confidence import vertex_confidence
 from registration.frames import MM_PER_M
 from registration.geometry.large_steps import LargeSteps, normalised_laplacian, spacing
 from registration.losses import geometry, image, landmark
-from registration.losses.anatomy import SelfIntersection
+from registration.losses.anatomy import OF_THE_TONGUE, SelfIntersection
 from registration.losses.texture import TextureSlide
 from registration.model.gnm import GNM
 from registration.model.gnm_npz import GNMData
 from registration.model.landmarks import LandmarkScheme
-from registration.model.regions import crossing_parts, group, offset_regions, vertex_classes
+from registration.model.regions import crossing_parts, offset_regions, vertex_classes
 from registration.optimize import AdamBlock, AdamUniformBlock, Block, History, minimise
 from registration.render.renderer import Renderer
 from registration.stages import Lengths, Recipe, Stage, rigid
 from registration.start import Candidate, assess
 from registration.targets.classes import ClassMap
-from registration.trust import Trust, ViewErrors, view_errors
+from registration.trust import HEAD_PX, Trust, ViewErrors, view_errors
 from registration.types import Registration, Rendered, Targets
 from registration.unknowns import Start, Unknowns, skin_topology, skin_vertices
 
@@ -83,8 +83,6 @@ class Fit:
         self.appearance = Appearance(self.renderer, recipe.texture_px, len(pyramid[0].names), self.device)
         self.trust = Trust.full(len(pyramid[0].names))
         self._contacts = SelfIntersection(data, self.device)
-        eyeballs = np.maximum(group(data, "left_eye"), group(data, "right_eye")) > 0.5
-        self._eyeballs = torch.as_tensor(eyeballs, device=self.device)[:, None]
         self._slide: TextureSlide | None = None
         self._random = np.random.default_rng(seed)
         self._order: list[int] = []
@@ -140,7 +138,7 @@ class Fit:
         vertices = self.vertices()
         with torch.no_grad():
             rendered = self.renderer(vertices, None, targets.pixels)
-        distances = [distance for distance, _ in self.landmark_residuals(vertices).values()]
+        distances = list(self._landmark_residuals(vertices).values())
         landmark_px = (
             torch.cat(distances, 1).nanmedian(1).values
             if distances
@@ -148,8 +146,8 @@ class Fit:
         )
         return view_errors(rendered, targets, landmark_px)
 
-    def landmark_residuals(self, vertices: Float[Tensor, "V 3"]) -> dict[str, tuple[Float[Tensor, "N L"], Tensor]]:
-        """Per scheme, px at 512 px of head height (NaN where not seen or not used), and the points in the world."""
+    def _landmark_residuals(self, vertices: Float[Tensor, "V 3"]) -> dict[str, Float[Tensor, "N L"]]:
+        """Per scheme, px at 512 px of head height; NaN where not seen or not used."""
         finest, found = self.pyramid[0], {}
         for name, scheme in self.schemes.items():
             points = scheme.points(vertices)
@@ -157,7 +155,24 @@ class Fit:
                 finest.pixels.cameras, points, finest.landmarks[name].to(self.device), finest.px_per_head
             )
             used = (counts > 0) & torch.as_tensor(self.landmark_use[name], device=self.device)
-            found[name] = (torch.where(used, distance, torch.nan), points)
+            found[name] = torch.where(used, distance, torch.nan)
+        return found
+
+    def landmark_misfits(self, solved: Mapping[str, Float[np.ndarray, "L 3"]]) -> dict[str, float]:
+        """Per scheme, how far the used landmarks lie from their points on the mesh: the median, px at 512 px of head.
+
+        `solved` are triangulated, world, metres, NaN where unseen: what all views say together. Each alone is off by
+        its own noise, however well the mesh fits.
+        """
+        finest, mesh, found = self.pyramid[0], self.vertices().double().cpu().numpy(), {}
+        for name, scheme in self.schemes.items():
+            points = scheme.points(mesh)
+            distance = np.linalg.norm(points - solved[name], axis=1)[self.landmark_use[name]]
+            depths = [camera.project(points.mean(0)[None])[1][0] for camera in finest.pixels.cameras]
+            focals = [camera.intrinsics[0, 0] for camera in finest.pixels.cameras]
+            px_per_m = float(np.median(np.divide(focals, depths))) * HEAD_PX / finest.px_per_head
+            seen = distance[np.isfinite(distance)]
+            found[name] = float(np.median(seen)) * px_per_m if len(seen) else float("nan")
         return found
 
     def _run_stage(self, stage: Stage, outcome: Outcome, on_step: OnStep) -> tuple[History, str | None]:
@@ -246,13 +261,7 @@ class Fit:
         rendered = self.renderer(vertices, self.appearance.texture if colour else None, batch.pixels)
         terms = self._image_terms(stage, rendered, batch, views)
         terms |= self._landmark_terms(stage, vertices, batch)
-        if stage.weights.contacts > 0:
-            # Eyeballs are seen and round: images place them, and lids, most of whose rims no image shows, yield.
-            touching = torch.where(self._eyeballs, vertices.detach(), vertices)
-            if step % _CONTACTS_EVERY == 0:
-                self._contacts.refresh(touching)
-            for pair, penalty in self._contacts(touching).items():
-                terms[f"contact {pair}"] = stage.weights.contacts * penalty
+        terms |= self._contact_terms(stage, step, offsets)
         if stage.weights.slide > 0 and self._slide is not None:
             even = replace(batch, rgb=self.appearance.corrected(batch, views))
             terms["slide"] = stage.weights.slide * self._slide(vertices, even)
@@ -276,6 +285,18 @@ class Fit:
         if stage.texture:
             self.appearance.improve(self.vertices(), rendered, batch, agree, views)
         return terms
+
+    def _contact_terms(self, stage: Stage, step: int, offsets: Tensor) -> dict[str, Tensor]:
+        w = stage.weights
+        if not (w.contacts or w.tongue):
+            return {}
+        touching = self.unknowns.yielding(offsets)
+        if step % _CONTACTS_EVERY == 0:
+            # How a person's tongue fills the mouth at rest is the model's own making, and seen by nobody.
+            self._contacts.accept(self.unknowns.at_rest(), OF_THE_TONGUE)
+            self._contacts.refresh(touching)
+        found = self._contacts(touching).items()
+        return {f"contact {pair}": (w.tongue if pair in OF_THE_TONGUE else w.contacts) * cost for pair, cost in found}
 
     def _class_weights(self, eyes: float) -> Tensor:
         return torch.tensor([eyes if "eye" in name else 1.0 for name in self._class_names], device=self.device)

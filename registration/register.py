@@ -302,7 +302,7 @@ def _collect(inputs: Inputs, fit: Fit, start: Start, outcome: Outcome) -> Regist
     parameters, offsets = fit.unknowns.parameters()
     positions = fit.vertices()
     vertices, errors = positions.cpu().numpy(), fit.view_errors()
-    landmark_px = {name: _median(distance) for name, (distance, _) in fit.landmark_residuals(positions).items()}
+    landmark_px = fit.landmark_misfits(inputs.landmarks)
     status, reason = _status(outcome, landmark_px, errors)
 
     def array(value: torch.Tensor) -> np.ndarray:
@@ -335,10 +335,6 @@ def _collect(inputs: Inputs, fit: Fit, start: Start, outcome: Outcome) -> Regist
         config=inputs.config,
         inputs=inputs.digests,
     )
-
-
-def _median(distance: torch.Tensor) -> float:
-    return float(distance.nanmedian())
 
 
 def _status(outcome: Outcome, landmark_px: Mapping[str, float], errors: ViewErrors) -> tuple[Status, str]:

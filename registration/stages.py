@@ -26,9 +26,10 @@ class Weights:
     expression: float = 2e-3
     rotations: float = 0.1  # joints other than the root, per rad^2
     eyes: float = 1.0  # eyeballs moved out of the model's place, per m^2
-    eye_scale: float = 0.01
+    eye_scale: float = 2e-3
     offsets: float = 2e4  # per m^2: how hard images are taken to pull, which the lengths below are balanced against
     contacts: float = 0.0  # per mm^2, summed over the vertices that lie too deep in another part
+    tongue: float = 1e-5  # the same of the tongue, which is mostly unseen: little more than its prior's pull
     slide: float = 0.0  # dissimilarity of the neutral's texture and the images unwrapped; expressions only
 
 
@@ -97,13 +98,13 @@ def _model(steps: int) -> Stage:
         steps=steps,
         level=2,
         free=_rates(("identity", 0.1), ("expression", 0.03), ("scale", 3e-3), *_POSE),
-        weights=Weights(contacts=2e-5),
     )
 
 
 def _offsets(
     smoothing_mm: float, half_gain_mm: float, steps: int, level: int, start: float, end: float, ssim: float = 0.06
 ) -> Stage:
+    # Pose and expression stand still: offsets would make up for what they drift, and teeth would be left behind.
     return Stage(
         name=f"offsets {smoothing_mm:g} mm",
         steps=steps,
@@ -151,7 +152,7 @@ def rigid(level: int) -> Stage:
     """Pose and size alone, to judge a start."""
     rates = (("root", 2e-2), ("position", 3e-3), ("scale", 1e-2))
     free = tuple((name, Rate(start=rate, end=rate * 0.2)) for name, rate in rates)
-    return Stage(name="rigid", steps=30, level=level, free=free, weights=Weights(mask=1.0, landmarks=0.0))
+    return Stage(name="rigid", steps=30, level=level, free=free, weights=Weights(mask=1.0, landmarks=0.0, tongue=0.0))
 
 
 def expression_of(recipe: Recipe) -> Recipe:

@@ -1,6 +1,6 @@
 """What a fit solves for, and the mesh that follows from it."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -14,7 +14,7 @@ from registration.geometry.large_steps import LargeSteps
 from registration.geometry.topology import edges
 from registration.model.gnm import GNM
 from registration.model.gnm_npz import GNMData
-from registration.model.regions import group, neck_other
+from registration.model.regions import exterior, group, neck_other
 from registration.types import Parameters
 
 
@@ -69,6 +69,9 @@ class Unknowns:
         if start.offsets is not None:
             self.fixed_offsets = tensor(start.offsets, count, 3)
             self.fixed_offsets[self._skin] = 0
+        outside = torch.as_tensor(np.flatnonzero(exterior(data)), device=device)
+        shown = model.expression_basis.unflatten(-1, (-1, 3)).index_select(1, outside)
+        self._inner = (shown == 0).all(-1).all(-1)  # expression components that move nothing of the outer skin
         self.reference_offsets = self.tensors["offsets"].clone()  # what the offsets' penalties are measured from
         self._steps: LargeSteps | None = None
         self._bind: tuple[Tensor, Tensor] | None = None
@@ -87,7 +90,7 @@ class Unknowns:
             self.tensors["offsets"] = steps.latent(self.tensors["offsets"])
         if not {"identity", "expression"} & set(names):
             with torch.no_grad():
-                self._bind = self._bind_pose()
+                self._bind = self._bind_pose(self.tensors)
         for name in names:
             self.tensors[name].requires_grad_(True)
 
@@ -102,14 +105,14 @@ class Unknowns:
         latent = self.tensors["offsets"]
         return latent if self._steps is None else self._steps.displacement(latent)
 
-    def _bind_pose(self) -> tuple[Tensor, Tensor]:
-        identity = self.tensors["identity"]
-        return self.model.bind(identity, self.tensors["expression"]), self.model.joints(identity)
+    def _bind_pose(self, tensors: Mapping[str, Tensor]) -> tuple[Tensor, Tensor]:
+        identity = tensors["identity"]
+        return self.model.bind(identity, tensors["expression"]), self.model.joints(identity)
 
-    def offsets(self, skin_offsets: Tensor, bind: Tensor) -> Float[Tensor, "V 3"]:
+    def _offsets(self, skin_offsets: Tensor, bind: Tensor, eyes: Tensor) -> Float[Tensor, "V 3"]:
         """All offsets in bind space: the skin's, and the eyeballs' moves."""
         offsets = self.fixed_offsets.index_add(0, self._skin, skin_offsets)
-        for move, index in zip(self.tensors["eyes"], self._eyes, strict=True):
+        for move, index in zip(eyes, self._eyes, strict=True):
             own = bind[index]
             offsets = offsets.index_add(0, index, move[:3] + torch.expm1(move[3]) * (own - own.mean(0).detach()))
         return offsets
@@ -119,18 +122,37 @@ class Unknowns:
 
     def vertices(self, skin_offsets: Tensor) -> Float[Tensor, "V 3"]:
         """The mesh in the capture's world, metres."""
-        bind, joints = self._bind or self._bind_pose()
-        bind = bind + self.offsets(skin_offsets, bind)
-        local = torch.cat([self.rotation()[None], axis_angle_to_matrix(self.tensors["joints"])])
+        return self._posed(skin_offsets, self.tensors)
+
+    def yielding(self, skin_offsets: Tensor) -> Float[Tensor, "V 3"]:
+        """The same mesh, with a gradient for what yields where parts touch: offsets, and the tongue.
+
+        A face does not become another one for its parts to fit, nor do the eyeballs move, which images place.
+        """
+        held = {name: tensor.detach() for name, tensor in self.tensors.items()}
+        held["expression"] = torch.where(self._inner, self.tensors["expression"], held["expression"])
+        return self._posed(skin_offsets, held)
+
+    @torch.no_grad()
+    def at_rest(self) -> Float[Tensor, "V 3"]:
+        """The model's head of this identity, its face relaxed, in the model's frame."""
+        identity = self.tensors["identity"]
+        return self.model.bind(identity, torch.zeros_like(self.tensors["expression"]))
+
+    def _posed(self, skin_offsets: Tensor, tensors: Mapping[str, Tensor]) -> Float[Tensor, "V 3"]:
+        bind, joints = self._bind or self._bind_pose(tensors)
+        bind = bind + self._offsets(skin_offsets, bind, tensors["eyes"])
+        root = axis_angle_to_matrix(tensors["root"]) @ self.base_rotation
+        local = torch.cat([root[None], axis_angle_to_matrix(tensors["joints"])])
         # The root turns the head about its joint; the pivot, turned likewise, is then put in its place.
-        pivot = local[0] @ (self.pivot - joints[0]) + joints[0]
-        return self.tensors["scale"].exp() * (self.model.pose(bind, joints, local) - pivot) + self.tensors["position"]
+        pivot = root @ (self.pivot - joints[0]) + joints[0]
+        return tensors["scale"].exp() * (self.model.pose(bind, joints, local) - pivot) + tensors["position"]
 
     @torch.no_grad()
     def parameters(self) -> tuple[Parameters, Float[Tensor, "V 3"]]:
         """The model's own parameters and bind-space offsets that give the same mesh."""
         rotation, scale = self.rotation(), self.tensors["scale"].exp()
-        bind, joints = self._bind_pose()
+        bind, joints = self._bind_pose(self.tensors)
         root = matrix_to_axis_angle(rotation.double().cpu().numpy())
         rotations = torch.cat([torch.tensor(root, dtype=torch.float32, device=rotation.device)[None], self["joints"]])
         # The model turns about its root joint, we about the pivot.
@@ -142,7 +164,7 @@ class Unknowns:
             translation=translation,
             scale=scale,
         )
-        return parameters, self.offsets(self.skin_offsets(), bind)
+        return parameters, self._offsets(self.skin_offsets(), bind, self["eyes"])
 
 
 def pivot(data: GNMData) -> Float[np.ndarray, "3"]:

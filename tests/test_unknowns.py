@@ -8,6 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from registration.geometry.large_steps import LargeSteps
 from registration.model.gnm import GNM
+from registration.model.regions import exterior
 from registration.unknowns import Start, Unknowns, skin_topology, start_of
 from tests.fixtures.make_fixtures import tiny_model
 
@@ -76,3 +77,18 @@ def test_eyeballs_keep_their_shape() -> None:
     assert torch.equal(rest[right], moved[right])
     sizes = [torch.pdist(mesh[left][::7]) for mesh in (rest, moved)]
     torch.testing.assert_close(sizes[1], sizes[0] * float(np.exp(0.05)), rtol=1e-3, atol=1e-6)
+
+
+def test_where_parts_touch_offsets_and_tongue_yield_and_nothing_else() -> None:
+    unknowns, _ = _fitted()
+    data = tiny_model()
+    unknowns.free(list(set(unknowns.tensors) - {"offsets"}), None)
+    unknowns["offsets"].requires_grad_(True)
+    mesh, same = (draw(unknowns.skin_offsets()) for draw in (unknowns.vertices, unknowns.yielding))
+    torch.testing.assert_close(same, mesh, rtol=0, atol=0)
+    same.square().sum().backward()
+    got = {name for name, tensor in unknowns.tensors.items() if tensor.grad is not None and tensor.grad.any()}
+    assert got == {"offsets", "expression"}
+    moves_skin = np.abs(data.expression_basis[:, exterior(data)]).max((1, 2)) > 0
+    assert moves_skin.any() and not moves_skin.all()
+    assert not unknowns["expression"].grad[torch.as_tensor(moves_skin)].any()

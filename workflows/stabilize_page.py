@@ -77,7 +77,7 @@ def _bar() -> str:
     return (
         f'<div class="bar"><span>0 mm</span><i style="background:linear-gradient(90deg, {stops})"></i>'
         f'<span>{LIMIT_MM:g} mm and more</span><em><span class="swatch" style="background:rgb{UNMEASURED}"></span>'
-        "not trusted: unseen, neck, no skin</em></div>"
+        "has no say: unseen, neck, mouth and cheeks</em></div>"
     )
 
 

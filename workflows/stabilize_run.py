@@ -48,11 +48,13 @@ def stabilize_run(
     settings: Stabilization | None = None,
     skip_failed: bool = False,
     force: bool = False,
+    whatever_decided: bool = False,
     progress: Progress | None = None,
 ) -> Outcome:
     """Stabilize all registrations of a run and write the folder `out` (docs/formats.md), by default RUN/stabilized.
 
-    The same as `stabilize` of the registrations. A folder made from the same inputs is left as it is, unless `force`.
+    The same as `stabilize` of the registrations. A folder made from the same inputs is left as it is, unless `force`;
+    with `whatever_decided` also one that other decisions made: its components are the same.
 
     Raises:
         InputError: as `read_run`, `read_decisions`, `check_out`; fewer than two expressions. Nothing is written then.
@@ -69,7 +71,7 @@ def stabilize_run(
     wanted = input_hash(found.inputs, {"settings": plain(settings), "decisions": plain(decided)})
     if not force and disk.is_stabilized(out):
         manifest = disk.read_manifest(out)
-        if manifest["input_hash"] == wanted:
+        if manifest["input_hash"] == wanted or (whatever_decided and manifest["dataset"] == dataset):
             return Outcome(out=out, dataset=dataset, figures=manifest["figures"])
     with disk.fresh_folder(out) as fresh:
         ids, components, moved = _write_subjects(fresh, found, data, head, settings, decided, progress)

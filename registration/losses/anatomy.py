@@ -2,9 +2,11 @@
 
 A vertex is penalised by the square of how much deeper it lies in the other part than in the template, beyond a margin:
 contact is the normal state of lids and lips, and the template runs through itself in places. An eyeball is the union of
-two spheres; everything else is a surface that vertices get behind. Eye sockets, the mouth's lining and the lower gums
-are left out: in the model they lie inside their neighbours.
+two spheres; everything else is a surface that vertices get behind. Eye sockets and the mouth's lining are left out: in
+the model they lie inside their neighbours.
 """
+
+from collections.abc import Sequence
 
 import numpy as np
 import torch
@@ -29,6 +31,7 @@ _AROUND = 5.0  # skin around that and around lips, by which it is told what lies
 _LINING = 6.0  # of the mouth, as far as it belongs to a lip
 _LIDS = 6.0  # from the eyeball
 _LEAST_CORNEA = 8  # vertices; fewer are no second sphere
+OF_THE_TONGUE = ("tongue-teeth", "tongue-lips", "tongue-palate", "tongue-gums")
 
 
 class SelfIntersection:
@@ -54,10 +57,22 @@ class SelfIntersection:
         # Every point of every contact has a slot, which says how deep it may lie.
         points = [eyeball.points for eyeball in self._eyeballs] + [surface.points for _, surface in self._surfaces]
         self._slots = np.cumsum([0, *(len(index) for index in points)])
-        self._allowed = torch.zeros(self._slots[-1], device=device)
-        self.refresh(template)
-        slot, _, _, depth = self._depths(template)
-        self._allowed = self._allowed.scatter_reduce(0, slot, depth, "amax") + _MARGIN
+        self._own = torch.zeros(self._slots[-1], device=device)  # that of the template
+        self._allowed = self._own
+        self.accept(template)
+        self._own = self._allowed = self._allowed + _MARGIN
+
+    def accept(self, vertices: Float[Tensor, "V 3"], pairs: Sequence[str] | None = None) -> None:
+        """From now on what is no deeper than in this head or in the template costs nothing, in some pairs or in all.
+
+        `vertices` are posed, in metres. What was accepted before is forgotten.
+        """
+        self._allowed = self._own
+        self.refresh(vertices)
+        slot, pair, _, depth = self._depths(vertices.detach())
+        chosen = [number for number, name in enumerate(self.pairs) if pairs is None or name in pairs]
+        taken = torch.isin(pair, torch.tensor(chosen, device=self._device))
+        self._allowed = self._own.scatter_reduce(0, slot[taken], depth[taken], "amax")
 
     def refresh(self, vertices: Float[Tensor, "V 3"]) -> None:
         """Look up the head's size and what is near enough to touch. `vertices` are posed, in metres."""
@@ -164,6 +179,7 @@ def _surfaces(data: GNMData, rest: Float[np.ndarray, "V 3"]) -> list[tuple[str, 
         ("tongue-teeth", into(regions.teeth(data), part(tongue))),
         ("tongue-lips", into(upper | lower, part(tongue))),
         ("tongue-palate", into(regions.palate(data), part(tongue))),
+        ("tongue-gums", into(tongue, [triangles for jaw in regions.gums(data) for triangles in part(jaw)])),
         ("ears-head", into(ears, part(head), around_ears)),
         ("ears-head", into(head, part(ears), around_ears)),
     ]

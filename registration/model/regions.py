@@ -131,7 +131,14 @@ def tongue(data: GNMData) -> Bool[np.ndarray, "V"]:
 
 def palate(data: GNMData) -> Bool[np.ndarray, "V"]:
     """The upper gums and the roof of the mouth, as far as the model has one."""
-    return (group(data, "gums") > _INSIDE) & (group(data, "upper_teeth_and_gums") > _INSIDE)
+    return gums(data)[0]
+
+
+def gums(data: GNMData) -> tuple[Bool[np.ndarray, "V"], Bool[np.ndarray, "V"]]:
+    """Upper and lower gums, each without its teeth."""
+    found = group(data, "gums") > _INSIDE
+    upper = group(data, "upper_teeth_and_gums") > _INSIDE
+    return found & upper, found & ~upper
 
 
 def mouth_lining(data: GNMData) -> Bool[np.ndarray, "V"]:

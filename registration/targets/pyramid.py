@@ -10,7 +10,7 @@ from typing import Any
 import cv2
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from registration.capture.pixels import read_labels, read_mask, read_view, undistort_landmarks
 from registration.targets.classes import BACKGROUND, ClassMap
@@ -142,7 +142,7 @@ def _coverage(pixels: ViewPixels, capture: Capture) -> Float[np.ndarray, "H W"] 
 
 
 def _cut_to_head(whole: _Window) -> _Window:
-    head = (whole.mask > 0.5) & (whole.neck + whole.excluded < 0.5)
+    head, _ = _head_and_other(whole)
     if not whole.has_mask or not head.any():
         return whole
     rows, columns = np.flatnonzero(head.any(1)), np.flatnonzero(head.any(0))
@@ -234,7 +234,7 @@ def _weigh(window: _Window) -> dict[str, np.ndarray]:
         "normal_weight": facing,
         "rgb_weight": core * (facing if window.has_normals else 1.0),
         "mask_weight": _silhouette_weight(window) * known if window.has_mask else 0 * known,
-        "class_weight": inside if window.has_classes else 0 * inside,
+        "class_weight": inside * (window.classes.sum(-1) > 0.5),
     }
 
 
@@ -251,8 +251,7 @@ def _silhouette_weight(window: _Window) -> Float[np.ndarray, "H W"]:
     A model ends elsewhere on the chest than a scan, and hair is not in it.
     """
     subject = window.mask > 0.5
-    other = subject & (window.neck + window.excluded > 0.5)
-    head = subject & ~other
+    head, other = _head_and_other(window)
 
     def distance_to(region: np.ndarray) -> np.ndarray:
         return (
@@ -262,6 +261,15 @@ def _silhouette_weight(window: _Window) -> Float[np.ndarray, "H W"]:
         )
 
     to_head = distance_to(head)
-    return (head | (~subject & (to_head < distance_to(other)) & (to_head < _MARGIN * window.head_px + 2))).astype(
-        np.float32
-    )
+    near = to_head < np.where(subject, np.inf, _MARGIN * window.head_px + 2)
+    return (near & (to_head < distance_to(other))).astype(np.float32)
+
+
+def _head_and_other(window: _Window) -> tuple[Bool[np.ndarray, "H W"], Bool[np.ndarray, "H W"]]:
+    """The subject's head, and its neck, hair and clothes; of neither are pixels that the mask has and no label."""
+    subject = window.mask > 0.5
+    other = subject & (window.neck + window.excluded > 0.5)
+    head = subject & ~other
+    if window.has_classes:
+        head &= window.classes.sum(-1) + window.excluded > 0.5
+    return head, other

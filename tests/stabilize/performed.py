@@ -11,6 +11,7 @@ from coregister import expressions, population
 from coregister.anatomy import Anatomy
 from coregister.expressions import EXPRESSIONS, Expression
 from registration.frames import transform_points
+from registration.model.gnm_npz import GNMData
 from registration.stabilize.meshes import SubjectMeshes
 
 # Twenty of the capture protocol, in every category that moves the skin.
@@ -121,6 +122,15 @@ def _patches(points: np.ndarray, share: float, rng: np.random.Generator) -> np.n
     while hidden.mean() < share:
         hidden[tree.query_ball_point(points[rng.integers(len(points))], 15e-3)] = True
     return hidden
+
+
+def body_stays(seen: Seen, data: GNMData) -> Seen:
+    """The same heads turned on necks, as the model's skinning has them, while the body stays where it was."""
+    weights = data.skinning_weights.astype(np.float64)
+    still = (weights[0] / weights.sum(0))[:, None]  # the root's share
+    back = np.linalg.inv(seen.T_expression_neutral)
+    heads = [head + still * (transform_points(T, head) - head) for T, head in zip(back, seen.vertices, strict=True)]
+    return replace(seen, vertices=np.stack(heads).astype(np.float32))
 
 
 def meshes(truth: Performed, seen: Seen) -> SubjectMeshes:

@@ -44,6 +44,13 @@ def test_vertices_are_what_the_motion_makes(results, seens):
         np.testing.assert_allclose(result.vertices[3], seen.vertices[3] @ T[:3, :3].T + T[:3, 3], atol=1e-6)
 
 
+def test_heads_that_turn_on_their_necks_are_found_as_well(truths, seens, skin, model):
+    turned = performed.body_stays(seens[0], model)
+    assert 1e3 * np.abs(turned.vertices - seens[0].vertices).max() > 5
+    result = stabilize_subject(performed.meshes(truths[0], turned), skin)
+    assert np.median(measures.left(result.T_neutral_expression, seens[0], truths[0], model)[1]) < 0.2
+
+
 def test_unseen_vertices_have_no_say(truths, seens, skin, results):
     seen = seens[0]
     changed = replace(

@@ -262,3 +262,33 @@ def test_progress_is_told(capture):
     done = []
     build_pyramid(capture, class_map(CLASSES), finest_head_px=40, levels=1, progress=done.append)
     assert done == [0, 1, 2, 3, 4]
+
+
+def test_a_mask_larger_than_the_labels_makes_no_head_of_the_neck(tmp_path):
+    """Labels and masks come from two networks: what only the mask has belongs to what it is next to."""
+    plain = [picture(f"cam{i}", turn) for i, turn in enumerate(small.TURNS)]
+    larger = [replace(view, mask=distance_transform_edt(~view.mask) <= 3) for view in plain]
+    made = []
+    for name, views in (("plain", plain), ("larger", larger)):
+        capture = capture_of(tmp_path / name, views)
+        made.append(build_pyramid(capture, class_map(CLASSES), finest_head_px=10_000, levels=1)[0])
+    tight, wide = made
+    assert wide.px_per_head == pytest.approx(tight.px_per_head, abs=6.0)  # not by the neck's length
+    unlabelled = 0
+    for number, (camera, view) in enumerate(zip(wide.pixels.cameras, larger, strict=True)):
+        shift = np.round(view.camera.intrinsics[:2, 2] - camera.intrinsics[:2, 2]).astype(int)
+        listed = np.argwhere(wide.pixels.index[number].numpy() >= 0)
+        y, x = (listed + shift[::-1]).T
+        held = (y < view.camera.height_px) & (x < view.camera.width_px)
+        listed, y, x = listed[held], y[held], x[held]
+        ring = view.mask[y, x] & (view.labels[y, x] == 0)
+        away = {
+            name: distance_transform_edt(~np.isin(view.labels, labels))[y, x]
+            for name, labels in (("head", (1, 4)), ("other", (2, 3)))
+        }
+        of_neck, of_head = ring & (away["other"] < away["head"] - 1), ring & (away["head"] < away["other"] - 1)
+        weight = images(wide, "mask_weight")[number, ..., 0][tuple(listed.T)]
+        classes = images(wide, "class_weight")[number, ..., 0][tuple(listed.T)]
+        assert not weight[of_neck].any() and (weight[of_head] == 1).all() and not classes[ring].any()
+        unlabelled += of_head.sum()
+    assert unlabelled > 100

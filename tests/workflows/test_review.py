@@ -111,6 +111,15 @@ def test_a_review_goes_on_from_its_log(page, run, model_file):  # noqa: F811
         again.close()
 
 
+def test_looking_again_leaves_what_was_decided(page, run, model_file):  # noqa: F811
+    page.review.decide("nose", 0, "subtract", "moves as one")
+    page.review.save()
+    decided = stabilize_run(run, model_path=model_file, decisions=run / "decisions.jsonl")
+    written = disk.read_manifest(decided.out)
+    review(run, model_path=model_file, port=0).close()
+    assert disk.read_manifest(decided.out) == written and len(written["decisions"]) == 1
+
+
 def test_a_taken_port_is_told(page, run, model_file):  # noqa: F811
     with pytest.raises(InputError, match="cannot be served"):
         review(run, model_path=model_file, port=page.port)

@@ -44,7 +44,9 @@ def review(
     Raises:
         InputError: as `stabilize_run`; the log at `decisions` is another dataset's; the port cannot be had.
     """
-    outcome = stabilize_run(run, model_path=model_path, out=out, skip_failed=skip_failed, progress=progress)
+    outcome = stabilize_run(
+        run, model_path=model_path, out=out, skip_failed=skip_failed, whatever_decided=True, progress=progress
+    )
     log = Path(run) / LOG if decisions is None else Path(decisions)
     saved = read_decisions(log, outcome.dataset) if log.is_file() else []
     head = Head.of(gnm_npz.read(model_path))
@@ -100,13 +102,8 @@ class Page:
     def _build(self) -> None:
         """The scene and all controls, empty."""
         server, gui = self._server, self._server.gui
-        gui.configure_theme(
-            control_layout="fixed",
-            control_width="large",
-            brand_color=(31, 122, 116),
-            show_logo=False,
-            show_share_button=False,
-        )
+        gui.configure_theme(brand_color=(31, 122, 116), show_logo=False, show_share_button=False, control_width="large")
+        gui.main_panel.dock_right()
         server.scene.set_up_direction("+y")
         server.scene.configure_default_lights(False)
         server.scene.configure_environment_map(None)  # colours mean millimetres: light must not wash them out
