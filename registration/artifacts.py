@@ -107,7 +107,7 @@ def save_registration(registration: Registration, out: Path, report_html: str | 
         if report_html is not None:
             (fresh / "report.html").write_text(report_html, encoding="utf-8")
         _write_json(fresh / "manifest.json", _manifest(registration, content_id(arrays, texture)))
-        _replace(fresh, out)
+        replace_folder(fresh, out)
     finally:
         shutil.rmtree(fresh, ignore_errors=True)
     return out
@@ -167,9 +167,9 @@ def update_figures(path: Path, figures: Mapping[str, Any], report_html: str | No
     path = Path(path)
     manifest = read_manifest(path)
     manifest["figures"] = {**manifest["figures"], **figures}
-    _swap_in(path / "manifest.json", _json_text(manifest))
+    swap_in(path / "manifest.json", _json_text(manifest))
     if report_html is not None:
-        _swap_in(path / "report.html", report_html)
+        swap_in(path / "report.html", report_html)
 
 
 def read_manifest(path: Path) -> dict[str, Any]:
@@ -306,7 +306,8 @@ def _read_json(file: Path) -> dict[str, Any]:
     return value
 
 
-def _swap_in(file: Path, text: str) -> None:
+def swap_in(file: Path, text: str) -> None:
+    """Write a file in one rename: whoever reads sees the old or the new one."""
     fresh = file.with_name(f".{file.name}.{secrets.token_hex(4)}.tmp")
     try:
         fresh.write_text(text, encoding="utf-8")
@@ -315,7 +316,7 @@ def _swap_in(file: Path, text: str) -> None:
         fresh.unlink(missing_ok=True)
 
 
-def _replace(fresh: Path, out: Path) -> None:
+def replace_folder(fresh: Path, out: Path) -> None:
     """Move `fresh` to `out`; an existing folder there is exchanged in one step and ends up at `fresh`."""
     if not out.exists() or not any(out.iterdir()):
         os.replace(fresh, out)

@@ -109,7 +109,7 @@ def test_replacing_without_an_atomic_exchange(tmp_path, monkeypatch):
     assert [p.name for p in tmp_path.iterdir()] == ["r"]
 
 
-@pytest.mark.parametrize("failing", ["write_obj", "_replace"])
+@pytest.mark.parametrize("failing", ["write_obj", "replace_folder"])
 def test_a_crash_while_writing_leaves_the_former_result(tmp_path, monkeypatch, failing):
     save_registration(a_registration(0), tmp_path / "r")
 

@@ -18,6 +18,7 @@ from registration.errors import InputError
 CaptureFolder = Positional[Annotated[Path, arg(metavar="CAPTURE")]]
 RegistrationFolder = Positional[Annotated[Path, arg(metavar="REG")]]
 SubjectFolder = Positional[Annotated[Path, arg(metavar="SUBJECT")]]
+RunFolder = Positional[Annotated[Path, arg(metavar="RUN")]]
 NeutralFolder = Annotated[Path | None, arg(metavar="REG")]
 
 
@@ -149,6 +150,85 @@ def evaluate(
     return 0
 
 
+def stabilize(
+    run: RunFolder,
+    /,
+    decisions: Annotated[Path | None, arg(metavar="FILE")] = None,
+    model: Annotated[Path | None, arg(metavar="NPZ")] = None,
+    out: Annotated[Path | None, arg(metavar="DIR")] = None,
+    skip_failed: bool = False,
+    force: bool = False,
+) -> int:
+    """Take the head's motion out of expressions, so that the skull stands still: automatically, then over all subjects.
+
+    Args:
+        run: A folder of subject folders that `gnmreg subject` wrote, or one such folder.
+        decisions: A log that `gnmreg stabilize review` saved; without one, what is flagged is subtracted.
+        model: The head model of the registrations; not needed if it is the first or the official one.
+        out: The folder to write, RUN/stabilized by default.
+        skip_failed: Leave registrations out that failed.
+        force: Stabilize again although the folder holds the result of the same input.
+    """
+    from registration.progress import shown
+    from workflows.stabilize_folder import known_model
+    from workflows.stabilize_run import stabilize_run
+
+    with shown() as progress:
+        outcome = stabilize_run(
+            run,
+            model_path=model or known_model(run),
+            out=out,
+            decisions=decisions,
+            skip_failed=skip_failed,
+            force=force,
+            progress=progress,
+        )
+    figures = outcome.figures
+    print(f"{figures['samples']} expressions; {figures['residual_median_mm']:.2f} mm of skin on the skull, median")
+    print(f"the second stage turned by {figures['regional_turn_deg']:.2f} degrees, moved by", end=" ")
+    print(f"{figures['regional_rms_mm']:.2f} mm, rms")
+    print(outcome.out / "index.html")
+    return 0
+
+
+def review_stabilization(
+    run: RunFolder,
+    /,
+    decisions: Annotated[Path | None, arg(metavar="FILE")] = None,
+    model: Annotated[Path | None, arg(metavar="NPZ")] = None,
+    out: Annotated[Path | None, arg(metavar="DIR")] = None,
+    skip_failed: bool = False,
+    port: Annotated[int, arg(metavar="PORT")] = 8080,
+) -> int:
+    """Look at the components of a stabilized run in the browser and decide about each; stops with Ctrl-C.
+
+    Args:
+        run: As for `gnmreg stabilize`, which is done first where needed.
+        decisions: The log to go on from and to save into, RUN/decisions.jsonl by default.
+        model: The head model of the registrations; not needed if it is the first or the official one.
+        out: The folder of the stabilized set, RUN/stabilized by default.
+        skip_failed: Leave registrations out that failed.
+        port: Where to serve, on this machine only; from elsewhere: ssh -L PORT:127.0.0.1:PORT HOST.
+    """
+    from registration.progress import shown
+    from workflows.stabilize_folder import known_model
+    from workflows.web.review import review
+
+    with shown() as progress:
+        page = review(
+            run,
+            model_path=model or known_model(run),
+            out=out,
+            decisions=decisions,
+            skip_failed=skip_failed,
+            port=port,
+            progress=progress,
+        )
+    print(f"Open http://127.0.0.1:{page.port} in a browser; Ctrl-C ends.", flush=True)
+    page.wait()
+    return 0
+
+
 def check_capture(capture: CaptureFolder, /, out: Annotated[Path | None, arg(metavar="PNG")] = None) -> int:
     """Check a capture folder before any fitting.
 
@@ -243,6 +323,48 @@ def describe_model(
     return 0
 
 
+def evaluate_model(
+    models: Positional[Annotated[tuple[Path, ...], arg(metavar="MODEL")]],
+    /,
+    held_out: Annotated[Path, arg(metavar="RUN|NPZ")],
+    out: Annotated[Path, arg(metavar="DIR")],
+    captures: Annotated[Path | None, arg(metavar="DIR")] = None,
+    components: Annotated[tuple[int, ...], arg(metavar="K")] = (5, 10, 20, 40),
+    samples: Annotated[int, arg(metavar="N")] = 200,
+    seed: Annotated[int, arg(metavar="S")] = 0,
+    force: bool = False,
+) -> int:
+    """Measure head models on people that they were not made from; others are compared with the first one.
+
+    Args:
+        models: The head models, GNM NPZ files of one topology.
+        held_out: A folder of subject folders that `gnmreg subject` wrote, or an NPZ file of meshes.
+        out: The folder to write; one that this command wrote before is replaced.
+        captures: The folder of the run's subjects with their captures: adds scans, categories and tags.
+        components: Numbers of components to measure with; all are, besides.
+        samples: Random heads of each model, for specificity; 0 leaves it out.
+        seed: Seed of everything random.
+        force: Measure again although the folder holds the result of the same input.
+    """
+    from coregister.evaluate import Settings
+    from registration.progress import shown
+    from workflows.evaluate_models import PAGE, evaluate_models, lines
+
+    settings = Settings(components=components, samples=samples, seed=seed)
+    with shown() as progress:
+        manifest = evaluate_models(
+            models,
+            held_out=held_out,
+            out=out,
+            captures=captures,
+            settings=settings,
+            force=force,
+            progress=progress,
+        )
+    print("\n".join((*lines(manifest), str(out / PAGE))))
+    return 0
+
+
 def fetch_model() -> int:
     """Download Google's GNM head weights into the cache and print where they lie."""
     from registration.model.fetch import fetch
@@ -270,19 +392,24 @@ COMMANDS: Mapping[str, Command | Group] = {
     "register": register,
     "subject": register_subject,
     "evaluate": evaluate,
+    "stabilize": stabilize,
+    "stabilize review": review_stabilization,
     "capture": (
         "Look at captures, make synthetic ones, spoil good ones.",
         {"check": check_capture, "synth": synth_capture, "spoil": spoil_capture},
     ),
     "model": (
-        "Look at head models, make the first one, get the official one.",
-        {"info": describe_model, "bootstrap": bootstrap_model, "fetch": fetch_model},
+        "Look at head models, measure them, make the first one, get the official one.",
+        {"info": describe_model, "evaluate": evaluate_model, "bootstrap": bootstrap_model, "fetch": fetch_model},
     ),
 }
 
 
 def main(args: Sequence[str] | None = None) -> int:
     """Run one command; `args` replaces the process' own. Returns the exit code."""
+    args = list(sys.argv[1:] if args is None else args)
+    if args[:2] == ["stabilize", "review"]:  # a command that has both an argument and a command below it
+        args[:2] = ["stabilize review"]
     try:
         return tyro.cli(
             _choice(COMMANDS),

@@ -2,14 +2,12 @@
 `subject.json` (docs/formats.md)."""
 
 import json
-import os
-import secrets
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any, Literal
 
-from registration.artifacts import check_out
+from registration.artifacts import check_out, swap_in
 from registration.capture.native import natural_key, read
 from registration.errors import InputError
 from registration.hashes import plain
@@ -131,8 +129,8 @@ def save_subject(subject: Subject, out: Path, page: str) -> None:
     rows = [{f.name: getattr(row, f.name) for f in fields(row)} for row in subject.rows]
     body = {f.name: getattr(subject, f.name) for f in fields(subject) if f.name != "rows"}
     text = json.dumps(plain({**head, **body, "captures": rows}), indent=1, allow_nan=False) + "\n"
-    _write(out / MANIFEST, text)
-    _write(out / PAGE, page)
+    swap_in(out / MANIFEST, text)
+    swap_in(out / PAGE, page)
 
 
 def _capture_folders(folder: Path) -> list[Path]:
@@ -193,15 +191,6 @@ def _owner(out: Path) -> str | None:
         return None
     ours = isinstance(manifest, dict) and manifest.get("kind") == KIND
     return str(manifest.get("subject")) if ours else None
-
-
-def _write(file: Path, text: str) -> None:
-    fresh = file.with_name(f".{file.name}.{secrets.token_hex(4)}.tmp")
-    try:
-        fresh.write_text(text, encoding="utf-8")
-        os.replace(fresh, file)
-    finally:
-        fresh.unlink(missing_ok=True)
 
 
 def _refused(out: Path, *, got: str, fix: str) -> InputError:

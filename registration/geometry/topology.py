@@ -97,3 +97,10 @@ def vertex_normals(vertices: Float[Tensor, "V 3"], triangles: Int[Tensor, "F 3"]
         weighted.append(unit * torch.atan2(size, ((q - p) * (r - p)).sum(-1))[:, None])
     total = torch.zeros_like(vertices).index_add(0, triangles.T.reshape(-1), torch.cat(weighted))
     return total / total.norm(dim=-1, keepdim=True).clamp_min(1e-20)
+
+
+def vertex_areas(vertices: Float[np.ndarray, "V 3"], triangles: Int[np.ndarray, "F 3"]) -> Float[np.ndarray, "V"]:
+    """A third of the area of the triangles around each vertex, m^2; together the area of the mesh."""
+    a, b, c = (vertices[triangles[:, k]].astype(np.float64) for k in range(3))
+    area = np.linalg.norm(np.cross(b - a, c - a), axis=1) / 2
+    return np.bincount(triangles.ravel(), np.repeat(area / 3, 3), len(vertices))

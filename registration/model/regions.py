@@ -184,6 +184,80 @@ def offset_regions(data: GNMData) -> dict[str, Bool[np.ndarray, "V"]]:
     }
 
 
+def skull_skin(data: GNMData) -> Bool[np.ndarray, "V"]:
+    """Skin that may lie still on the skull: the exterior without the neck and the nape, which stay with the body, and
+    without what jaw, mouth and cheeks move: lips, chin, cheeks up to the eye's rim, and the skin before the ears."""
+    sides = [f"{side}_{name}_region" for name in ("infraorbital", "cheek", "parotid") for side in ("left", "right")]
+    moving = _any(data, (*_MOUTH, *sides))
+    return exterior(data) & ~neck_other(data) & ~moving
+
+
+def head_skin(data: GNMData) -> Bool[np.ndarray, "V"]:
+    """Skin that head shape is measured on: the exterior without the neck, which turns at a joint of its own."""
+    return exterior(data) & ~neck_other(data)
+
+
+def head_regions(data: GNMData) -> dict[str, Bool[np.ndarray, "V"]]:
+    """Parts of `head_skin` that figures are split by; they may overlap and need not cover it."""
+    parts = stabilization_regions(data)
+    back = parts.pop("neck_back")
+    found = {
+        "face": group(data, "hockey_mask") > _INSIDE,
+        **parts,
+        "forehead": group(data, "forehead_region") > _INSIDE,
+        "chin": group(data, "chin_region") > _INSIDE,
+        "ears": ears(data),
+        "back": back,
+    }
+    return {name: members & head_skin(data) for name, members in found.items()}
+
+
+_EXPRESSION_GROUPS = {  # region of an expression component's name -> the group that holds its soft mask
+    "left_eye_region": "expression_basis_left_eye",
+    "right_eye_region": "expression_basis_right_eye",
+    "lower_face_region": "expression_basis_mouth_nose_ears",
+}
+
+
+def expression_regions(data: GNMData) -> dict[str, tuple[Int[np.ndarray, "K"], Float[np.ndarray, "V"]]]:
+    """Of each region of the skin that expressions are modelled in: its components, by number, and its soft mask.
+
+    Left eye, right eye, lower face; a region of which the file names no component is left out.
+    """
+    names = data.expression_names.tolist()
+    found = {}
+    for region, source in _EXPRESSION_GROUPS.items():
+        members = [k for k, name in enumerate(names) if name.startswith(region)]
+        if members:
+            found[region.removesuffix("_region")] = (np.array(members), np.clip(group(data, source), 0, 1))
+    return found
+
+
+_MOUTH = ("upper_lip", "lower_lip", "upper_lip_region", "lower_lip_region", "chin_region")
+STEADY_REGIONS = ("nose", "neck_back")  # of `stabilization_regions`: where expressions move the skin least
+
+
+def stabilization_regions(data: GNMData) -> dict[str, Bool[np.ndarray, "V"]]:
+    """The five regions in which a person looks for motion of the whole head (paper, Head Expression); all exterior.
+
+    They may overlap, where cheeks meet lower lids, and leave ears and forehead out.
+    """
+    sides = [f"{side}_{name}_region" for name in ("infraorbital", "cheek") for side in ("left", "right")]
+    face = ("hockey_mask", "ears", "forehead_region")
+    sources = {
+        "left_periocular": ("expression_basis_left_eye",),
+        "right_periocular": ("expression_basis_right_eye",),
+        "nose": ("nose_region",),
+        "mouth": (*_MOUTH, *sides),
+    }
+    found = {name: _any(data, groups) & exterior(data) for name, groups in sources.items()}
+    return found | {"neck_back": exterior(data) & ~_any(data, face)}
+
+
+def _any(data: GNMData, names: tuple[str, ...]) -> Bool[np.ndarray, "V"]:
+    return np.max([group(data, name) for name in names], axis=0) > _INSIDE
+
+
 def _nearness(data: GNMData, members: Bool[np.ndarray, "V"], near: float, far: float) -> Float[np.ndarray, "V"]:
     """1 up to `near` (metres, in the template) from the nearest member, falling to 0 at `far`."""
     points = data.template_vertex_positions

@@ -1,8 +1,10 @@
-"""Charts of how the optimisation went, as SVG inside the page."""
+"""Charts as SVG inside a page: how an optimisation went, and figures over a number."""
 
 import io
 import math
 from collections.abc import Mapping, Sequence
+from contextlib import AbstractContextManager
+from dataclasses import dataclass
 
 import matplotlib
 from matplotlib.axes import Axes
@@ -26,33 +28,82 @@ def loss_curves(history: Mapping[str, Mapping[str, Sequence[float]]]) -> str:
     names = list(dict.fromkeys(term for terms in stages.values() for term in terms))
     colours = {term: LINES[k % len(LINES)] for k, term in enumerate(names)}
     rows, columns = math.ceil(len(stages) / _PANELS), min(len(stages), _PANELS)
-    with matplotlib.rc_context({"svg.fonttype": "none", "svg.hashsalt": "report", "font.family": "sans-serif"}):
+    with _style():
         figure = Figure(figsize=(11.4, 2.9 * rows + 0.5), layout="constrained")
         panels = figure.subplots(rows, columns, squeeze=False).ravel()
         for panel, (stage, terms) in zip(panels, stages.items(), strict=False):
             for term, values in terms.items():
                 clean = [v if v is not None and math.isfinite(v) and v > 0 else math.nan for v in values]
                 panel.plot(range(1, len(clean) + 1), clean, color=colours[term], lw=1.4, label=term)
-            _dress(panel, stage)
+            _scale_by_powers(panel)
+            _dress(panel, stage, "step")
         for panel in panels[len(stages) :]:
             panel.set_visible(False)
-        handles = [Line2D([], [], color=colours[term], lw=2.4) for term in names]
-        figure.legend(handles, names, loc="outside lower left", ncols=min(len(names), 8), fontsize=9, frameon=False)
-        buffer = io.StringIO()
-        figure.savefig(buffer, format="svg", transparent=True, metadata={"Date": None, "Creator": None})
+        return _drawn(figure, colours)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Line:
+    """Values over a number, with the band in which they may as well lie; None where there is no band."""
+
+    name: str
+    x: Sequence[float]
+    y: Sequence[float]
+    low: Sequence[float | None] = ()
+    high: Sequence[float | None] = ()
+
+
+def number_curves(panels: Mapping[str, Sequence[Line]], x_name: str) -> str:
+    """One panel per title, its axis from zero; a line keeps its name's colour throughout. Empty without any line."""
+    panels = {title: lines for title, lines in panels.items() if lines}
+    if not panels:
+        return ""
+    names = list(dict.fromkeys(line.name for lines in panels.values() for line in lines))
+    colours = {name: LINES[k % len(LINES)] for k, name in enumerate(names)}
+    rows, columns = math.ceil(len(panels) / _PANELS), min(len(panels), _PANELS)
+    with _style():
+        figure = Figure(figsize=(11.4, 2.9 * rows + 0.5), layout="constrained")
+        axes = figure.subplots(rows, columns, squeeze=False).ravel()
+        for panel, (title, lines) in zip(axes, panels.items(), strict=False):
+            for line in lines:
+                panel.plot(line.x, line.y, color=colours[line.name], lw=1.6, marker="o", ms=3.5)
+                known = [k for k, low in enumerate(line.low) if low is not None]
+                low, high = ([float(side[k] or 0) for k in known] for side in (line.low, line.high))
+                panel.fill_between([line.x[k] for k in known], low, high, color=colours[line.name], alpha=0.15, lw=0)
+            panel.set_ylim(bottom=0)
+            _dress(panel, title, x_name)
+        for panel in axes[len(panels) :]:
+            panel.set_visible(False)
+        return _drawn(figure, colours)
+
+
+def _style() -> AbstractContextManager[None]:
+    return matplotlib.rc_context({"svg.fonttype": "none", "svg.hashsalt": "report", "font.family": "sans-serif"})
+
+
+def _drawn(figure: Figure, colours: Mapping[str, str]) -> str:
+    """The figure with its legend below, as SVG."""
+    handles = [Line2D([], [], color=colour, lw=2.4) for colour in colours.values()]
+    columns = min(len(colours), 8)
+    figure.legend(handles, list(colours), loc="outside lower left", ncols=columns, fontsize=9, frameon=False)
+    buffer = io.StringIO()
+    figure.savefig(buffer, format="svg", transparent=True, metadata={"Date": None, "Creator": None})
     drawing = buffer.getvalue()
     return drawing[drawing.index("<svg") :]
 
 
-def _dress(panel: Axes, stage: str) -> None:
+def _scale_by_powers(panel: Axes) -> None:
     panel.set_yscale("log")
     low, high = panel.get_ylim()
     panel.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
     panel.yaxis.set_minor_formatter(NullFormatter())
     if high < 100 * low:
         panel.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
-    panel.set_title(stage, loc="left", fontsize=10.5, color=INK, fontweight="bold")
-    panel.set_xlabel("step", fontsize=9, color=INK)
+
+
+def _dress(panel: Axes, title: str, x_name: str) -> None:
+    panel.set_title(title, loc="left", fontsize=10.5, color=INK, fontweight="bold")
+    panel.set_xlabel(x_name, fontsize=9, color=INK)
     panel.tick_params(labelsize=8.5, colors=INK, which="both", length=0)
     panel.grid(axis="y", color=FAINT, lw=0.7)
     panel.margins(x=0.01)

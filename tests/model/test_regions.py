@@ -207,3 +207,52 @@ def test_parts_that_touch_of_the_full_head(full):
     assert full.template_vertex_positions[upper, 1].mean() > full.template_vertex_positions[lower, 1].mean()
     assert [role(full).sum() for role in PARTS_THAT_TOUCH] == [1054, 1868, 933, 702, 406]
     assert not exterior[regions.mouth_lining(full)].any()
+
+
+def test_stabilization_regions_are_exterior_and_mirrored(tiny):
+    found = regions.stabilization_regions(tiny)
+    assert list(found) == ["left_periocular", "right_periocular", "nose", "mouth", "neck_back"]
+    assert set(regions.STEADY_REGIONS) < set(found)
+    exterior, mirror = regions.exterior(tiny), tiny.mirror_indices
+    for mask in found.values():
+        assert mask.any() and exterior[mask].all()
+    np.testing.assert_array_equal(found["left_periocular"][mirror], found["right_periocular"])
+    assert not found["neck_back"][regions.group(tiny, "hockey_mask") > 0].any()
+    skull = regions.skull_skin(tiny)
+    assert skull.any() and exterior[skull].all() and not skull[regions.neck_other(tiny)].any()
+    assert not skull[regions.lips(tiny)[0] | (regions.group(tiny, "chin_region") > 0)].any()
+
+
+@pytest.mark.parametrize(
+    "name", ["expression_basis_left_eye", "nose_region", "chin_region", "left_cheek_region", "forehead_region", "ears"]
+)
+def test_stabilization_regions_need_their_groups(tiny, name):
+    with pytest.raises(InputError, match=f"no vertex group '{name}'"):
+        regions.stabilization_regions(without(tiny, name))
+
+
+def test_the_heads_skin_has_no_neck_and_its_regions_are_mirrored(tiny):
+    skin, mirror = regions.head_skin(tiny), tiny.mirror_indices
+    assert skin.any() and regions.exterior(tiny)[skin].all() and not skin[regions.neck_other(tiny)].any()
+    found = regions.head_regions(tiny)
+    assert {"face", "nose", "mouth", "ears", "forehead", "chin", "back"} < set(found)
+    for name, mask in found.items():
+        assert mask.any() and skin[mask].all()
+        twin = {"left_periocular": "right_periocular", "right_periocular": "left_periocular"}.get(name, name)
+        np.testing.assert_array_equal(mask[mirror], found[twin])
+
+
+@needs_shared
+def test_expression_regions_are_components_with_their_mask(full, tiny):
+    found = regions.expression_regions(full)
+    assert {name: len(members) for name, (members, _) in found.items()} == {
+        "left_eye": 100,
+        "right_eye": 100,
+        "lower_face": 150,
+    }
+    np.testing.assert_array_equal(found["left_eye"][1][full.mirror_indices], found["right_eye"][1])
+    inside = found["left_eye"][1] > 0
+    energy = (full.expression_basis[found["left_eye"][0]].astype(np.float32) ** 2).sum((0, 2))
+    assert energy[inside].sum() > 0.9 * energy.sum()
+    names = np.array(["pupils" if n.startswith("left_eye") else n for n in tiny.expression_names.tolist()])
+    assert set(regions.expression_regions(replace(tiny, expression_names=names))) == {"right_eye", "lower_face"}

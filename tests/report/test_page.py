@@ -9,7 +9,7 @@ import pytest
 
 from registration.hashes import versions
 from registration.report import heat
-from registration.report.charts import loss_curves
+from registration.report.charts import Line, loss_curves, number_curves
 from registration.report.inputs import ReportInputs, heat_map
 from registration.report.page import headline, write_report
 from registration.types import Registration
@@ -145,6 +145,20 @@ def test_loss_curves_are_one_panel_a_stage():
     drawn = loss_curves(gaps)
     assert ElementTree.fromstring(drawn) is not None and "empty" not in drawn
     assert loss_curves({}) == "" and loss_curves({"a": {}}) == ""
+
+
+def test_number_curves_have_a_panel_a_title_and_a_band_where_one_is_known():
+    lines = [
+        Line(name="first", x=(5, 10), y=(2.0, 1.0), low=(1.5, None), high=(2.5, None)),
+        Line(name="next", x=(5, 10), y=(1.8, 0.8)),
+    ]
+    svg = ElementTree.fromstring(
+        number_curves({"identity, mm": lines, "scans, mm": lines[:1], "none": []}, "components")
+    )
+    words = [element.text for element in svg.iter("{http://www.w3.org/2000/svg}text")]
+    assert {"identity, mm", "scans, mm", "first", "next"} <= set(words) and "none" not in words
+    assert words.count("components") == 2 and words.count("first") == 1
+    assert number_curves({"none": []}, "components") == ""
 
 
 def test_remarks_name_what_was_left_out_and_what_lies_too_deep():

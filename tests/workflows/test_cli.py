@@ -12,14 +12,25 @@ from workflows.cli import main
 from workflows.subject_folder import Row, Subject
 
 TINY_MODEL = Path(__file__).parents[1] / "fixtures" / "tiny_gnm.npz"
-HEAVY = {"torch", "mitsuba", "drjit", "numpy", "scipy", "cv2", "pycolmap", "kornia", "trimesh", "matplotlib"}
+HEAVY = {"torch", "mitsuba", "drjit", "numpy", "scipy", "cv2", "pycolmap", "kornia", "trimesh", "matplotlib", "viser"}
 
 
 @pytest.mark.parametrize(
     "command",
     [
-        *("", "register", "subject", "evaluate", "capture", "capture check", "capture synth", "capture spoil"),
-        *("model", "model info", "model fetch", "model bootstrap"),
+        *(
+            "",
+            "register",
+            "subject",
+            "evaluate",
+            "stabilize",
+            "stabilize review",
+            "capture",
+            "capture check",
+            "capture synth",
+            "capture spoil",
+        ),
+        *("model", "model info", "model evaluate", "model fetch", "model bootstrap"),
     ],
 )
 def test_every_command_explains_itself(command: str, capsys: pytest.CaptureFixture[str]) -> None:

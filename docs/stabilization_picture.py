@@ -1,0 +1,72 @@
+"""Makes docs/stabilization.jpg: the review page, of the first model's population, in a headless Chromium.
+
+    python -m docs.stabilization_picture
+
+Needs Debian's `chromium`. Two kinds of motion of the head are put into a third of the samples.
+"""
+
+import shutil
+import tempfile
+from pathlib import Path
+
+import cv2
+import numpy as np
+from playwright.sync_api import sync_playwright
+
+from coregister import anatomy as anatomy_of
+from coregister import bootstrap, makehuman, population
+from registration.geometry.rigid import motion_fields
+from registration.model import gnm_npz
+from registration.stabilize.components import Head, regional_components
+from registration.stabilize.folder import StoredComponents
+from tests.stabilize import performed
+from tests.workflows.test_review import CHROMIUM, FLAGS
+from workflows.stabilize_run import along
+from workflows.web.decide import Review
+from workflows.web.review import Page
+
+PICTURE = Path(__file__).with_name("stabilization.jpg")
+SIZE = {"width": 1500, "height": 960}
+WAIT_MS = 6000  # until the heads are somewhere in their swing
+
+
+def stored(head: Head) -> StoredComponents:
+    anatomy = anatomy_of.make(makehuman.read(makehuman.fetch()), population.mean_person())
+    truths = [performed.perform(anatomy, 1000 + number) for number in range(16)]
+    rng = np.random.default_rng(5)
+    twists = rng.normal(size=(2, 2, 3))
+    twists *= np.array([np.radians(1.0), 2e-3])[:, None] / np.linalg.norm(twists, axis=2, keepdims=True)
+    count = sum(len(truth.labels) for truth in truths)
+    strengths = rng.normal(size=(count, 2)) * (rng.permutation(count) % 3 == 0)[:, None]
+    moved = np.tensordot(strengths @ twists.reshape(2, 6), motion_fields(head.points), 1)
+    displacements = [d.astype(np.float32) for d in moved + np.concatenate([t.vertices - t.neutral for t in truths])]
+    labels = tuple(label for truth in truths for label in truth.labels)
+    components = regional_components(displacements, labels, head)
+    return StoredComponents(
+        components=tuple(components),
+        subjects=tuple(truth.name for truth in truths for _ in truth.labels),
+        names=labels,
+        labels=labels,
+        along=along(displacements, components),
+    )
+
+
+def main() -> None:
+    head = Head.of(gnm_npz.read(bootstrap.bootstrap()))
+    with tempfile.TemporaryDirectory() as folder, sync_playwright() as playwright:
+        page = Page(Review(stored(head), head, Path(folder) / "log.jsonl", "picture"), port=0)
+        browser = playwright.chromium.launch(executable_path=CHROMIUM or shutil.which("chromium"), args=list(FLAGS))
+        tab = browser.new_page(viewport=SIZE)
+        tab.goto(f"http://127.0.0.1:{page.port}")
+        tab.get_by_text("Software WebGL rendering detected").locator("xpath=ancestor::*[@role='alert'][1]").get_by_role(
+            "button"
+        ).click()
+        tab.wait_for_timeout(WAIT_MS)
+        picture = cv2.imdecode(np.frombuffer(tab.screenshot(), np.uint8), cv2.IMREAD_COLOR)
+        cv2.imwrite(str(PICTURE), picture, [cv2.IMWRITE_JPEG_QUALITY, 88])
+        browser.close()
+        page.close()
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,209 @@
+"""`gnmreg stabilize review`: a page in the browser on which a person decides about components (paper, end of Head
+Expression). Served by viser from this machine alone, over one port; the page asks nobody else for anything."""
+
+import threading
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from registration.errors import InputError
+from registration.model import gnm_npz, regions
+from registration.progress import Progress
+from registration.report.heat import scale_limit_mm
+from registration.report.pictures import scale_colours
+from registration.stabilize import folder as disk
+from registration.stabilize.components import Components, Head
+from registration.stabilize.decisions import ACTIONS
+from workflows.stabilize_folder import read_decisions
+from workflows.stabilize_run import LOG, stabilize_run
+from workflows.web import panels
+from workflows.web.decide import Review
+from workflows.web.loops import SWING, swinging_head
+
+if TYPE_CHECKING:
+    from viser import ViserServer
+
+HOST = "127.0.0.1"
+_APART = 0.15  # metres, each head from the middle
+
+
+def review(
+    run: Path,
+    *,
+    model_path: Path,
+    out: Path | None = None,
+    decisions: Path | None = None,
+    skip_failed: bool = False,
+    port: int = 8080,
+    progress: Progress | None = None,
+) -> "Page":
+    """Stabilize the run where it is not yet, and serve the page; returns at once.
+
+    Raises:
+        InputError: as `stabilize_run`; the log at `decisions` is another dataset's; the port cannot be had.
+    """
+    outcome = stabilize_run(
+        run, model_path=model_path, out=out, skip_failed=skip_failed, whatever_decided=True, progress=progress
+    )
+    log = Path(run) / LOG if decisions is None else Path(decisions)
+    saved = read_decisions(log, outcome.dataset) if log.is_file() else []
+    head = Head.of(gnm_npz.read(model_path))
+    return Page(Review(disk.read_components(outcome.out), head, log, outcome.dataset, saved), port)
+
+
+class Page:
+    """The page of one review; everyone who opens it sees, and decides about, the same."""
+
+    def __init__(self, review: Review, port: int):
+        self.review = review
+        self._lock = threading.Lock()
+        self._parts = {part.region: part for part in review.stored.components if len(part.energy)}
+        if not self._parts:
+            raise InputError(
+                "There is nothing to review",
+                where="displacements of all samples",
+                expected="expressions that move",
+                got="none moves anything",
+                fix="check that the expressions are not copies of the neutral",
+            )
+        data = review.head.data
+        shells = np.logical_or(*regions.eyeball_shells(data))
+        self._shown = np.flatnonzero(regions.exterior(data) | shells)
+        number = np.full(len(review.head.points), -1)
+        number[self._shown] = np.arange(len(self._shown))
+        faces = number[data.triangles]
+        self._faces = faces[(faces >= 0).all(1)]
+        self._server = _serve(port)
+        self.port = self._server.get_port()
+        self._build()
+        self._show()
+
+    def wait(self) -> None:
+        """Until Ctrl-C."""
+        try:
+            while True:
+                time.sleep(1)
+        finally:
+            self.close()
+
+    def close(self) -> None:
+        self._server.stop()
+
+    @property
+    def _part(self) -> Components:
+        return self._parts[self._region.value.replace(" ", "_")]
+
+    @property
+    def _component(self) -> int:
+        return int(self._number.value) - 1
+
+    def _build(self) -> None:
+        """The scene and all controls, empty."""
+        server, gui = self._server, self._server.gui
+        gui.configure_theme(brand_color=(31, 122, 116), show_logo=False, show_share_button=False, control_width="large")
+        gui.main_panel.dock_right()
+        server.scene.set_up_direction("+y")
+        server.scene.configure_default_lights(False)
+        server.scene.configure_environment_map(None)  # colours mean millimetres: light must not wash them out
+        server.scene.add_light_ambient("/ambient", intensity=1.7)
+        server.scene.add_light_directional("/key", intensity=1.6, position=(-0.5, 0.7, 1.0))
+        server.initial_camera.position = (0.0, 0.0, 0.78)
+        server.initial_camera.look_at = (0.0, 0.0, 0.0)
+        server.initial_camera.fov = np.radians(38)
+        samples, subjects = len(self.review.stored.labels), len(set(self.review.stored.subjects))
+        gui.add_markdown(f"### Does the head move?\n{samples} expressions of {subjects} subjects")
+        names = tuple(region.replace("_", " ") for region in self._parts)
+        # viser's setters have types of their own that type checkers take for read-only properties.
+        self._region: Any = gui.add_dropdown("Region", names)
+        self._number: Any = gui.add_slider("Component", min=1, max=2, step=1, initial_value=1)
+        steps = gui.add_button_group("Step", ("previous", "next"))
+        self._about = gui.add_html("")
+        self._action: Any = gui.add_button_group("Action", ACTIONS)
+        self._reason: Any = gui.add_text("Reason", "")
+        self._error = gui.add_html("")
+        undo, save = gui.add_button("Undo"), gui.add_button("Save decisions")
+        self._said = gui.add_markdown("")
+        self._bar, self._histogram, self._strongest = (gui.add_html("") for _ in range(3))
+        for text, x in (("before", -_APART), ("after", _APART)):
+            server.scene.add_label(f"/{text} label", text, position=(x, -0.185, 0.0))
+        self._region.on_update(lambda _: self._turn_to(1))
+        self._number.on_update(lambda _: self._show())
+        steps.on_click(lambda _: self._turn_to(self._component + 1 + (1 if steps.value == "next" else -1)))
+        self._action.on_click(lambda _: self._decide())
+        undo.on_click(lambda _: self._undo())
+        save.on_click(lambda _: self._save())
+        self._turn_to(1)
+
+    def _turn_to(self, number: int) -> None:
+        count = len(self._part.energy)
+        self._number.max = max(count, 2)
+        self._number.value = int(np.clip(number, 1, count))
+        self._show()
+
+    def _decide(self) -> None:
+        with self._lock:
+            self.review.decide(self._part.region, self._component, self._action.value, self._reason.value)
+            self._reason.value = ""
+        self._show()
+
+    def _undo(self) -> None:
+        with self._lock:
+            last = self.review.undo()
+        if last is None:
+            self._said.content = "Nothing to undo that is not saved."
+            return
+        self._region.value = last.region.replace("_", " ")
+        self._turn_to(last.component + 1)
+        self._said.content = "Undone."
+
+    def _save(self) -> None:
+        with self._lock:
+            try:
+                count = self.review.save()
+                self._said.content = f"{count} decisions saved in `{self.review.log}`."
+            except (InputError, OSError) as error:
+                self._said.content = f"Not saved: {error}"
+        self._show()
+
+    def _show(self) -> None:
+        """Everything as it is now."""
+        with self._lock:
+            part, k = self._part, min(self._component, len(self._part.energy) - 1)
+            review = self.review
+            self._about.content = panels.about(part, k, review.action(part.region, k), review.head)
+            self._error.content = panels.error(review.change, review.unsaved)
+            self._histogram.content = panels.histogram(part.coefficients[:, k], review.stored.labels)
+            self._strongest.content = panels.strongest(part, k, review.stored)
+            before, after = (motion[self._shown] for motion in review.motions(part.region, k))
+            reach = 1e3 * SWING * np.linalg.norm(before, axis=1)
+            limit = scale_limit_mm(reach)
+            self._bar.content = panels.colour_bar(limit)
+            points = review.head.points[self._shown]
+            for name, motion, x in (("before", before, -_APART), ("after", after, _APART)):
+                colours = scale_colours(1e3 * SWING * np.linalg.norm(motion, axis=1) / limit)
+                glb = swinging_head(points, motion, self._faces, colours)
+                self._server.scene.add_glb(f"/{name}", glb, position=(x, 0.0, 0.0))
+
+
+def _serve(port: int) -> "ViserServer":
+    """viser looks for the next free port by itself, but a tunnel leads to the one that was asked for."""
+    import socket
+
+    import viser
+
+    with socket.socket() as probe:
+        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        try:
+            probe.bind((HOST, port))
+            port = probe.getsockname()[1]
+        except (OSError, OverflowError) as error:
+            raise InputError(
+                "The page cannot be served",
+                where=f"{HOST}:{port}",
+                expected="a free port",
+                got=error,
+                fix="choose another one with --port",
+            ) from error
+    return viser.ViserServer(host=HOST, port=port, label="Stabilization", verbose=False)
