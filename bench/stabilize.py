@@ -1,7 +1,7 @@
 """Stabilization against known truth: does the skull stand still, and are expressions what they were?
 
-    python -m bench.stabilize [--subjects 20]
-    python -m bench.stabilize --run OUT --model MODEL.npz
+    python bench/stabilize.py [--subjects 20]
+    python bench/stabilize.py --run OUT --model MODEL.npz
 
 Subjects that the first model does not span perform 20 expressions; their heads are turned by up to 5 degrees and moved
 by up to 10 mm, with noise of 0.3 mm (smooth over 15 mm) and 0.1 mm (white) in each coordinate, and a tenth of the
@@ -13,29 +13,33 @@ registrations, as `gnmreg subject` wrote them, and applies 50 motions to their v
 
 import argparse
 import resource
+import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 
-from coregister import anatomy as anatomy_of
-from coregister import bootstrap, makehuman, population
-from registration.geometry.rigid import align
-from registration.model import gnm_npz
-from registration.model.gnm_npz import GNMData
-from registration.stabilize.automatic import stabilize_subject
-from registration.stabilize.components import Head
-from registration.stabilize.dataset import (
+if not __package__:  # run as a file: the tests' measures lie beside `bench`
+    sys.path[0] = str(Path(__file__).resolve().parents[1])
+
+from coregister import anatomy as anatomy_of  # noqa: E402
+from coregister import bootstrap, makehuman, population  # noqa: E402
+from registration.geometry.rigid import align  # noqa: E402
+from registration.model import gnm_npz  # noqa: E402
+from registration.model.gnm_npz import GNMData  # noqa: E402
+from registration.stabilize.automatic import stabilize_subject  # noqa: E402
+from registration.stabilize.components import Head  # noqa: E402
+from registration.stabilize.dataset import (  # noqa: E402
     Stabilization,
     StabilizedSubject,
     automatic_stage,
     corrected,
     regional_stage,
 )
-from registration.stabilize.meshes import SkullSkin, SubjectMeshes
-from tests.stabilize import measures, performed
-from workflows.stabilize_folder import read_run
+from registration.stabilize.meshes import SkullSkin, SubjectMeshes  # noqa: E402
+from tests.stabilize import measures, performed  # noqa: E402
+from workflows.stabilize_folder import read_run  # noqa: E402
 
 DRAWS = 5
 MOTIONS = 50
