@@ -108,6 +108,43 @@ def eyeball_shells(data: GNMData) -> tuple[Bool[np.ndarray, "V"], Bool[np.ndarra
     return outer & (group(data, "left_eye") > _INSIDE), outer & (group(data, "right_eye") > _INSIDE)
 
 
+def eyeballs(data: GNMData) -> tuple[Bool[np.ndarray, "V"], Bool[np.ndarray, "V"]]:
+    """The left and the right eyeball, all of each."""
+    return group(data, "left_eye") > _INSIDE, group(data, "right_eye") > _INSIDE
+
+
+def skin(data: GNMData) -> Bool[np.ndarray, "V"]:
+    """All skin, linings included: what is neither eyeball nor tooth, gum or tongue."""
+    return group(data, "skin") > _INSIDE
+
+
+def upper_teeth(data: GNMData) -> Bool[np.ndarray, "V"]:
+    """Upper teeth with their gums: they stay with the skull."""
+    return group(data, "upper_teeth_and_gums") > _INSIDE
+
+
+def jaw_parts(data: GNMData) -> Bool[np.ndarray, "V"]:
+    """What moves with the jaw though it is no skin: lower teeth with their gums, and the tongue."""
+    return (group(data, "lower_teeth_and_gums") > _INSIDE) | tongue(data)
+
+
+def jaw_skin(data: GNMData) -> Bool[np.ndarray, "V"]:
+    """Skin whose motion tells the jaw's: lower lip and chin (paper, Initial Placement of Teeth and Tongue)."""
+    return _any(data, ("lower_lip", "lower_lip_region", "chin_region")) & exterior(data)
+
+
+def inner_lip_halves(data: GNMData) -> tuple[Float[np.ndarray, "V"], Float[np.ndarray, "V"]]:
+    """`inner_lips`, upper and lower apart."""
+    inner = inner_lips(data)
+    upper, lower = (np.clip(group(data, name), 0, 1) for name in ("upper_lip", "lower_lip"))
+    return inner * upper, inner * lower
+
+
+def expression_skin(data: GNMData) -> Bool[np.ndarray, "V"]:
+    """The skin of both eye regions of the expression basis, up to the middle of their blend into the lower face."""
+    return _any(data, ("expression_basis_left_eye", "expression_basis_right_eye")) & skin(data)
+
+
 def lips(data: GNMData) -> tuple[Bool[np.ndarray, "V"], Bool[np.ndarray, "V"]]:
     """Upper and lower lip with the skin around them; they may share the corners of the mouth."""
     upper, lower = (
