@@ -64,12 +64,13 @@ def align_neutrals(
     settings = settings or Alignment()
     template = data.template_vertex_positions.astype(np.float64)
     stable = SkullSkin.of(data).area
-    looks = _Looks(data)
+    looks = Looks(data)
     kept, rejected = np.arange(len(vertices)), list[Rejected]()
     while True:
         T, mean, rounds = procrustes(vertices[kept], confidence[kept] * stable, template, settings)
         moved = np.stack([transform_points(t, v).astype(np.float32) for t, v in zip(T, vertices[kept], strict=True)])
-        found = _spoiled(looks.figures(moved, confidence[kept], mean), settings)
+        figures = np.stack([looks.figures(m - mean, sure) for m, sure in zip(moved, confidence[kept], strict=True)])
+        found = spoiled(figures, "the mean", settings)
         if found is None:
             break
         worst, reason = found
@@ -102,8 +103,9 @@ def procrustes(
     source, own = vertices[:, rows].astype(np.float64), weights[:, rows]
     aim = template[rows]
     total = own.sum(0)
-    mean, T = aim, np.tile(np.eye(4), (len(vertices), 1, 1))
-    for round_ in range(1, settings.rounds + 1):
+    mean, T, round_ = aim, np.tile(np.eye(4), (len(vertices), 1, 1)), 0
+    while round_ < settings.rounds:
+        round_ += 1
         T = align(source, mean, own)
         moved = np.einsum("ncd,npd->npc", T[:, :3, :3], source) + T[:, None, :3, 3]
         fresh = np.einsum("np,npc->pc", own, moved) / total[:, None]
@@ -119,50 +121,39 @@ def procrustes(
     return T, whole, round_
 
 
-class _Looks:
-    """What a head is compared by."""
+class Looks:
+    """What meshes of one kind are compared by: how far the skin that is seen lies from where it should."""
 
-    _NAMES = ("lies {:.1f} mm (rms) from the mean", "has a spot {:.1f} mm from the mean", "is rough by {:.2f} mm (rms)")
+    NAMES = ("lies {:.1f} mm (rms) from {}", "has a spot {:.1f} mm from {}", "is rough by {:.2f} mm (rms) against {}")
 
     def __init__(self, data: GNMData):
         self._outside = regions.exterior(data)
         self._laplacian: csr_matrix = normalised_laplacian(data.triangles, len(self._outside))
 
-    def figures(
-        self,
-        moved: Float[np.ndarray, "N V 3"],
-        confidence: Float[np.ndarray, "N V"],
-        mean: Float[np.ndarray, "V 3"],
-    ) -> list[tuple[str, Float[np.ndarray, "N"]]]:
-        """In words and mm, over the skin that is seen: rms distance, its 99.5th percentile, rms Laplacian of it."""
-        rows = []
-        for head, sure in zip(moved, confidence, strict=True):
-            seen = self._outside & (sure > 0)
-            away = head - mean
-            distance = MM_PER_M * np.linalg.norm(away[seen], axis=1)
-            bent = MM_PER_M * np.linalg.norm((self._laplacian @ away)[seen], axis=1)
-            rows.append([_rms(distance), np.percentile(distance, 99.5), _rms(bent)])
-        return list(zip(self._NAMES, np.array(rows).T, strict=True))
+    def figures(self, away: Float[np.ndarray, "V 3"], confidence: Float[np.ndarray, "V"]) -> Float[np.ndarray, "3"]:
+        """mm: rms of the distance, its 99.5th percentile, rms of its Laplacian; 0 where nothing is seen."""
+        seen = self._outside & (confidence > 0)
+        if not seen.any():
+            return np.zeros(len(self.NAMES))
+        distance = MM_PER_M * np.linalg.norm(away[seen], axis=1)
+        bent = MM_PER_M * np.linalg.norm((self._laplacian @ away)[seen], axis=1)
+        return np.array([_rms(distance), np.percentile(distance, 99.5), _rms(bent)])
 
 
-def _spoiled(
-    figures: list[tuple[str, Float[np.ndarray, "N"]]], settings: Alignment
-) -> tuple[int, str] | None:
-    """The head that stands out most from the median of a figure, by its logarithm's robust deviations, and why."""
-    worst: tuple[float, int, str] | None = None
-    for words, values in figures:
-        if len(values) < LEAST_TO_COMPARE:
-            return None
-        logs = np.log(np.maximum(values, 1e-6))
-        middle = np.median(logs)
-        spread = 1.4826 * np.median(np.abs(logs - middle))
-        out = (logs - middle) / max(spread, 1e-3)
-        number = int(out.argmax())
-        if out[number] > settings.deviations and logs[number] - middle > np.log(settings.times):
-            reason = f"{words.format(values[number])}, the median head {np.exp(middle):.2f} mm"
-            if worst is None or out[number] > worst[0]:
-                worst = (float(out[number]), number, reason)
-    return None if worst is None else worst[1:]
+def spoiled(figures: Float[np.ndarray, "N 3"], origin: str, settings: Alignment) -> tuple[int, str] | None:
+    """The mesh that stands out most from the median of a figure, by its logarithm's robust deviations, and why."""
+    if len(figures) < LEAST_TO_COMPARE:
+        return None
+    logs = np.log(np.maximum(figures, 1e-3))
+    middle = np.median(logs, axis=0)
+    spread = np.maximum(1.4826 * np.median(np.abs(logs - middle), axis=0), 1e-2)
+    out = (logs - middle) / spread
+    out[logs - middle <= np.log(settings.times)] = 0
+    number, which = np.unravel_index(out.argmax(), out.shape)
+    if out[number, which] <= settings.deviations:
+        return None
+    words = Looks.NAMES[which].format(figures[number, which], origin)
+    return int(number), f"{words}; the median is {np.exp(middle[which]):.2f} mm"
 
 
 def _rms(values: Float[np.ndarray, "_"]) -> float:

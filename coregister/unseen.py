@@ -25,8 +25,8 @@ class Completion:
     """Fills displacements from a template, of one kind: of identity or of expression.
 
     The model's coefficients have a standard normal prior (`basis` is scaled by standard deviations). Their mean given
-    the seen skin, b = (B'WB + I)^-1 B'W d, with weights W = share seen x area / detail_size^2 / detail^2, displaces what
-    was not seen, and what the seen skin differs from that continues beyond its border (`geometry.fill.continued`).
+    the seen skin, b = (B'WB + I)^-1 B'W d, with weights W = share seen x area / detail_size^2 / detail^2, displaces
+    what was not seen; what the seen skin differs by from that continues beyond its border (`geometry.fill.continued`).
     """
 
     def __init__(self, data: GNMData, basis: Float[np.ndarray, "K V 3"], settings: Unseen):

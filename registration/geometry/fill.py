@@ -16,11 +16,11 @@ def continued(
     *,
     reach_m: float,
 ) -> Float[np.ndarray, "V C"]:
-    """The known values, and from their border on what solves (L + D / 4 (h / reach)^2) x = 0, D the
-    number and h the mean length of a vertex' edges.
+    """The known values, and from their border on what solves (L + D / 4 (h / reach)^2) x = 0.
 
-    The screened Laplace equation (D / 4 h^2 is what L makes of a unit second derivative on equilateral triangles): without a jump at the border, falling to zero by a factor e over `reach_m`. Parts of
-    the mesh where nothing is known get zero.
+    The screened Laplace equation, discretely: L is the mesh's Laplacian, D the number and h the mean length of a vertex'
+    edges (of a unit second derivative L makes D / 4 h^2 on equilateral triangles). There is no jump at the border, and
+    values fall by a factor e over `reach_m`. Parts of the mesh where nothing is known get zero.
     """
     result = np.where(known[:, None], values, 0.0)
     open_ = np.flatnonzero(~known)
