@@ -24,7 +24,7 @@ class Alignment:
 
     tolerance_m: float = 1e-6  # rms change of the mean at which rounds end
     rounds: int = 100
-    deviations: float = 6.0  # robust ones of a figure's logarithm, and
+    deviations: float = 5.0  # robust ones of a figure's logarithm, and
     times: float = 2.0  # as many times the others' median: then a head is spoiled
 
 
@@ -136,7 +136,9 @@ class Looks:
         if not seen.any():
             return np.zeros(len(self.NAMES))
         distance = MM_PER_M * np.linalg.norm(away[seen], axis=1)
-        bent = MM_PER_M * np.linalg.norm((self._laplacian @ away)[seen], axis=1)
+        # At a border with what is not seen the Laplacian would tell of that.
+        inside = seen & (abs(self._laplacian) @ ~seen == 0)
+        bent = MM_PER_M * np.linalg.norm((self._laplacian @ away)[inside], axis=1)
         return np.array([_rms(distance), np.percentile(distance, 99.5), _rms(bent)])
 
 
@@ -157,4 +159,4 @@ def spoiled(figures: Float[np.ndarray, "N 3"], origin: str, settings: Alignment)
 
 
 def _rms(values: Float[np.ndarray, "_"]) -> float:
-    return float(np.sqrt(np.mean(values**2)))
+    return float(np.sqrt(np.mean(values**2))) if len(values) else 0.0

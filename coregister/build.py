@@ -1,7 +1,7 @@
 """Many registrations and the previous model -> the next model, with how it came about (paper, GNM).
 
     built = build(subjects, previous)
-    write(built, path, previous_path)
+    provenance.write(built.data, built.manifest, built.coefficients, path, previous_path)
 
 Reads straight down: neutrals are checked, completed and aligned; the head's identity, its joints and the regional
 expressions are built from them; what no skin moves with, eyes' and teeth's own shapes, the tongue's motions and the
@@ -16,22 +16,18 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from coregister import expression, identity, joints, lids
+from coregister import expression, identity, joints
 from coregister.align import Aligned, Alignment, Looks, Rejected, align_neutrals, spoiled
 from coregister.expression import Coefficients, Expressions, Region
 from coregister.identity import HeadIdentity, Identity
+from coregister.provenance import Origin, manifest
 from coregister.samples import Subject, Survey, survey
 from coregister.spool import Spool
 from coregister.unseen import Completion, Unseen
-from registration import hashes
-from registration.frames import MM_PER_M, transform_points
+from registration.frames import transform_points
 from registration.geometry.rigid import align
-from registration.model import gnm_npz, regions
 from registration.model.gnm_npz import GNMData
 from registration.stabilize.meshes import SkullSkin
-
-KIND = "gnm-model"
-SCHEMA = 1
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -77,15 +73,24 @@ def build(subjects: Iterable[Subject], previous: GNMData, settings: Build | None
     data = _with_identity(previous, head)
     with Spool(len(head.template)) as spool:
         samples = _spooled(subjects, found, aligned, previous, spool, settings)
-        kept = samples.weights > 0
-        bases: dict[str, Region] = {}
-        coefficients = None
-        if kept.any():
+        bases, coefficients = dict[str, Region](), None
+        if samples.weights.any():
             bases = expression.regional_bases(spool, samples.weights, data, settings.expressions, settings.memory_gb)
             coefficients = expression.coefficients(spool, samples.weights, bases, data)
             data = _with_expressions(data, bases, coefficients)
-    manifest = _manifest(found, aligned, filled, head, bases, samples, previous, data, settings)
-    return Built(data=data, manifest=manifest, coefficients=coefficients)
+    origin = Origin(
+        found=found,
+        aligned=aligned,
+        head=head,
+        bases=bases,
+        expression_subjects=samples.subjects,
+        expression_labels=samples.labels,
+        expression_weights=samples.weights,
+        rejected=(*aligned.rejected, *samples.rejected),
+        filled={"neutrals": filled, "expressions": samples.filled},
+    )
+    told = manifest(origin, previous, data, settings, settings.categories)
+    return Built(data=data, manifest=told, coefficients=coefficients)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -169,92 +174,8 @@ def _with_expressions(data: GNMData, bases: Mapping[str, Region], found: Coeffic
 
 
 def _replaced(data: GNMData, **arrays: np.ndarray) -> GNMData:
-    numbers = {
+    numbers: dict[str, Any] = {
         name: array if array.dtype.kind == "U" else array.astype(getattr(data, name).dtype)
         for name, array in arrays.items()
     }
     return replace(data, **numbers)
-
-
-def _manifest(
-    found: Survey,
-    aligned: Aligned,
-    filled: int,
-    head: HeadIdentity,
-    bases: Mapping[str, Region],
-    samples: _Samples,
-    previous: GNMData,
-    data: GNMData,
-    settings: Build,
-) -> dict[str, Any]:
-    inputs = {**found.digests, "previous": gnm_npz.content_hash(previous)}
-    config = hashes.plain(settings)
-    taken = [label for label, weight in zip(samples.labels, samples.weights, strict=True) if weight > 0]
-    category = settings.categories or {}
-    counted = Counter(of for of, weight in zip(samples.subjects, samples.weights, strict=True) if weight > 0)
-    template = data.template_vertex_positions.astype(np.float64)
-    both = lids.sockets(data)
-    gap = lids.gap_change_mm(both, template, data.vertex_identity_basis[: len(head.basis)])
-    return hashes.plain(
-        {
-            "kind": KIND,
-            "schema": SCHEMA,
-            "content_id": gnm_npz.content_hash(data),
-            "input_hash": hashes.input_hash(inputs, config),
-            "inputs": inputs,
-            "config": config,
-            "versions": hashes.versions(),
-            "subjects": [
-                {
-                    "subject": found.subjects[k],
-                    "tags": found.tags[k],
-                    "expressions": counted[found.subjects[k]],
-                    "weight_of_each": 1 / max(counted[found.subjects[k]], 1),
-                    "residual_mm": residual,
-                }
-                for k, residual in zip(aligned.kept, aligned.residual_mm, strict=True)
-            ],
-            "rejected": [vars(one) for one in (*aligned.rejected, *samples.rejected)],
-            "filled": {"neutrals": filled, "expressions": samples.filled},
-            "alignment": {"rounds": aligned.rounds},
-            "identity": {**_told(head), "previous_components": data.identity_names[len(head.basis) :]},
-            "expression": {name: _told(region) for name, region in bases.items()}
-            or {"previous": "all of it: there are no expressions"},
-            "labels": dict(sorted(Counter(taken).items())),
-            "categories": dict(sorted(Counter(category.get(label, label) for label in taken).items())),
-            "demographics": _demographics([found.tags[k] for k in aligned.kept]),
-            "figures": {
-                "drift_mm": drift_mm(previous, data),
-                "lid_gap_change_mm": {"worst": gap.max(initial=0), "median": np.median(gap) if len(gap) else 0.0},
-            },
-        }
-    )
-
-
-def drift_mm(previous: GNMData, data: GNMData) -> float:
-    """rms distance of the stable skin between two models' templates, as they lie."""
-    stable = SkullSkin.of(previous).area
-    away = data.template_vertex_positions.astype(np.float64) - previous.template_vertex_positions
-    return float(MM_PER_M * np.sqrt((away**2).sum(1) @ stable / stable.sum()))
-
-
-def _told(part: HeadIdentity | Region) -> dict[str, Any]:
-    variance = part.variance if isinstance(part, HeadIdentity) else part.energy
-    return {
-        "components": len(variance),
-        "share_kept": part.share,
-        "share_previous": part.previous,
-        "method": part.method,
-        "variance_mm2": MM_PER_M**2 * variance,
-    }
-
-
-def _demographics(tags: Iterable[Mapping[str, Any]]) -> dict[str, dict[str, int]]:
-    """Tag -> value -> subjects; ages by decade."""
-    counts: dict[str, Counter[str]] = {}
-    for of in tags:
-        for name, value in of.items():
-            decade = isinstance(value, (int, float)) and not isinstance(value, bool)
-            told = f"{10 * int(value // 10)}-{10 * int(value // 10) + 9}" if decade else str(value)
-            counts.setdefault(name, Counter())[told] += 1
-    return {name: dict(sorted(count.items())) for name, count in sorted(counts.items())}

@@ -123,7 +123,7 @@ def regional_bases(
     """
     settings = settings or Expressions()
     masks, mirror = regional_masks(data), data.mirror_indices
-    found = {}
+    found: dict[str, Region] = {}
     for name, mask in zip(REGIONS, masks, strict=True):
         if name == "right_eye_region":
             left = found["left_eye_region"]

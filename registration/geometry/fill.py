@@ -18,9 +18,9 @@ def continued(
 ) -> Float[np.ndarray, "V C"]:
     """The known values, and from their border on what solves (L + D / 4 (h / reach)^2) x = 0.
 
-    The screened Laplace equation, discretely: L is the mesh's Laplacian, D the number and h the mean length of a vertex'
-    edges (of a unit second derivative L makes D / 4 h^2 on equilateral triangles). There is no jump at the border, and
-    values fall by a factor e over `reach_m`. Parts of the mesh where nothing is known get zero.
+    The screened Laplace equation, discretely: L is the mesh's Laplacian, D the number and h the mean length of a
+    vertex' edges (L makes D / 4 h^2 of a unit second derivative on equilateral triangles). There is no jump at the
+    border, and values fall by a factor e over `reach_m`. Parts of the mesh where nothing is known get zero.
     """
     result = np.where(known[:, None], values, 0.0)
     open_ = np.flatnonzero(~known)
