@@ -138,8 +138,8 @@ def regional_bases(
 
 
 def with_jaw(basis: Float[np.ndarray, "K V 3"], data: GNMData) -> Float[np.ndarray, "K V 3"]:
-    """The motion w x p + t of lower lip and chin in each component, everywhere: linear in the coefficient, as a full
-    turn would not be (algorithms, section 7, first placement)."""
+    """The motion w x p + t of the jaw's skin in each component, everywhere: linear in the coefficient, as a full turn
+    would not be (algorithms, section 7, first placement)."""
     points = data.template_vertex_positions.astype(np.float64)
     area = vertex_areas(points, data.triangles) * regions.jaw_skin(data)
     points = points - area @ points / area.sum()

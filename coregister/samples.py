@@ -46,7 +46,6 @@ class Survey:
     subjects: tuple[str, ...]
     neutrals: Float[np.ndarray, "N V 3"]  # float32
     confidence: Float[np.ndarray, "N V"]  # float32
-    labels: tuple[tuple[str, ...], ...]  # of each subject's expressions
     digests: Mapping[str, str]  # mesh -> what it was read from
     tags: tuple[Mapping[str, Any], ...]
 
@@ -85,7 +84,7 @@ def survey(
             or with confidence out of range; an unknown label; too few neutrals.
     """
     topology = topology_hash(data.triangles)
-    names, neutrals, sure, performed, tags = [], [], [], [], []
+    names, neutrals, sure, tags = [], [], [], []
     digests: dict[str, str] = {}
     for subject in subjects:
         if subject.neutral is None:
@@ -108,14 +107,12 @@ def survey(
         names.append(subject.name)
         neutrals.append(subject.neutral.vertices.astype(np.float32))
         sure.append(subject.neutral.confidence.astype(np.float32))
-        performed.append(tuple(mesh.label for mesh in subject.expressions))
         tags.append(subject.tags)
     _check_count(len(names), least, rank, previous)
     return Survey(
         subjects=tuple(names),
         neutrals=np.stack(neutrals),
         confidence=np.stack(sure),
-        labels=tuple(performed),
         digests=digests,
         tags=tuple(tags),
     )

@@ -129,8 +129,13 @@ def jaw_parts(data: GNMData) -> Bool[np.ndarray, "V"]:
 
 
 def jaw_skin(data: GNMData) -> Bool[np.ndarray, "V"]:
-    """Skin whose motion tells the jaw's: lower lip and chin (paper, Initial Placement of Teeth and Tongue)."""
-    return _any(data, ("lower_lip", "lower_lip_region", "chin_region")) & exterior(data)
+    """Skin whose motion tells the jaw's: the chin.
+
+    The paper has lower lip and chin (Initial Placement of Teeth and Tongue). Against MakeHuman's own jaw the lip
+    misleads: with it the lower teeth are off by 2.1 mm instead of 0.9 when the jaw goes left, by 3.9 instead of 1.2
+    in a pucker.
+    """
+    return (group(data, "chin_region") > _INSIDE) & exterior(data)
 
 
 def inner_lip_halves(data: GNMData) -> tuple[Float[np.ndarray, "V"], Float[np.ndarray, "V"]]:

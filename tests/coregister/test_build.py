@@ -150,6 +150,19 @@ class iter_again:
         return iter(list(self._subjects))
 
 
+def test_a_built_model_is_built_upon(built: Built, subjects):
+    again = build(subjects[:5], built.data)
+    for names in (again.data.identity_names.tolist(), again.data.expression_names.tolist()):
+        assert len(set(names)) == len(names)
+    assert again.data.identity_names.tolist()[-3:] == ["eye_000", "eye_001", "eye_002"]
+    assert again.data.expression_names.tolist()[-1] == built.data.expression_names.tolist()[-1] == "pupils_000"
+    assert again.manifest["inputs"]["previous"] == built.manifest["content_id"]
+    # Joints that are told anew round after round stay where they are.
+    one, two = built.data, again.data
+    told = two.joint_regressor @ one.template_vertex_positions
+    assert 1e3 * np.abs(told - one.template_joint_positions).max() < 0.5
+
+
 def test_without_expressions_the_previous_basis_stays(subjects, model):
     built = build([replace(subject, expressions=()) for subject in subjects], model)
     assert np.array_equal(built.data.expression_basis, model.expression_basis)

@@ -10,6 +10,7 @@ from coregister import lids
 from coregister.align import align_neutrals
 from coregister.identity import HeadIdentity, Identity, head_identity
 from registration.geometry.rigid import fit_twists, motion_fields
+from registration.geometry.topology import vertex_areas
 from registration.model import regions
 from registration.model.gnm_npz import GNMData
 from registration.stabilize.meshes import SkullSkin
@@ -72,6 +73,22 @@ def test_raw_draws_equal_a_dense_svd(model):
     print(f"components {away:.2e} m, variances {np.abs(found.variance / expected - 1).max():.2e}")
     assert away < 1e-4 * np.abs(mine).max()
     assert found.share == pytest.approx(1, abs=1e-6)
+
+
+def test_components_by_area_are_those_of_the_surface(model):
+    """Orthogonal where every square millimetre counts alike, and with the variance that it has there."""
+    rng = np.random.default_rng(7)
+    heads = _aligned(model, _drawn(model, rng, 15), rng)
+    found = head_identity(heads, model, replace(RAW, by_area=True))
+    skin = regions.skin(model)
+    area = vertex_areas(model.template_vertex_positions, model.triangles)[skin]
+    weight = np.repeat(np.maximum(area, 0.01 * area.mean()) / area.mean(), 3)
+    mine = _skin(found.basis, model)
+    gram = (mine * weight) @ mine.T
+    np.testing.assert_allclose(gram, np.diag(found.variance), atol=1e-5 * found.variance[0])
+    away = (heads[:, skin] - heads[:, skin].mean(0)).reshape(len(heads), -1).astype(np.float64)
+    assert found.variance.sum() == pytest.approx((away**2 @ weight).sum() / (len(heads) - 1), rel=1e-5)
+    np.testing.assert_allclose(away - away @ (weight * mine).T @ np.linalg.pinv(gram) @ mine, 0, atol=2e-6)
 
 
 def test_a_share_or_a_number_truncates(model):
