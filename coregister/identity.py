@@ -1,7 +1,136 @@
 """Identity basis: centred principal components of aligned neutral heads (paper, Head Identity)."""
 
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
+
+from coregister import lids
+from coregister.mixed import Mixed
+from registration.geometry import pca
+from registration.geometry.rigid import fit_twists, motion_fields
+from registration.geometry.topology import vertex_areas
+from registration.model import regions
+from registration.model.gnm_npz import GNMData
+from registration.stabilize.meshes import SkullSkin
+
+
+@dataclass(frozen=True, kw_only=True)
+class Identity:
+    """What the head's identity basis is made of."""
+
+    share: float = 0.99  # of the variance, kept
+    most: int | None = None  # components
+    previous: float = 0.2  # of the variance, from the previous model; the registrations have the rest
+    by_area: bool = False  # vertices count by their area instead of alike
+    lids_rest: bool = True  # lids stay on the eyeballs to first order (`lids.rested`)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class HeadIdentity:
+    """The template and K components; metres, the model's frame."""
+
+    template: Float[np.ndarray, "V 3"]
+    basis: Float[np.ndarray, "K V 3"]
+    variance: Float[np.ndarray, "K"]  # of the skin, m^2 summed over its coordinates, before lids were settled
+    share: float  # of the variance, kept
+    previous: float  # share of the variance that is the previous model's
+    method: str  # of the principal components
+
+
+def head_identity(
+    heads: Float[np.ndarray, "N V 3"], data: GNMData, settings: Identity | None = None, memory_gb: float = 4.0
+) -> HeadIdentity:
+    """The basis of aligned neutrals (`align.align_neutrals`), with everything that is no skin filled back.
+
+    The covariance is (1 - p) C + p (tr C / tr P) P: C of the heads about their mean, with N - 1; P = B'B of the
+    previous model's components of the head, rigid motions taken out as alignment takes them out of heads (`Mixed`).
+    p = `settings.previous`; the variance in all is the heads'.
+
+    The template is the heads' mean alone; eyeballs are placed to fit its lids, teeth and tongue follow the inner lips.
+    """
+    settings = settings or Identity()
+    rows = np.flatnonzero(regions.skin(data))
+    root = _root(data, rows, settings.by_area)
+    mean = heads[:, rows].mean(0, dtype=np.float64)
+    previous = (_previous_rows(data, rows) * root).reshape(-1, 3 * len(rows))
+    deviations = _Deviations(heads, rows, mean, root)
+    stream = Mixed(deviations, np.ones(len(heads)), len(heads) - 1, previous, settings.previous)
+    found = pca.principal_components(
+        stream, centred=False, share=settings.share, most=settings.most, memory_gb=memory_gb
+    )
+    basis = np.zeros((len(found.variance), *data.template_vertex_positions.shape))
+    basis[:, rows] = found.components.reshape(len(basis), len(rows), 3) / root
+    template = data.template_vertex_positions.astype(np.float64)
+    template[rows] = mean
+    template, basis = _filled(template, basis, data, settings.lids_rest)
+    return HeadIdentity(
+        template=template,
+        basis=basis,
+        variance=found.variance,
+        share=found.share,
+        previous=stream.share,
+        method=found.method,
+    )
+
+
+def carried(data: GNMData) -> Int[np.ndarray, "_"]:
+    """Identity components of the previous model in which no skin moves: eyes' and teeth's own shapes."""
+    return np.flatnonzero(~_moves_skin(data))
+
+
+def _moves_skin(data: GNMData) -> np.ndarray:
+    return np.abs(data.vertex_identity_basis[:, regions.skin(data)]).max(axis=(1, 2), initial=0) > 0
+
+
+def _root(data: GNMData, rows: Int[np.ndarray, "R"], by_area: bool) -> Float[np.ndarray, "R 1"]:
+    """What displacements are multiplied by before they are compared."""
+    if not by_area:
+        return np.ones((len(rows), 1))
+    area = vertex_areas(data.template_vertex_positions, data.triangles)[rows]
+    return np.sqrt(np.maximum(area, 0.01 * area.mean()) / area.mean())[:, None]
+
+
+def _previous_rows(data: GNMData, rows: Int[np.ndarray, "R"]) -> Float[np.ndarray, "K R 3"]:
+    """The previous model's components of the head on the skin, each without the rigid motion of the stable skin."""
+    basis = data.vertex_identity_basis[_moves_skin(data)].astype(np.float64)
+    stable = SkullSkin.of(data).area
+    points = data.template_vertex_positions.astype(np.float64)
+    points = points - stable @ points / stable.sum()
+    twists = fit_twists(basis, points, stable)
+    return basis[:, rows] - np.tensordot(twists, motion_fields(points[rows]), 1)
+
+
+class _Deviations:
+    """Of every head from the mean, on the skin."""
+
+    def __init__(self, heads: Float[np.ndarray, "N V 3"], rows: np.ndarray, mean: np.ndarray, root: np.ndarray):
+        self._heads, self._rows, self._mean, self._root = heads, rows, mean, root
+
+    def __iter__(self) -> Iterator[Float[np.ndarray, "D"]]:
+        return (((head[self._rows] - self._mean) * self._root).ravel() for head in self._heads)
+
+
+def _filled(
+    template: Float[np.ndarray, "V 3"], basis: Float[np.ndarray, "K V 3"], data: GNMData, lids_rest: bool
+) -> tuple[Float[np.ndarray, "V 3"], Float[np.ndarray, "K V 3"]]:
+    """Eyeballs between the lids; teeth and tongue moved as the mean of the inner lips (paper, Initial Placement)."""
+    for socket in lids.sockets(data):
+        template[socket.ball] += lids.placed(socket, template)
+    for part, lip in zip(
+        (regions.upper_teeth(data), regions.jaw_parts(data)), regions.inner_lip_halves(data), strict=True
+    ):
+        share = lip.astype(np.float64) / lip.sum(dtype=np.float64)
+        template[part] += share @ (template - data.template_vertex_positions)
+        basis[:, part] = np.einsum("v,kvc->kc", share, basis)[:, None]
+    both = lids.sockets(replace(data, template_vertex_positions=template))
+    shifts = np.stack([lids.following(socket, template, basis) for socket in both], 1)
+    if lids_rest:
+        basis = lids.rested(both, data, template, basis, shifts)
+    for side, socket in enumerate(both):
+        basis[:, socket.ball] = shifts[:, None, side]
+    return template, basis
 
 
 def principal_components(

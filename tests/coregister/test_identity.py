@@ -1,0 +1,171 @@
+"""The identity basis against models of which the answer is known."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.linalg import subspace_angles
+
+from coregister import lids
+from coregister.align import align_neutrals
+from coregister.identity import HeadIdentity, Identity, head_identity
+from registration.geometry.rigid import fit_twists, motion_fields
+from registration.geometry.topology import vertex_areas
+from registration.model import regions
+from registration.model.gnm_npz import GNMData
+from registration.stabilize.meshes import SkullSkin
+from tests.coregister import known
+
+RAW = Identity(share=1.0, previous=0.0, lids_rest=False)
+
+
+def _aligned(model: GNMData, shapes: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    heads = known.moved(shapes, rng).astype(np.float32)
+    names = [str(k) for k in range(len(heads))]
+    return align_neutrals(heads, np.ones(heads.shape[:2], np.float32), names, model).vertices
+
+
+def _drawn(model: GNMData, rng: np.random.Generator, count: int) -> np.ndarray:
+    return known.heads(model, rng.normal(size=(count, len(known.head_components(model)))))
+
+
+def _still(model: GNMData) -> np.ndarray:
+    """The model's own components without the rigid motions of the stable skin: K V 3."""
+    basis, stable = known.head_components(model), SkullSkin.of(model).area
+    points = model.template_vertex_positions.astype(np.float64)
+    points = points - stable @ points / stable.sum()
+    return basis - np.tensordot(fit_twists(basis, points, stable), motion_fields(points), 1)
+
+
+def _skin(basis: np.ndarray, model: GNMData) -> np.ndarray:
+    return basis[:, regions.skin(model)].reshape(len(basis), -1)
+
+
+def test_whitened_samples_give_the_model_back(model):
+    """A model whose components hold no motion of the skull's skin: alignment then has nothing of theirs to remove."""
+    rng = np.random.default_rng(0)
+    basis = _still(model)
+    size = len(basis)
+    shapes = model.template_vertex_positions + np.tensordot(known.whitened(rng, 150, size), basis, 1)
+    found = head_identity(_aligned(model, shapes, rng), model, replace(RAW, most=size))
+    mine, truth = _skin(found.basis, model), _skin(basis, model)
+    values = np.linalg.svd(truth, compute_uv=False) ** 2
+    angles = np.degrees(subspace_angles(mine.T, truth.T))
+    print(f"angle {angles.max():.4f} deg, eigenvalues {np.abs(found.variance / values - 1).max():.1e}")
+    np.testing.assert_allclose(found.variance, values, rtol=0.01)
+    assert angles.max() < 0.1
+
+
+def test_raw_draws_equal_a_dense_svd(model):
+    rng = np.random.default_rng(1)
+    heads = _aligned(model, _drawn(model, rng, 40), rng)
+    found = head_identity(heads, model, RAW)
+    flat = heads[:, regions.skin(model)].astype(np.float64).reshape(len(heads), -1)
+    mean = flat.mean(0)
+    _, s, vt = np.linalg.svd(flat - mean, full_matrices=False)
+    expected = (s**2 / (len(heads) - 1))[: len(heads) - 1]
+    np.testing.assert_allclose(found.variance, expected, rtol=1e-4)
+    skin = regions.skin(model)
+    np.testing.assert_allclose(found.template[skin].ravel(), mean, atol=1e-7)
+    mine = _skin(found.basis, model)
+    aligned = vt[: len(mine)] * np.sign((mine * vt[: len(mine)]).sum(1))[:, None]
+    away = np.abs(mine - aligned * np.sqrt(expected)[:, None]).max()
+    print(f"components {away:.2e} m, variances {np.abs(found.variance / expected - 1).max():.2e}")
+    assert away < 1e-4 * np.abs(mine).max()
+    assert found.share == pytest.approx(1, abs=1e-6)
+
+
+def test_components_by_area_are_those_of_the_surface(model):
+    """Orthogonal where every square millimetre counts alike, and with the variance that it has there."""
+    rng = np.random.default_rng(7)
+    heads = _aligned(model, _drawn(model, rng, 15), rng)
+    found = head_identity(heads, model, replace(RAW, by_area=True))
+    skin = regions.skin(model)
+    area = vertex_areas(model.template_vertex_positions, model.triangles)[skin]
+    weight = np.repeat(np.maximum(area, 0.01 * area.mean()) / area.mean(), 3)
+    mine = _skin(found.basis, model)
+    gram = (mine * weight) @ mine.T
+    np.testing.assert_allclose(gram, np.diag(found.variance), atol=1e-5 * found.variance[0])
+    away = (heads[:, skin] - heads[:, skin].mean(0)).reshape(len(heads), -1).astype(np.float64)
+    assert found.variance.sum() == pytest.approx((away**2 @ weight).sum() / (len(heads) - 1), rel=1e-5)
+    np.testing.assert_allclose(away - away @ (weight * mine).T @ np.linalg.pinv(gram) @ mine, 0, atol=2e-6)
+
+
+def test_a_share_or_a_number_truncates(model):
+    rng = np.random.default_rng(2)
+    heads = _aligned(model, _drawn(model, rng, 20), rng)
+    for share in (0.9, 0.99):
+        found = head_identity(heads, model, replace(RAW, share=share))
+        fewer = found.variance[:-1].sum() / found.variance.sum() * found.share
+        assert fewer < share <= found.share
+    assert len(head_identity(heads, model, replace(RAW, most=5)).basis) == 5
+
+
+def test_the_previous_model_has_the_share_that_is_stated(model):
+    rng = np.random.default_rng(3)
+    heads = _aligned(model, _drawn(model, rng, 8), rng)
+    alone = head_identity(heads, model, RAW)
+    mixed = head_identity(heads, model, replace(RAW, previous=0.2))
+    assert (alone.previous, mixed.previous) == (0, 0.2)
+    assert mixed.variance.sum() == pytest.approx(alone.variance.sum(), rel=1e-5)
+    assert len(alone.basis) == 7 and len(mixed.basis) >= len(known.head_components(model))
+    # In directions that the heads do not reach there is exactly what the previous model brings along.
+    own, truth = _skin(alone.basis, model), _skin(_still(model), model)
+    q, _ = np.linalg.qr(own.T)
+    beyond = truth - (truth @ q) @ q.T
+    both = _skin(mixed.basis, model)
+    left = both - (both @ q) @ q.T
+    scale = 0.2 * alone.variance.sum() / (truth**2).sum()
+    assert (left**2).sum() == pytest.approx(scale * (beyond**2).sum(), rel=1e-3)
+
+
+def test_parts_in_the_mouth_move_as_the_inner_lips(model):
+    rng = np.random.default_rng(4)
+    heads = _aligned(model, _drawn(model, rng, 10), rng)
+    found = head_identity(heads, model, RAW)
+    parts = (regions.upper_teeth(model), regions.jaw_parts(model))
+    for part, lip in zip(parts, regions.inner_lip_halves(model), strict=True):
+        wanted = np.average(found.basis, axis=1, weights=lip)
+        assert np.abs(found.basis[:, part] - wanted[:, None]).max() < 1e-9
+        away = (found.template - model.template_vertex_positions)[part]
+        assert np.ptp(away, axis=0).max() < 1e-9 and np.abs(away).max() > 1e-5
+
+
+@pytest.fixture(scope="module")
+def of_people(anatomy, model) -> tuple[GNMData, HeadIdentity, HeadIdentity]:
+    """The model with the template of people that it does not span, their basis, and the same with lids left alone."""
+    subjects = known.people(anatomy, model, range(300, 324), ("smile",))
+    heads = np.stack([subject.neutral.vertices for subject in subjects])
+    aligned = align_neutrals(heads, np.ones(heads.shape[:2], np.float32), [s.name for s in subjects], model)
+    settings = Identity(previous=0.2)
+    left, found = (head_identity(aligned.vertices, model, replace(settings, lids_rest=r)) for r in (False, True))
+    return replace(model, template_vertex_positions=found.template.astype(np.float32)), found, left
+
+
+def test_lids_stay_on_the_eyeballs(of_people, model):
+    new, found, left = of_people
+    both = lids.sockets(new)
+    for before, after in zip(lids.sockets(model), both, strict=True):
+        gap, _ = after.gaps(found.template[before.rim], np.zeros(3))
+        print(f"template: gap change {1e3 * np.abs(gap - before.gap).mean():.3f} mm (mean over the rim)")
+        assert np.abs(gap - before.gap).mean() < 0.2e-3
+    change, alone = (lids.gap_change_mm(both, found.template, one.basis) for one in (found, left))
+    print(f"worst component at 3 sigma: {change.max():.3f} mm; moved eyeballs alone {alone.max():.3f}")
+    assert change.max() < 0.2 and change.max() < alone.max()
+    # And the eyeballs do follow: left where they are, they would part from the lids.
+    still = found.basis.copy()
+    still[:, regions.eyeballs(new)[0] | regions.eyeballs(new)[1]] = 0
+    assert lids.gap_change_mm(both, found.template, still).max() > 2 * change.max()
+
+
+def test_settling_lids_changes_nothing_else(of_people, model):
+    _, found, left = of_people
+    away = np.linalg.norm(found.basis - left.basis, axis=2).max(0)
+    far = regions.exterior(model) & (regions.lids(model) == 0)
+    assert away[far].max() * lids.BOUND < 0.05e-3 and away.max() > 0
+
+
+def test_eyeballs_move_as_a_whole(of_people):
+    new, found, _ = of_people
+    for ball in regions.eyeballs(new):
+        assert np.ptp(found.basis[:, ball], axis=1).max() == 0
