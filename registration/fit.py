@@ -292,8 +292,9 @@ class Fit:
             return {}
         touching = self.unknowns.yielding(offsets)
         if step % _CONTACTS_EVERY == 0:
-            # How a person's tongue fills the mouth at rest is the model's own making, and seen by nobody.
-            self._contacts.accept(self.unknowns.at_rest(), OF_THE_TONGUE)
+            if step == 0 or stage.frees("identity"):  # else the head at rest is the one of step 0
+                # How a person's tongue fills the mouth at rest is the model's own making, and seen by nobody.
+                self._contacts.accept(self.unknowns.at_rest(), OF_THE_TONGUE)
             self._contacts.refresh(touching)
         found = self._contacts(touching).items()
         return {f"contact {pair}": (w.tongue if pair in OF_THE_TONGUE else w.contacts) * cost for pair, cost in found}
