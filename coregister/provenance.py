@@ -74,7 +74,12 @@ def manifest(
         "rejected": [vars(one) for one in origin.rejected],
         "filled": origin.filled,
         "alignment": {"rounds": aligned.rounds},
-        "identity": {**_told(head, head.variance), "carried": data.identity_names[len(head.basis) :]},
+        "identity": {
+            **_told(head, head.variance),
+            "samples": 2 * head.heads if head.mirrored else head.heads,
+            "weight_of_each": 0.5 if head.mirrored else 1.0,
+            "carried": data.identity_names[len(head.basis) :],
+        },
         "expression": expressions or "the previous model's: there are no expressions",
         "labels": dict(sorted(Counter(labels).items())),
         "categories": dict(sorted(Counter((categories or {}).get(label, label) for label in labels).items())),
