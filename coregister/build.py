@@ -66,7 +66,7 @@ def build(subjects: Iterable[Subject], previous: GNMData, settings: Build | None
         previous,
         labels=None if settings.categories is None else {*settings.categories},
         rank=settings.identity.most,
-        previous=of_head if settings.identity.previous > 0 else 0,
+        previous=of_head if settings.identity.previous != 0 else 0,
         mirrored=settings.identity.mirrored,
     )
     aligned, filled = _aligned(found, previous, settings)

@@ -1,6 +1,6 @@
 """Identity basis: centred principal components of aligned neutral heads (paper, Head Identity)."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -9,6 +9,7 @@ from jaxtyping import Float, Int
 from coregister import lids
 from coregister.expression import FLIP, mirrored
 from coregister.mixed import Mixed
+from coregister.share import SHARES, left_out_rms
 from registration.geometry import pca
 from registration.geometry.rigid import fit_twists, motion_fields
 from registration.geometry.topology import vertex_areas
@@ -17,13 +18,19 @@ from registration.model.gnm_npz import GNMData
 from registration.stabilize.meshes import SkullSkin
 
 
+_SHARE = 0.2  # of the previous model's
+_LEAST_TO_SHARE = 3  # heads, among which other shares can be compared
+_TYPICAL = 20  # components that it is compared with
+
+
 @dataclass(frozen=True, kw_only=True)
 class Identity:
     """What the head's identity basis is made of."""
 
     share: float = 0.99  # of the variance, kept
     most: int | None = None  # components
-    previous: float = 0.2  # of the variance, from the previous model; the registrations have the rest
+    previous: float | None = _SHARE  # of the variance, from the previous model, the heads have the rest; None: what
+    # serves heads that are left out best, with `most` components or 20 (`coregister.share`)
     by_area: bool = False  # vertices count by their area instead of alike
     mirrored: bool = False  # every head counts half, its mirror image the other half
     lids_rest: bool = True  # lids stay on the eyeballs to first order (`lids.rested`)
@@ -38,6 +45,7 @@ class HeadIdentity:
     variance: Float[np.ndarray, "K"]  # of the skin, m^2 summed over its coordinates, before lids were settled
     share: float  # of the variance, kept
     previous: float  # share of the variance that is the previous model's
+    tried: Mapping[float, float]  # shares that were compared -> rms distance of heads left out, metres, per vertex
     heads: int  # that came in, N
     mirrored: bool  # each has its mirror image beside it
     method: str  # of the principal components
@@ -50,7 +58,7 @@ def head_identity(
 
     The covariance is (1 - p) C + p (tr C / tr P) P: C of the heads about their mean, with N - 1; P = B'B of the
     previous model's components of the head, rigid motions taken out as alignment takes them out of heads (`Mixed`).
-    p = `settings.previous`; the variance in all is the heads'.
+    p is `settings.previous`, or chosen; the variance in all is the heads'.
 
     `settings.mirrored`: people are as often asymmetric one way as the other, so the mean is symmetric, and C and P are
     those of heads and components and of their mirror images, half each. That is what their symmetric and their
@@ -66,12 +74,15 @@ def head_identity(
     whole = heads.mean(0, dtype=np.float64)
     mean = whole[rows] if mirror is None else (whole[rows] + whole[mirror] * FLIP) / 2
     previous = _previous(data, rows, settings.mirrored)
+    previous = (previous * root).reshape(len(previous), 3 * len(rows))
+    deviations = _Deviations(heads, rows, mirror, mean, root)
+    share, tried = _share(deviations, len(heads), previous, settings)
     stream = Mixed(
-        _Deviations(heads, rows, mirror, mean, root),
+        deviations,
         np.ones(len(heads)) if mirror is None else np.repeat((1, 1 - 1 / len(heads)), len(heads)),
         len(heads) - 1,
-        (previous * root).reshape(len(previous), 3 * len(rows)),
-        settings.previous,
+        previous,
+        share,
     )
     found = pca.principal_components(
         stream, centred=False, share=settings.share, most=settings.most, memory_gb=memory_gb
@@ -89,6 +100,7 @@ def head_identity(
         variance=found.variance,
         share=found.share,
         previous=stream.share,
+        tried=tried,
         heads=len(heads),
         mirrored=settings.mirrored,
         method=found.method,
@@ -151,6 +163,25 @@ class _Deviations:
     def _part(self, head: Float[np.ndarray, "V 3"], sign: int) -> Float[np.ndarray, "R 3"]:
         own = head[self._rows].astype(np.float64)
         return own if self._mirror is None else (own + sign * head[self._mirror] * FLIP) / 2
+
+
+def _share(
+    deviations: "_Deviations", heads: int, previous: Float[np.ndarray, "K D"], settings: Identity
+) -> tuple[float, dict[float, float]]:
+    """The previous model's share, and the shares that were compared for it. Samples are held in memory, in float32."""
+    if settings.previous is not None:
+        return settings.previous, {}
+    if heads < _LEAST_TO_SHARE or not previous.any():
+        return _SHARE, {}
+    rows = np.concatenate([np.stack([d.astype(np.float32) for d in deviations]), previous.astype(np.float32)])
+    gram = np.zeros((len(rows), len(rows)))
+    for first in range(0, rows.shape[1], 4096):
+        part = rows[:, first : first + 4096].astype(np.float64)
+        gram += part @ part.T
+    members = np.split(np.arange(2 * heads if settings.mirrored else heads), 2 if settings.mirrored else 1)
+    rms = left_out_rms(gram, members, (True, False)[: len(members)], settings.most or _TYPICAL)
+    rms /= np.sqrt(rows.shape[1] / 3)
+    return SHARES[int(rms.argmin())], dict(zip(SHARES, rms.tolist(), strict=True))
 
 
 def _settled(

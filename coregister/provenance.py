@@ -78,6 +78,7 @@ def manifest(
             **_told(head, head.variance),
             "samples": 2 * head.heads if head.mirrored else head.heads,
             "weight_of_each": 0.5 if head.mirrored else 1.0,
+            "shares_tried_mm": {f"{share:.2f}": MM_PER_M * rms for share, rms in head.tried.items()},
             "carried": data.identity_names[len(head.basis) :],
         },
         "expression": expressions or "the previous model's: there are no expressions",
