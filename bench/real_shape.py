@@ -1,6 +1,6 @@
 """Does a model that is rebuilt from a few real shapes come nearer to the next one? Leave-one-out over captures.
 
-    python -m bench.real_shape CAPTURE... --model MODEL.npz --out OUT [--previous 0.2] [--no-by-area] [--no-mirrored]
+    python -m bench.real_shape CAPTURE... --model MODEL.npz --out OUT [--previous chosen] [--by-area] [--no-mirrored]
 
 Every neutral CAPTURE, with a scan, is registered with the `draft` recipe from MODEL into OUT/registrations; what is
 there already is not registered again. Then each subject in turn is left out: the next model is built from the others
@@ -28,7 +28,6 @@ from coregister.generalization import Fit, fit, identity_part
 from coregister.identity import Identity
 from coregister.samples import Mesh, Subject, unposed
 from coregister.scan_fit import fit_scan
-from registration.artifacts import load_registration
 from registration.capture.native import read
 from registration.capture.scan import read_scan
 from registration.errors import InputError
@@ -130,7 +129,7 @@ def main() -> None:
     parser.add_argument("--out", required=True, type=Path)
     parser.add_argument("--components", type=int, nargs="*", default=[5, 10, 20, 40])
     parser.add_argument("--headline", type=int, default=20)
-    parser.add_argument("--previous", type=float, default=Identity().previous)
+    parser.add_argument("--previous", default=str(Identity().previous))
     for name in ("by-area", "mirrored"):
         default = getattr(Identity(), name.replace("-", "_"))
         parser.add_argument(f"--{name}", action=argparse.BooleanOptionalAction, default=default)
@@ -144,7 +143,8 @@ def main() -> None:
             got="other",
             fix="leave them out",
         )
-    settings = Identity(previous=options.previous, by_area=options.by_area, mirrored=options.mirrored)
+    share = None if options.previous == "chosen" else float(options.previous)
+    settings = Identity(previous=share, by_area=options.by_area, mirrored=options.mirrored)
     counts = sorted({*options.components, options.headline})
     figures = left_out(pairs, gnm_npz.read(options.model), settings, counts)
     show([capture.subject for capture, _ in pairs], figures, counts)

@@ -106,7 +106,7 @@ def procrustes(
     In turn all heads are aligned with the mean and the mean is taken anew, each vertex' by its weights; it is then laid
     on the template, since nothing else says where it stands. `mirror` makes mean and template symmetric.
     """
-    weighted = weights.any(0)
+    weighted = np.asarray(weights.any(0))
     rows = np.flatnonzero(weighted if mirror is None else weighted | weighted[mirror])
     source, own = vertices[:, rows].astype(np.float64), weights[:, rows]
     twins = None if mirror is None else np.searchsorted(rows, mirror[rows])

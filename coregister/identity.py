@@ -17,7 +17,6 @@ from registration.model import regions
 from registration.model.gnm_npz import GNMData
 from registration.stabilize.meshes import SkullSkin
 
-
 _SHARE = 0.2  # of the previous model's
 _LEAST_TO_SHARE = 3  # heads, among which other shares can be compared
 _TYPICAL = 20  # components that it is compared with
@@ -32,7 +31,7 @@ class Identity:
     previous: float | None = _SHARE  # of the variance, from the previous model, the heads have the rest; None: what
     # serves heads that are left out best, with `most` components or 20 (`coregister.share`)
     by_area: bool = False  # vertices count by their area instead of alike
-    mirrored: bool = False  # every head counts half, its mirror image the other half
+    mirrored: bool = True  # every head counts half, its mirror image the other half
     lids_rest: bool = True  # lids stay on the eyeballs to first order (`lids.rested`)
 
 

@@ -16,7 +16,7 @@ from registration.model.gnm_npz import GNMData
 from registration.stabilize.meshes import SkullSkin
 from tests.coregister import known
 
-RAW = Identity(share=1.0, previous=0.0, lids_rest=False)
+RAW = Identity(share=1.0, previous=0.0, mirrored=False, lids_rest=False)
 
 
 def _aligned(model: GNMData, shapes: np.ndarray, rng: np.random.Generator) -> np.ndarray:
@@ -192,7 +192,7 @@ def test_mirrored_heads_make_a_symmetric_model(model):
         model,
         mirrored=True,
     ).vertices
-    for settings in (MIRRORED, Identity(mirrored=True, by_area=True)):
+    for settings in (MIRRORED, Identity(share=1.0, by_area=True)):
         found = head_identity(heads, model, settings)
         assert (found.heads, found.mirrored) == (12, True)
         template = found.template[model.mirror_indices] * expression.FLIP
