@@ -29,7 +29,7 @@ SCAN_POINTS = 20_000
 _HELD_OUT_SEED, _TRAINING_SEED = 12345, 777
 
 
-class _Moves(dict):
+class Moves(dict):
     """Target -> displacement, read when first asked for."""
 
     def __init__(self, anatomy: Anatomy):
@@ -41,7 +41,7 @@ class _Moves(dict):
         return self[name]
 
 
-def people(anatomy: Anatomy, data: GNMData, moves: _Moves, count: int) -> list[HeldOut]:
+def people(anatomy: Anatomy, data: GNMData, moves: Moves, count: int) -> list[HeldOut]:
     rng = np.random.default_rng(_HELD_OUT_SEED)
     acts = [expressions.named(name) for name in ACTS]
     face = data.triangles[(regions.group(data, "hockey_mask") > 0.5)[data.triangles].all(1)]
@@ -65,7 +65,7 @@ def people(anatomy: Anatomy, data: GNMData, moves: _Moves, count: int) -> list[H
     return found
 
 
-def trained(anatomy: Anatomy, data: GNMData, moves: _Moves, count: int) -> GNMData:
+def trained(anatomy: Anatomy, data: GNMData, moves: Moves, count: int) -> GNMData:
     """The first model with the identity of other people's true meshes."""
     rng = np.random.default_rng(_TRAINING_SEED)
     heads = [anatomy.person(population.any_person(anatomy.source, rng), moves)[0] for _ in range(count)]
@@ -88,7 +88,7 @@ def main() -> None:
     arguments = parser.parse_args()
     data = gnm_npz.read(bootstrap.bootstrap())
     anatomy = anatomy_of.make(makehuman.read(makehuman.fetch()), population.mean_person())
-    moves = _Moves(anatomy)
+    moves = Moves(anatomy)
     subjects = people(anatomy, data, moves, arguments.subjects)
     models = {"first": data} | {f"true_{n}": trained(anatomy, data, moves, n) for n in arguments.training}
     for name, model in models.items():

@@ -15,6 +15,7 @@ from registration.model import regions
 from registration.model.gnm_npz import GNMData
 from registration.stabilize.meshes import SkullSkin
 
+_NONE = 1e-300  # a weight that nothing has
 LEAST_TO_COMPARE = 5  # heads; among fewer nobody can tell which one is spoiled
 
 
@@ -55,8 +56,12 @@ def align_neutrals(
     names: Sequence[str],
     data: GNMData,
     settings: Alignment | None = None,
+    *,
+    mirrored: bool = False,
 ) -> Aligned:
     """Rigid, never scaled, never a reflection, by the skin on the skull; weights are its area times the confidence.
+
+    `mirrored`: to the mean of the heads and their mirror images, about the model's plane x = 0.
 
     Heads stand anywhere at first. After each alignment the head that stands out most from the others is left out, and
     the rest is aligned again, until none does: among at least LEAST_TO_COMPARE.
@@ -65,9 +70,10 @@ def align_neutrals(
     template = data.template_vertex_positions.astype(np.float64)
     stable = SkullSkin.of(data).area
     looks = Looks(data)
+    mirror = data.mirror_indices if mirrored else None
     kept, rejected = np.arange(len(vertices)), list[Rejected]()
     while True:
-        T, mean, rounds = procrustes(vertices[kept], confidence[kept] * stable, template, settings)
+        T, mean, rounds = procrustes(vertices[kept], confidence[kept] * stable, template, settings, mirror)
         moved = np.stack([transform_points(t, v).astype(np.float32) for t, v in zip(T, vertices[kept], strict=True)])
         figures = np.stack([looks.figures(m - mean, sure) for m, sure in zip(moved, confidence[kept], strict=True)])
         found = spoiled(figures, "the mean", settings)
@@ -93,25 +99,28 @@ def procrustes(
     weights: Float[np.ndarray, "N V"],
     template: Float[np.ndarray, "V 3"],
     settings: Alignment,
+    mirror: Int[np.ndarray, "V"] | None = None,
 ) -> tuple[Float[np.ndarray, "N 4 4"], Float[np.ndarray, "V 3"], int]:
     """T_model_head of each head, their mean (all vertices, metres), and how many rounds it took.
 
     In turn all heads are aligned with the mean and the mean is taken anew, each vertex' by its weights; it is then laid
-    on the template, since nothing else says where it stands.
+    on the template, since nothing else says where it stands. `mirror` makes mean and template symmetric.
     """
-    rows = np.flatnonzero(weights.any(0))
+    weighted = np.asarray(weights.any(0))
+    rows = np.flatnonzero(weighted if mirror is None else weighted | weighted[mirror])
     source, own = vertices[:, rows].astype(np.float64), weights[:, rows]
-    aim = template[rows]
+    twins = None if mirror is None else np.searchsorted(rows, mirror[rows])
     total = own.sum(0)
+    aim = _both_sides(template[rows], np.ones_like(total), twins)[0]
     mean, T, round_ = aim, np.tile(np.eye(4), (len(vertices), 1, 1)), 0
     while round_ < settings.rounds:
         round_ += 1
         T = align(source, mean, own)
         moved = np.einsum("ncd,npd->npc", T[:, :3, :3], source) + T[:, None, :3, 3]
-        fresh = np.einsum("np,npc->pc", own, moved) / total[:, None]
-        home = align(fresh[None], aim, total[None])[0]
+        fresh, both = _both_sides(np.einsum("np,npc->pc", own, moved) / np.maximum(total, _NONE)[:, None], total, twins)
+        home = align(fresh[None], aim, both[None])[0]
         fresh, T = transform_points(home, fresh), home @ T
-        change = np.sqrt(((fresh - mean) ** 2).sum(1) @ total / total.sum())
+        change = np.sqrt(((fresh - mean) ** 2).sum(1) @ both / both.sum())
         mean = fresh
         if change < settings.tolerance_m:
             break
@@ -119,6 +128,17 @@ def procrustes(
     for t, head in zip(T, vertices, strict=True):
         whole += transform_points(t, head.astype(np.float64)) / len(vertices)
     return T, whole, round_
+
+
+def _both_sides(
+    points: Float[np.ndarray, "P 3"], weights: Float[np.ndarray, "P"], twins: Int[np.ndarray, "P"] | None
+) -> tuple[Float[np.ndarray, "P 3"], Float[np.ndarray, "P"]]:
+    """The weighted mean of points and of their mirror images, and its weights; as they are without `twins`."""
+    if twins is None:
+        return points, weights
+    both = weights + weights[twins]
+    mean = weights[:, None] * points + weights[twins, None] * points[twins] * (-1, 1, 1)
+    return mean / np.maximum(both, _NONE)[:, None], both
 
 
 class Looks:

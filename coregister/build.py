@@ -66,7 +66,8 @@ def build(subjects: Iterable[Subject], previous: GNMData, settings: Build | None
         previous,
         labels=None if settings.categories is None else {*settings.categories},
         rank=settings.identity.most,
-        previous=of_head if settings.identity.previous > 0 else 0,
+        previous=of_head if settings.identity.previous != 0 else 0,
+        mirrored=settings.identity.mirrored,
     )
     aligned, filled = _aligned(found, previous, settings)
     head = identity.head_identity(aligned.vertices, previous, settings.identity, settings.memory_gb)
@@ -114,7 +115,9 @@ def _aligned(found: Survey, previous: GNMData, settings: Build) -> tuple[Aligned
         away = transform_points(T, vertices.astype(np.float64)) - template
         heads[number] = template + complete(away, sure)
         filled += complete.unseen(sure)
-    aligned = align_neutrals(heads, found.confidence, found.subjects, previous, settings.alignment)
+    aligned = align_neutrals(
+        heads, found.confidence, found.subjects, previous, settings.alignment, mirrored=settings.identity.mirrored
+    )
     T_model_head = aligned.T_model_head @ T_model_head[aligned.kept]
     return replace(aligned, T_model_head=T_model_head), filled
 

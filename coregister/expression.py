@@ -17,6 +17,7 @@ from registration.model import regions
 from registration.model.gnm_npz import GNMData
 
 REGIONS = ("left_eye_region", "right_eye_region", "lower_face_region")
+FLIP = np.array([-1.0, 1.0, 1.0])  # a mirror image's coordinates
 _BLEND = 10e-3  # metres along the surface, across which one region fades into the next
 _UPPER = ("forehead", "middle_brow", "left_brow", "right_brow", "left_temple", "right_temple", "left_orbital")
 _UPPER_REGIONS = tuple(f"{name}_region" for name in (*_UPPER, "right_orbital"))
@@ -44,7 +45,7 @@ def regional_masks(data: GNMData) -> Float[np.ndarray, "3 V"]:
     """
     skin, mirror = regions.skin(data), data.mirror_indices
     vertices = data.template_vertex_positions.astype(np.float64)
-    vertices = (vertices + vertices[mirror] * (-1, 1, 1)) / 2
+    vertices = (vertices + vertices[mirror] * FLIP) / 2
     upper = regions.expression_skin(data)
     edges = edges_of(data.triangles[skin[data.triangles].all(1)]).vertices
     length = np.linalg.norm(vertices[edges[:, 0]] - vertices[edges[:, 1]], axis=1)
@@ -75,7 +76,7 @@ def smoothstep(share: Float[np.ndarray, "*S"]) -> Float[np.ndarray, "*S"]:
 
 def mirrored(basis: Float[np.ndarray, "K V 3"], mirror: Int[np.ndarray, "V"]) -> Float[np.ndarray, "K V 3"]:
     """The same displacements on the other side of the head: P diag(-1, 1, 1) E."""
-    return basis[:, mirror] * (-1, 1, 1)
+    return basis[:, mirror] * FLIP
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -214,4 +215,4 @@ class _Masked:
         for displacement in self._displacements:
             yield (displacement[self._rows] * self._scale).ravel()
             if self._twins is not None:
-                yield (displacement[self._twins] * (-1, 1, 1) * self._scale).ravel()
+                yield (displacement[self._twins] * FLIP * self._scale).ravel()

@@ -86,6 +86,7 @@ def survey(
     least: int = 2,
     rank: int | None = None,
     previous: int = 0,
+    mirrored: bool = False,
 ) -> Survey:
     """Read every mesh once, keep the neutrals.
 
@@ -93,6 +94,7 @@ def survey(
         labels: all that an expression may be labelled; any if None.
         least: neutrals without which nothing is built.
         rank: identity components asked for, which neutrals and `previous` components of the model must span.
+        mirrored: mirror images of neutrals count too.
 
     Raises:
         InputError: a subject without a neutral, or twice; a mesh of another topology, with numbers that are not finite
@@ -123,7 +125,7 @@ def survey(
         neutrals.append(subject.neutral.vertices.astype(np.float32))
         sure.append(subject.neutral.confidence.astype(np.float32))
         tags.append(subject.tags)
-    _check_count(len(names), least, rank, previous)
+    _check_count(len(names), least, rank, previous, mirrored)
     return Survey(
         subjects=tuple(names),
         neutrals=np.stack(neutrals),
@@ -154,15 +156,17 @@ def _check(where: str, mesh: Mesh, topology: str, data: GNMData) -> None:
         )
 
 
-def _check_count(neutrals: int, least: int, rank: int | None, previous: int) -> None:
+def _check_count(neutrals: int, least: int, rank: int | None, previous: int, mirrored: bool) -> None:
     if neutrals < least:
         fix = "register more subjects"
         raise _wrong("There are too few neutrals", "subjects", f"at least {least}", neutrals, fix)
-    if rank is not None and not 0 < rank <= neutrals - 1 + previous:
+    most = (2 * neutrals if mirrored else neutrals) - 1 + previous
+    if rank is not None and not 0 < rank <= most:
+        images = " and their mirror images" if mirrored else ""
         raise _wrong(
             "There are too few samples for the rank that is asked for",
             "components of the head's identity",
-            f"1 to {neutrals - 1 + previous}: {neutrals} neutrals about their mean, {previous} of the previous model",
+            f"1 to {most}: {neutrals} neutrals{images} about their mean, {previous} of the previous model",
             rank,
             "register more subjects, or ask for fewer components",
         )

@@ -88,3 +88,19 @@ def test_unseen_skin_has_no_say(model, scattered):
     found = align_neutrals(hidden, sure, _names(), model)
     clean = align_neutrals(scattered, sure, _names(), model)
     assert found.rejected == () and np.abs(found.T_model_head - clean.T_model_head).max() < 1e-6
+
+
+def test_mirror_images_are_aligned_as_the_heads_are(model):
+    """Mirrored heads give the mirror images of what the heads give, about the plane x = 0."""
+    rng = np.random.default_rng(6)
+    heads = known.heads(model, rng.normal(size=(6, len(known.head_components(model)))))
+    heads[:, :, 0] += 0.02 * np.maximum(heads[:, :, 0], 0)  # all are wider on one side
+    heads = known.moved(heads, rng)
+    mirror, flip = model.mirror_indices, (-1, 1, 1)
+    sure = rng.uniform(0.2, 1, heads.shape[:2]).astype(np.float32)
+    names = [str(k) for k in range(6)]
+    one = align_neutrals(heads.astype(np.float32), sure, names, model, mirrored=True)
+    two = align_neutrals((heads[:, mirror] * flip).astype(np.float32), sure[:, mirror], names, model, mirrored=True)
+    assert np.abs(two.vertices - one.vertices[:, mirror] * flip).max() < 2e-6
+    alone = align_neutrals(heads.astype(np.float32), sure, names, model)
+    assert np.abs(alone.vertices - one.vertices).max() > 1e-4

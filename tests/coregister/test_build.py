@@ -69,8 +69,11 @@ def test_what_is_not_built_is_the_previous_models(built: Built, model):
     assert np.array_equal(built.data.vertex_identity_basis[-3:], model.vertex_identity_basis[-3:])
 
 
-def test_the_built_model_mirrors_its_eyes_and_tells_its_joints(built: Built):
+def test_the_built_model_is_symmetric_mirrors_its_eyes_and_tells_its_joints(built: Built):
     data = built.data
+    for symmetric in (data.template_vertex_positions, data.template_joint_positions):
+        twins = symmetric[[0, 1, 3, 2] if len(symmetric) == 4 else data.mirror_indices] * (-1, 1, 1)
+        assert np.abs(twins - symmetric).max() <= 1e-7
     left, right = (
         data.expression_basis[[n.startswith(f"{side}_eye_region") for n in data.expression_names.tolist()]]
         for side in ("left", "right")
@@ -119,6 +122,8 @@ def test_the_manifest_tells_how_it_came_about(built: Built, files: Path, subject
     assert {s["expressions"] for s in told["subjects"]} == {4} and told["subjects"][0]["weight_of_each"] == 0.25
     assert told["inputs"]["previous"] == gnm_npz.content_hash(model) and len(told["inputs"]) == 8 * 5 + 1
     assert told["identity"]["share_previous"] == 0.2 and 0.99 <= told["identity"]["share_kept"] <= 1
+    assert told["identity"]["samples"] == 16 and told["identity"]["weight_of_each"] == 0.5
+    assert told["identity"]["shares_tried_mm"] == {} and told["config"]["identity"]["mirrored"] is True
     assert told["identity"]["carried"] == ["eye_000", "eye_001", "eye_002"]
     assert told["categories"] == dict.fromkeys(sorted(CATEGORIES.values()), 8)
     assert sum(told["demographics"]["age"].values()) == 8 and told["demographics"]["gender"] == {"female": 4, "male": 4}
@@ -161,6 +166,14 @@ def test_a_built_model_is_built_upon(built: Built, subjects):
     one, two = built.data, again.data
     told = two.joint_regressor @ one.template_vertex_positions
     assert 1e3 * np.abs(told - one.template_joint_positions).max() < 0.5
+
+
+def test_the_previous_models_share_is_chosen_and_told(subjects, model):
+    neutrals = [replace(subject, expressions=()) for subject in subjects]
+    told = build(neutrals, model, Build(identity=Identity(previous=None, most=10))).manifest["identity"]
+    tried = {float(share): rms for share, rms in told["shares_tried_mm"].items()}
+    assert len(tried) == 20 and told["share_previous"] == min(tried, key=tried.__getitem__)
+    assert told["components"] == 10 and 0 < tried[told["share_previous"]] < tried[0.0] < 10
 
 
 def test_without_expressions_the_previous_basis_stays(subjects, model):
@@ -248,8 +261,11 @@ def test_too_few_samples_are_refused(subjects, model):
     with pytest.raises(InputError, match="no samples|too few neutrals"):
         build([], model)
     with pytest.raises(InputError, match="rank") as caught:
-        build(subjects[:4], model, Build(identity=Identity(most=4, previous=0.0)))
-    assert caught.value.got == "4" and "4 neutrals" in caught.value.expected
+        build(subjects[:4], model, Build(identity=Identity(most=4, previous=0.0, mirrored=False)))
+    assert caught.value.got == "4" and "4 neutrals about" in caught.value.expected
+    with pytest.raises(InputError, match="rank") as caught:
+        build(subjects[:4], model, Build(identity=Identity(most=8, previous=0.0)))
+    assert caught.value.got == "8" and "4 neutrals and their mirror images" in caught.value.expected
     with pytest.raises(InputError, match="twice"):
         build([subjects[0], subjects[0]], model)
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.linalg import subspace_angles
 
-from coregister import lids
+from coregister import expression, lids
 from coregister.align import align_neutrals
 from coregister.identity import HeadIdentity, Identity, head_identity
 from registration.geometry.rigid import fit_twists, motion_fields
@@ -16,7 +16,7 @@ from registration.model.gnm_npz import GNMData
 from registration.stabilize.meshes import SkullSkin
 from tests.coregister import known
 
-RAW = Identity(share=1.0, previous=0.0, lids_rest=False)
+RAW = Identity(share=1.0, previous=0.0, mirrored=False, lids_rest=False)
 
 
 def _aligned(model: GNMData, shapes: np.ndarray, rng: np.random.Generator) -> np.ndarray:
@@ -169,3 +169,73 @@ def test_eyeballs_move_as_a_whole(of_people):
     new, found, _ = of_people
     for ball in regions.eyeballs(new):
         assert np.ptp(found.basis[:, ball], axis=1).max() == 0
+
+
+MIRRORED = replace(RAW, mirrored=True)
+
+
+def _lopsided(model: GNMData, rng: np.random.Generator, count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Heads of the symmetric model with a bump of random height on the left cheek, and what it does: metres."""
+    points = model.template_vertex_positions
+    away = points - points[np.argmax(points[:, 2] + 0.5 * points[:, 0])]
+    bump = np.exp(-(away**2).sum(1, keepdims=True) / 0.02**2) * (0.3, 0.1, 1.0) * 3e-3
+    return _drawn(model, rng, count) + rng.normal(size=(count, 1, 1)) * bump, bump
+
+
+def test_mirrored_heads_make_a_symmetric_model(model):
+    """Template and what the basis spans are their own mirror images; so are left and right of each component."""
+    rng = np.random.default_rng(8)
+    heads = align_neutrals(
+        known.moved(_lopsided(model, rng, 12)[0], rng).astype(np.float32),
+        np.ones((12, len(model.mirror_indices)), np.float32),
+        [str(k) for k in range(12)],
+        model,
+        mirrored=True,
+    ).vertices
+    for settings in (MIRRORED, Identity(share=1.0, by_area=True)):
+        found = head_identity(heads, model, settings)
+        assert (found.heads, found.mirrored) == (12, True)
+        template = found.template[model.mirror_indices] * expression.FLIP
+        twins = expression.mirrored(found.basis, model.mirror_indices)
+        flat, other = (basis.reshape(len(basis), -1) for basis in (found.basis, twins))
+        left = other - other @ np.linalg.pinv(flat) @ flat
+        print(f"template {np.abs(template - found.template).max():.1e} m, span {np.abs(left).max():.1e} m")
+        assert np.abs(template - found.template).max() <= 1e-7 and np.abs(left).max() <= 1e-7
+        same, opposite = (np.abs(twins - sign * found.basis).max((1, 2)) < 1e-7 for sign in (1, -1))
+        assert (same ^ opposite).all() and opposite.sum() >= 1
+    # By its nature no component of the heads alone is that.
+    alone = head_identity(heads, model, RAW)
+    twins = expression.mirrored(alone.basis, model.mirror_indices)
+    assert min(np.abs(twins - sign * alone.basis).max((1, 2)).min() for sign in (1, -1)) > 1e-5
+
+
+def test_mirrored_variance_keeps_its_meaning(model):
+    """Symmetric parts have it about their mean, with N - 1; antisymmetric parts about zero, which is known, with N."""
+    rng = np.random.default_rng(9)
+    heads, bump = _lopsided(model, rng, 9)
+    heads = heads.astype(np.float32)
+    found = head_identity(heads, model, MIRRORED)
+    skin = regions.skin(model)
+    twins = expression.mirrored(heads, model.mirror_indices)
+    even, odd = (((heads + sign * twins) / 2)[:, skin].reshape(9, -1).astype(np.float64) for sign in (1, -1))
+    even = np.linalg.svd(even - even.mean(0), compute_uv=False) ** 2 / 8
+    odd = np.linalg.svd(odd, compute_uv=False) ** 2 / 9
+    expected = np.sort(np.concatenate([even[:8], odd[:1]]))[::-1]  # the bump's height is the one asymmetry there is
+    np.testing.assert_allclose(found.variance[: len(expected)], expected, rtol=1e-4)
+    assert found.variance[len(expected) :].sum() < 1e-6 * expected.sum()
+    # And its direction is a component: half a bump here, less half a bump there.
+    pair = ((bump - expression.mirrored(bump[None], model.mirror_indices)[0]) / 2)[skin].ravel()
+    own = _skin(found.basis, model)
+    cosine = np.abs(own @ pair) / np.linalg.norm(own, axis=1) / np.linalg.norm(pair)
+    assert cosine.max() > 1 - 1e-5
+
+
+def test_mirror_images_of_a_symmetric_models_heads_change_nothing(model):
+    """Whitened samples of a symmetric model give it back, mirrored or not."""
+    rng = np.random.default_rng(10)
+    basis = _still(model)[:12]
+    shapes = model.template_vertex_positions + np.tensordot(known.whitened(rng, 40, 12), basis, 1)
+    found = head_identity(shapes.astype(np.float32), model, replace(MIRRORED, most=12))
+    mine, truth = _skin(found.basis, model), _skin(basis, model)
+    assert np.degrees(subspace_angles(mine.T, truth.T)).max() < 0.1
+    np.testing.assert_allclose(found.variance, np.linalg.svd(truth, compute_uv=False) ** 2, rtol=0.01)
