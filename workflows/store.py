@@ -17,13 +17,13 @@ import time
 import uuid
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
+from importlib.metadata import version
 from pathlib import Path, PurePosixPath
 from typing import Any
 
 import fsspec
 
 from registration.errors import InputError
-from registration.hashes import hash_file, plain, versions
 from workflows.jobs import check_id, redacted
 
 SCHEMA = 1
@@ -42,11 +42,11 @@ class Artifact:
     content_id: str  # sha256 over the names and digests of the files
     attempt: str  # the folder of the files, below the key
     files: Mapping[str, Mapping[str, Any]]  # name below the attempt -> {"sha256", "bytes"}
-    about: Mapping[str, Any]  # figures and the like, small
+    about: Mapping[str, Any]  # figures and the like, small, JSON
 
     def brief(self) -> dict[str, Any]:
         """What a step returns to the queue about it."""
-        return {"key": self.key, "content_id": self.content_id, "about": plain(self.about)}
+        return {"key": self.key, "content_id": self.content_id, "about": dict(self.about)}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -136,7 +136,7 @@ class Store:
                 self._fs.get_file(self._path(key, artifact.attempt, name), str(target))
             except FileNotFoundError:
                 raise _unusable(f"{key}/{name}", expected="the file that the manifest names", got="none") from None
-            if hash_file(target) != told["sha256"]:
+            if _digest(target.open("rb")) != told["sha256"]:
                 raise _unusable(f"{key}/{name}", expected=f"sha256 {told['sha256']}", got="another file")
         return artifact
 
@@ -170,7 +170,7 @@ class Store:
                 known.add(place)
                 if place not in names:
                     missing.append(place)
-                elif self._digest(place) != told["sha256"]:
+                elif _digest(self._fs.open(self._path(place), "rb")) != told["sha256"]:
                     altered.append(place)
         return Verified(
             artifacts=len(manifests),
@@ -213,7 +213,7 @@ class Store:
 
     def _published(self, key: str, attempt: str, wanted: str, folder: Path, about: Mapping[str, Any]) -> Artifact:
         files = {
-            file.relative_to(folder).as_posix(): {"sha256": hash_file(file), "bytes": file.stat().st_size}
+            file.relative_to(folder).as_posix(): {"sha256": _digest(file.open("rb")), "bytes": file.stat().st_size}
             for file in _files(folder)
         }
         artifact = Artifact(
@@ -256,13 +256,6 @@ class Store:
         for path in self._fs.find(self._path(below)):
             yield path.removeprefix(self._root).lstrip("/")
 
-    def _digest(self, name: str) -> str:
-        digest = hashlib.sha256()
-        with self._fs.open(self._path(name), "rb") as stream:
-            while block := stream.read(_BLOCK):
-                digest.update(block)
-        return digest.hexdigest()
-
     def _written(self, name: str) -> float:
         modified = self._fs.modified(self._path(name))
         return float(modified.timestamp())
@@ -284,6 +277,15 @@ def _files(folder: Path) -> list[Path]:
     return sorted(path for path in folder.rglob("*") if path.is_file())
 
 
+def _digest(stream: Any) -> str:
+    """sha256 of all that a stream of bytes holds; closes it."""
+    digest = hashlib.sha256()
+    with stream:
+        while block := stream.read(_BLOCK):
+            digest.update(block)
+    return digest.hexdigest()
+
+
 def _in_attempt(name: str) -> bool:
     return any(part.startswith(ATTEMPT) for part in posixpath.dirname(name).split("/"))
 
@@ -302,8 +304,8 @@ def _text(artifact: Artifact) -> str:
         "content_id": artifact.content_id,
         "attempt": artifact.attempt,
         "files": dict(artifact.files),
-        "about": plain(artifact.about),
-        "versions": versions(),
+        "about": dict(artifact.about),
+        "version": version("gnm-registration"),
     }
     return redacted(json.dumps(value, indent=1, allow_nan=False)) + "\n"
 
