@@ -1,7 +1,8 @@
 """The queue from outside: put jobs in, cancel a run, retry what failed, forget old iterations. No process is needed."""
 
 import json
-from collections.abc import Iterable, Iterator, Sequence
+import re
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from itertools import islice
 from typing import Any
 
@@ -16,6 +17,7 @@ from workflows.jobs import MAX_BYTES, FlowJob, Job, check_id
 CHUNK = 1000  # jobs that are put in with one transaction
 ACTIVE = ("ENQUEUED", "PENDING", "DELAYED")
 FAILED = ("ERROR", "MAX_RECOVERY_ATTEMPTS_EXCEEDED")
+_ITERATION = re.compile(r"^[^/]+/(it[0-9]+)(?:/|$)")
 
 
 class Queue:
@@ -78,19 +80,32 @@ class Queue:
         return gone
 
     def retry(self, run: str, *, cancelled: bool = False) -> list[str]:
-        """Put everything of a run that failed into its queue again, and the flows above it, in place. Returns the ids.
+        """Put what failed in a run into its queue again, in place, and what followed from it. Returns the ids.
 
-        Flows start from the beginning: what they made is there, so that they reach the place where they ended at once.
+        What followed: the flows above a failed job, from their beginning, and those of their jobs that were put in after
+        it ended, the stabilization after an expression for one. What has the same input as before returns at once. Of
+        a run with iterations the last one is retried only: the others' models are superseded.
         """
+        rows = self._rows(check_id(run))
+        iterations = [row["iteration"] for row in rows.values() if row["iteration"]]
+        last = max(iterations, default="")
         wanted = (*FAILED, "CANCELLED") if cancelled else FAILED
-        failed = self._ids(run, wanted)
-        above = {"/".join(parts[:n]) for parts in (i.split("/") for i in failed) for n in range(1, len(parts))}
-        flows = [i for i in self._ids(run, ("SUCCESS",), name="flow") if i in above]
-        chosen = sorted({*failed, *flows}, key=lambda i: -i.count("/"))  # jobs before the flows that wait for them
-        queues = self._queues(chosen)
-        for identity in chosen:
-            self._client.rewind_workflow(identity, 1, queue_name=queues[identity])
-        return chosen
+        failed = {i: r for i, r in rows.items() if r["status"] in wanted and r["iteration"] in ("", last)}
+        chosen = set(failed)
+        for identity, row in failed.items():
+            above = [i for i in _ancestors(identity) if i in rows]
+            chosen |= {i for i in above if rows[i]["status"] not in ACTIVE}
+            chosen |= {
+                i
+                for i, r in rows.items()
+                if r["name"] == "job" and r["status"] == "SUCCESS" and r["created"] >= (row["ended"] or 0)
+                and _nearest(i, rows) in above
+            }
+        ordered = sorted(chosen, key=lambda i: (-i.count("/"), i))  # jobs before the flows that wait for them
+        queues = self._queues(ordered)
+        for identity in ordered:
+            self._client.rewind_workflow(identity, start_step=1, queue_name=queues[identity])
+        return ordered
 
     def forget(self, part: str) -> int:
         """Delete the rows of a run or of an iteration of it that has ended. Returns how many.
@@ -111,21 +126,28 @@ class Queue:
             self._client.delete_workflows(chunk)
         return len(ids)
 
-    def _ids(self, run: str, statuses: Sequence[str], name: str | None = None) -> list[str]:
+    def _ids(self, run: str, statuses: Sequence[str]) -> list[str]:
         """Ids of a run in the given states (none: in any), the shortest first."""
-        query = f"SELECT workflow_uuid FROM {table(self.url, 'workflow_status')} WHERE {BELOW}"
-        parameters: dict[str, Any] = below(check_id(run))
-        if statuses:
-            query += " AND status IN :statuses"
-            parameters["statuses"] = list(statuses)
-        if name is not None:
-            query += " AND name = :name"
-            parameters["name"] = name
-        text = sa.text(query + " ORDER BY length(workflow_uuid), workflow_uuid")
-        if statuses:
-            text = text.bindparams(sa.bindparam("statuses", expanding=True))
+        rows = self._rows(check_id(run))
+        found = [i for i, row in rows.items() if not statuses or row["status"] in statuses]
+        return sorted(found, key=lambda i: (len(i), i))
+
+    def _rows(self, run: str) -> dict[str, dict[str, Any]]:
+        query = sa.text(
+            f"SELECT workflow_uuid, name, status, created_at, completed_at FROM {table(self.url, 'workflow_status')} "
+            f"WHERE {BELOW}"
+        )
         with self._engine.connect() as connection:
-            return [row[0] for row in connection.execute(text, parameters)]
+            return {
+                identity: {
+                    "name": name,
+                    "status": status,
+                    "created": created,
+                    "ended": ended,
+                    "iteration": found[0] if (found := _ITERATION.findall(identity)) else "",
+                }
+                for identity, name, status, created, ended in connection.execute(query, below(run))
+            }
 
     def _queues(self, ids: Sequence[str]) -> dict[str, str]:
         """The queue of each job. A dead letter's and a cancelled job's were taken from them, so they lie in the input."""
@@ -140,6 +162,17 @@ class Queue:
                 for identity, inputs in connection.execute(query, {"ids": chunk}):
                     found[identity] = json.loads(inputs)["kwargs"]["queue"]
         return found
+
+
+def _ancestors(identity: str) -> list[str]:
+    """The ids above an id, the nearest first."""
+    parts = identity.split("/")
+    return ["/".join(parts[:n]) for n in range(len(parts) - 1, 0, -1)]
+
+
+def _nearest(identity: str, rows: Mapping[str, Any]) -> str | None:
+    """The flow that a job belongs to."""
+    return next((i for i in _ancestors(identity) if i in rows), None)
 
 
 def _options(job: Job | FlowJob) -> EnqueueOptions:
