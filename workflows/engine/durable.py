@@ -17,7 +17,7 @@ from typing import Any, NoReturn
 from dbos import DBOS, DBOSConfig
 
 from registration.errors import InputError
-from workflows.children import RETRIED, Children, Outcome
+from workflows.slot import RETRIED, Slot, Outcome
 from workflows.engine.database import ENVIRONMENT, checked_url, prepare
 from workflows.engine.liveness import Liveness, Patience
 from workflows.engine.rows import APPLICATION, VERSION, JobFailed, Json
@@ -73,10 +73,10 @@ def serve(process: Process) -> NoReturn:
     migrate(url)
     liveness = Liveness(url, process.patience)
     name = liveness.join(process.names)  # before launch, which takes back what this name was doing before it died
-    children = Children(modules=process.modules) if process.steps else None
-    if children is not None:
-        children.warm()
-    _registered(process, url, children)
+    slot = Slot(modules=process.modules) if process.steps else None
+    if slot is not None:
+        slot.warm()
+    _registered(process, url, slot)
     DBOS(config=_config(url, name))
     DBOS.listen_queues(list(process.queues))
     DBOS.launch()
@@ -88,8 +88,8 @@ def serve(process: Process) -> NoReturn:
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, lambda *_: ended.set())
     ended.wait()
-    if children is not None:
-        children.kill()
+    if slot is not None:
+        slot.kill()
     print(f"{name} ends", flush=True)
     os._exit(0)
 
@@ -112,12 +112,12 @@ def _config(url: str, name: str) -> DBOSConfig:
     }
 
 
-def _registered(process: Process, url: str, children: Children | None) -> None:
+def _registered(process: Process, url: str, slot: Slot | None) -> None:
     """Make the two kinds of workflows known: `job` runs one step, `flow` is a function that makes jobs and waits."""
     roots = resolved_roots(process.roots)
 
     async def attempt(spec: Any, number: int) -> Outcome:
-        assert children is not None
+        assert slot is not None
         try:
             step, arguments = checked(spec, process.steps, roots)
             file = process.logs / f"{check_id(str(DBOS.workflow_id))}.log"
@@ -125,7 +125,7 @@ def _registered(process: Process, url: str, children: Children | None) -> None:
             return {"status": "refused", "reason": f"{error.where}: expected {error.expected}, got {error.got}"}
         if number > 1:
             log.warning("%s: attempt %d", DBOS.workflow_id, number)
-        return await children.run(step.function, arguments, log=file, hard_s=step.hard_s)
+        return await slot.run(step.function, arguments, log=file, hard_s=step.hard_s)
 
     @DBOS.workflow(name="job", max_recovery_attempts=RECOVERIES)
     async def job(spec: Any, queue: str) -> Any:

@@ -32,6 +32,7 @@ class Farm:
 
     def start(self, *names: str) -> None:
         """Names that begin with "c" are coordinators. Returns when all of them take jobs."""
+        before = {name: self.said(name).count("takes jobs") for name in names}
         for name in names:
             kind = "coordinator" if name.startswith("c") else "worker"
             with (self.folder / f"{name}.out").open("ab") as out:
@@ -43,11 +44,15 @@ class Farm:
                     stderr=out,
                 )
         for name in names:
-            self.until(lambda name=name: "takes jobs" in self.said(name) or not self.runs(name), what=f"{name} to start")
+            self.until(lambda name=name: self._started(name, before[name]) or not self.runs(name), what=f"{name} to start")
             assert self.runs(name), self.said(name)
 
+    def _started(self, name: str, before: int) -> bool:
+        return self.said(name).count("takes jobs") > before
+
     def said(self, name: str) -> str:
-        return (self.folder / f"{name}.out").read_text()
+        file = self.folder / f"{name}.out"
+        return file.read_text() if file.exists() else ""
 
     def runs(self, name: str) -> bool:
         return self.processes[name].poll() is None

@@ -10,36 +10,36 @@ from pathlib import Path
 import pytest
 
 from tests.workflows.farm.harness import ROOT, alive, children_of
-from workflows.children import Children
+from workflows.slot import Slot
 
 STEPS = "tests.workflows.farm.steps"
 
 
 @pytest.fixture(scope="module")
-def children() -> Iterator[Children]:
-    made = Children(modules=(STEPS,))
+def slot() -> Iterator[Slot]:
+    made = Slot(modules=(STEPS,))
     made.warm()
     yield made
     made.kill()
 
 
-def run(children: Children, name: str, log: Path, hard_s: float = 30.0, **arguments: object) -> dict:
-    return asyncio.run(children.run(f"{STEPS}:{name}", arguments, log=log, hard_s=hard_s))
+def run(slot: Slot, name: str, log: Path, hard_s: float = 30.0, **arguments: object) -> dict:
+    return asyncio.run(slot.run(f"{STEPS}:{name}", arguments, log=log, hard_s=hard_s))
 
 
-def test_everything_a_step_prints_lands_in_its_log(children: Children, tmp_path: Path) -> None:
+def test_everything_a_step_prints_lands_in_its_log(slot: Slot, tmp_path: Path) -> None:
     log = tmp_path / "a" / "job.log"
-    outcome = run(children, "talk", log, text="from a note")
+    outcome = run(slot, "talk", log, text="from a note")
     assert (outcome["status"], outcome["result"]) == ("done", "from a note")
     assert set(log.read_text().split("\n")) >= {"from a note", "from Python", "from C"}
     assert '"done": 1' in log.with_suffix(".jsonl").read_text()
 
 
-def test_one_warm_process_serves_all_steps(children: Children, tmp_path: Path) -> None:
-    before = children.warm()
-    run(children, "talk", tmp_path / "log", text="")
-    run(children, "fail", tmp_path / "log")
-    assert children.warm() == before
+def test_one_warm_process_serves_all_steps(slot: Slot, tmp_path: Path) -> None:
+    before = slot.warm()
+    run(slot, "talk", tmp_path / "log", text="")
+    run(slot, "fail", tmp_path / "log")
+    assert slot.warm() == before
 
 
 @pytest.mark.parametrize(
@@ -56,33 +56,33 @@ def test_one_warm_process_serves_all_steps(children: Children, tmp_path: Path) -
     ],
 )
 def test_what_goes_wrong_is_told_apart(
-    children: Children, tmp_path: Path, name: str, arguments: dict, status: str, reason: str
+    slot: Slot, tmp_path: Path, name: str, arguments: dict, status: str, reason: str
 ) -> None:
-    outcome = run(children, name, tmp_path / "log", **arguments)
+    outcome = run(slot, name, tmp_path / "log", **arguments)
     assert outcome["status"] == status
     assert reason in outcome["reason"]
     assert "secret" not in (tmp_path / "log").read_text() + outcome["reason"]
 
 
 def test_a_step_that_takes_too_long_is_killed_though_it_holds_the_interpreter(
-    children: Children, tmp_path: Path
+    slot: Slot, tmp_path: Path
 ) -> None:
     trace = tmp_path / "trace"
-    pid = children.warm()
+    pid = slot.warm()
     begun = time.monotonic()
-    outcome = run(children, "hold_gil", tmp_path / "log", hard_s=0.5, seconds=60, trace=str(trace))
+    outcome = run(slot, "hold_gil", tmp_path / "log", hard_s=0.5, seconds=60, trace=str(trace))
     assert outcome["status"] == "timed out" and time.monotonic() - begun < 30
     assert not alive(pid)
     assert trace.read_text() == "begin gil 0\n"
     assert "timed out" in (tmp_path / "log").read_text()
 
 
-def test_cancelling_kills_the_child(children: Children, tmp_path: Path) -> None:
-    pid = children.warm()
+def test_cancelling_kills_the_child(slot: Slot, tmp_path: Path) -> None:
+    pid = slot.warm()
 
     async def cancelled() -> None:
         arguments = {"store": str(tmp_path), "key": "k", "seconds": 60.0}
-        task = asyncio.create_task(children.run(f"{STEPS}:work", arguments, log=tmp_path / "log", hard_s=90))
+        task = asyncio.create_task(slot.run(f"{STEPS}:work", arguments, log=tmp_path / "log", hard_s=90))
         while not list(tmp_path.glob("k/attempt-*")):
             await asyncio.sleep(0.05)
         task.cancel()
@@ -95,21 +95,21 @@ def test_cancelling_kills_the_child(children: Children, tmp_path: Path) -> None:
     assert not alive(pid)
 
 
-def test_a_child_that_dies_between_jobs_is_replaced(children: Children, tmp_path: Path) -> None:
-    pid = children.warm()
+def test_a_child_that_dies_between_jobs_is_replaced(slot: Slot, tmp_path: Path) -> None:
+    pid = slot.warm()
     os.kill(pid, signal.SIGKILL)
     time.sleep(0.5)
-    assert run(children, "talk", tmp_path / "log", text="again")["status"] == "done"
-    assert children.warm() != pid
+    assert run(slot, "talk", tmp_path / "log", text="again")["status"] == "done"
+    assert slot.warm() != pid
 
 
 def test_a_child_dies_with_its_parent(tmp_path: Path) -> None:
     code = """
 import time
-from workflows.children import Children
+from workflows.slot import Slot
 if __name__ == "__main__":
-    children = Children()
-    print(children.warm(), flush=True)
+    slot = Slot()
+    print(slot.warm(), flush=True)
     time.sleep(60)
 """
     script = tmp_path / "parent.py"

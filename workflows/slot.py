@@ -1,4 +1,4 @@
-"""One warm child process that runs steps: it can be killed, its prints go to the job's log, and it dies with its parent.
+"""A worker's warm child process: it runs steps, can be killed, prints into the job's log, and dies with its parent.
 
 A step may crash its process, hold the interpreter's lock or never end. The process that talks to the queue must survive
 all of that, so it runs no step itself. Whatever happens becomes an outcome, a small dict:
@@ -35,7 +35,7 @@ RETRIED = ("failed", "died")  # bad input stays bad, and what ran out of time on
 _PR_SET_PDEATHSIG = 1
 
 
-class Children:
+class Slot:
     """The child process of one worker. It starts with the first `warm` or `run` and serves until it has to be killed."""
 
     def __init__(self, *, modules: tuple[str, ...] = ()) -> None:
