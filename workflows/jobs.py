@@ -62,6 +62,10 @@ class FlowJob:
         return {"flow": self.flow, "arguments": dict(self.arguments)}
 
 
+class Unusable(Exception):
+    """What a step made is no good, and trying again would not change that. The message is the reason."""
+
+
 STEPS: Mapping[str, Step] = {
     "register": Step(function="workflows.farm_steps:register_stored", places=("capture", "model", "store")),
 }

@@ -3,8 +3,8 @@
 A step may crash its process, hold the interpreter's lock or never end. The process that talks to the queue must survive
 all of that, so it runs no step itself. Whatever happens becomes an outcome, a small dict:
 
-    {"status": "done" | "bad input" | "failed" | "timed out" | "died" | "refused", "reason": str, "seconds": float,
-     "result": what the step returned, only if done}
+    {"status": "done" | "bad input" | "unusable" | "failed" | "timed out" | "died" | "refused", "reason": str,
+     "seconds": float, "result": what the step returned, only if done}
 """
 
 import asyncio
@@ -28,7 +28,7 @@ from typing import Any
 from pebble import ProcessExpired, ProcessPool
 
 from registration.errors import InputError
-from workflows.jobs import MAX_BYTES, redacted
+from workflows.jobs import MAX_BYTES, Unusable, redacted
 
 Outcome = dict[str, Any]
 RETRIED = ("failed", "died")  # bad input stays bad, and what ran out of time once would again
@@ -158,6 +158,9 @@ def _call(dotted: str, arguments: dict[str, Any], log: str) -> Outcome:
             return _outcome(
                 "bad input", f"{error.what}: {error.where}; expected {error.expected}, got {error.got}; {error.fix}"
             )
+        except Unusable as error:
+            print(error, flush=True)
+            return _outcome("unusable", str(error))
         except BaseException as error:  # also SystemExit: nothing that a step does may look like success
             print(redacted(traceback.format_exc()), flush=True)
             first, *_ = str(error).splitlines() or [""]

@@ -33,7 +33,7 @@ class Scope:
         return counts
 
     async def wait_below(self, part: str, total: int) -> dict[str, int]:
-        """Like `wait` for `total` flows and jobs that lie directly or deeper below an id: no list of ids is needed."""
+        """Like `wait` for the `total` flows and jobs that lie directly below an id: no list of ids is needed."""
         counts: dict[str, int] = await self._step("wait", _counted_below, self._url, part, total)
         return counts
 
@@ -73,7 +73,7 @@ async def _counted(url: str, ids: list[str]) -> dict[str, int]:
 
 
 async def _counted_below(url: str, part: str, total: int) -> dict[str, int]:
-    return await _polled(url, lambda reader: reader.counts(part), total)
+    return await _polled(url, lambda reader: reader.counts(part, direct=True), total)
 
 
 async def _polled(url: str, count: Any, total: int) -> dict[str, int]:
