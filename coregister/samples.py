@@ -9,6 +9,7 @@ import torch
 from jaxtyping import Float, Int
 
 from registration.errors import InputError
+from registration.geometry.rigid import align
 from registration.hashes import content_of
 from registration.model.gnm import GNM
 from registration.model.gnm_npz import GNMData, topology_hash
@@ -61,6 +62,20 @@ def unposed(registration: Registration, model: GNM) -> Float[np.ndarray, "V 3"]:
         parameters = Parameters(**take, rotations=pose.rotations, translation=pose.translation)
         vertices = model(parameters, torch.as_tensor(registration.offsets))
     return np.asarray(vertices.numpy(), np.float32)
+
+
+def onto_unposed(
+    expression: Float[np.ndarray, "V 3"],
+    neutral: Float[np.ndarray, "V 3"],
+    bare: Float[np.ndarray, "V 3"],
+    weights: Float[np.ndarray, "V"],
+) -> Float[np.ndarray, "V 3"]:
+    """A stabilized expression, in the world of its registered neutral, as the same displacement of `unposed`'s neutral.
+
+    `bare`: that neutral unposed. The displacement is turned as `weights`, of the skin on the skull, were turned.
+    """
+    turn = align(neutral[None].astype(np.float64), bare.astype(np.float64), weights[None])[0, :3, :3]
+    return np.asarray(bare + (expression.astype(np.float64) - neutral) @ turn.T, np.float32)
 
 
 def survey(

@@ -4,6 +4,7 @@ from collections.abc import Mapping
 from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -29,13 +30,14 @@ def capture(
     expression: str = "neutral",
     spanned: bool = False,
     targets: Mapping[str, float] | None = None,
+    tags: Mapping[str, Any] | None = None,
     studio: Studio | None = None,
 ) -> Path:
     """Photograph the subject that a seed draws and write a native capture folder; returns `root`.
 
     `spanned` draws from the people that the first model's identity basis is made of; otherwise subjects are asymmetric
-    and of any adult age and build, which the basis does not span. `targets` sets weights of MakeHuman targets by name.
-    One seed is one subject, with one look (the studio's own is not used), in whatever expression. Raises InputError
+    and of any adult age and build, which the basis does not span. `targets` sets weights of MakeHuman targets by name,
+    `tags` are told besides the subject's own. One seed is one subject, with one look (the studio's own is not used), in whatever expression. Raises InputError
     for unknown names, settings out of range, an existing folder, and where MakeHuman's head cannot be had.
     """
     studio = studio or Studio()
@@ -59,7 +61,7 @@ def capture(
         schemes=schemes_beside(model, len(data.template_vertex_positions)),
         subject=f"synth_{seed:04d}",
         expression=expression,
-        tags={**person.tags, "category": act.category},
+        tags={**person.tags, "category": act.category, **(tags or {})},
         studio=replace(studio, look=_look(seed, person)),
     )
 

@@ -24,3 +24,8 @@ class InputError(Exception):
             f"  got:      {self.got}\n"
             f"  fix:      {self.fix}"
         )
+
+    @property
+    def line(self) -> str:
+        """The same in one line, for tables."""
+        return f"{self.what}: {self.where}; expected {self.expected}, got {self.got}; {self.fix}"

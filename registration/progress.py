@@ -61,6 +61,19 @@ class Silent:
         pass
 
 
+class Named:
+    """For one of several: says which one it is about."""
+
+    def __init__(self, progress: Progress, name: str) -> None:
+        self._progress, self._name = progress, name
+
+    def note(self, text: str) -> None:
+        self._progress.note(f"{self._name}: {text}")
+
+    def at(self, done: int, total: int, what: str) -> None:
+        self._progress.at(done, total, f"{self._name}: {what}")
+
+
 @contextmanager
 def shown() -> Iterator[Progress]:
     """A bar on stderr if that is a terminal, else lines."""

@@ -274,11 +274,9 @@ def synth_capture(
     targets = _target_weights(target)
     from coregister.subjects import capture
     from coregister.synth import Studio
-    from registration.render.studio.shoot import Sensor
 
-    sensor = Sensor(shot_noise=0.01, read_noise=0.002, exposure_spread=0.05, colour_spread=0.03) if noise else Sensor()
     studio = Studio(
-        cameras=views, size_px=size, distortion=distortion, seed=seed, sensor=sensor, hair=hair, shirt=shirt
+        cameras=views, size_px=size, distortion=distortion, seed=seed, sensor=_sensor(noise), hair=hair, shirt=shirt
     )
     print(capture(out, seed=seed, expression=expression, spanned=spanned, targets=targets, studio=studio))
     return 0
@@ -320,6 +318,112 @@ def describe_model(
     from registration.model.info import describe
 
     describe(file, picture=out)
+    return 0
+
+
+def synth_dataset(
+    out: Positional[Annotated[Path, arg(metavar="DIR")]],
+    /,
+    subjects: Annotated[int, arg(metavar="N")],
+    expressions: Annotated[str, arg(metavar="A,B,C")] = "",
+    seed: Annotated[int, arg(metavar="S")] = 0,
+    held_out: Annotated[int, arg(metavar="N")] = 0,
+    views: Annotated[int, arg(metavar="N")] = 22,
+    size: Annotated[tuple[int, int], arg(metavar="W H")] = (480, 720),
+    distortion: bool = False,
+    noise: bool = False,
+    hair: bool = False,
+    shirt: bool = False,
+    jobs: Annotated[int, arg(metavar="N")] = 1,
+) -> int:
+    """Photograph a population of synthetic subjects: a dataset whose truth is known. Run again, it goes on.
+
+    Args:
+        out: The dataset's folder: a folder a subject, in it a capture an expression.
+        subjects: How many people; of any adult age and build, beyond what the first model spans.
+        expressions: Named expressions beside the neutral, with commas between them.
+        seed: The population: one seed is one set of people, and no two seeds share any.
+        held_out: So many of them, the last ones, are marked to be held out of models.
+        views: The number of cameras.
+        size: Width and height of the images in pixels.
+        distortion: Give the lenses distortion.
+        noise: Add sensor noise, and differences of exposure and colour between the cameras.
+        hair: Put hair on the heads, with its own label.
+        shirt: Put shirts on the shoulders, with their own label.
+        jobs: Captures that are made side by side.
+    """
+    from coregister.synth import Studio
+    from registration.progress import shown
+    from workflows.synth_dataset import Population, synth_dataset
+
+    acts = tuple(name.strip() for name in expressions.split(",") if name.strip())
+    studio = Studio(cameras=views, size_px=size, distortion=distortion, sensor=_sensor(noise), hair=hair, shirt=shirt)
+    population = Population(subjects=subjects, expressions=acts, seed=seed, held_out=held_out, studio=studio)
+    with shown() as progress:
+        synth_dataset(out, population, jobs=jobs, progress=progress)
+    print(out)
+    return 0
+
+
+def coregister(
+    dataset: Positional[Annotated[Path, arg(metavar="DATASET")]],
+    /,
+    model: Annotated[Path, arg(metavar="NPZ")],
+    out: Annotated[Path, arg(metavar="DIR")],
+    local: bool = False,
+    iterations: Annotated[int, arg(metavar="K")] = 3,
+    recipe: Literal["draft", "studio", "in_model"] = "draft",
+    held_out: Annotated[str | None, arg(metavar="SHARE|FILE")] = None,
+    seed: Annotated[int, arg(metavar="S")] = 0,
+    views: Annotated[int | None, arg(metavar="N")] = None,
+    components: Annotated[tuple[int, ...], arg(metavar="K")] = (),
+    jobs: Annotated[int, arg(metavar="N")] = 1,
+) -> int:
+    """Register a dataset, build the next model from it, measure it on people held out, and again. It can be resumed.
+
+    Args:
+        dataset: A folder of subject folders, each of capture folders.
+        model: The first head model, a GNM NPZ file with its landmark schemes beside it.
+        out: The folder to write; one that this command wrote before is gone on with.
+        local: Do everything on this machine; there is no other way yet.
+        iterations: At most so many rounds; it stops earlier when another one is not worth it.
+        recipe: As for register.
+        held_out: A share of the subjects, such as 0.2, or a file with a subject's folder name a line. Without it, those
+            whose neutral has the tag held_out, or else a fifth.
+        seed: Seed of everything random.
+        views: Use only this many views of each capture.
+        components: Numbers of identity components to measure models with; the largest decides.
+        jobs: Subjects that are registered side by side.
+    """
+    if not local:
+        raise InputError(
+            "There is no way to run this yet but on this machine",
+            where="--local",
+            expected="--local",
+            got="nothing",
+            fix="add --local",
+        )
+    from coregister.decide import Rule
+    from registration.progress import shown
+    from workflows.coregistration import PAGE, coregister
+
+    with shown() as progress:
+        state = coregister(
+            dataset,
+            model_path=model,
+            out=out,
+            recipe=recipe,
+            held_out=_share_or_file(held_out),
+            seed=seed,
+            views=views,
+            components=components or None,
+            jobs=jobs,
+            rule=Rule(rounds=iterations),
+            progress=progress,
+        )
+    for name, figures in state.generalization_mm.items():
+        print(f"{name}, {state.at} components: generalization {figures[str(state.at)]:.3f} mm")
+    print(f"{(state.verdict or {})['reason']}\n{out / PAGE}")
     return 0
 
 
@@ -394,6 +498,8 @@ COMMANDS: Mapping[str, Command | Group] = {
     "evaluate": evaluate,
     "stabilize": stabilize,
     "stabilize review": review_stabilization,
+    "coregister": coregister,
+    "dataset": ("Make whole datasets.", {"synth": synth_dataset}),
     "capture": (
         "Look at captures, make synthetic ones, spoil good ones.",
         {"check": check_capture, "synth": synth_capture, "spoil": spoil_capture},
@@ -436,6 +542,19 @@ def _choice(commands: Mapping[str, Command | Group]) -> Any:
         else:
             choices.append(Annotated[Any, subcommand(name, constructor=command)])
     return Union[tuple(choices)]  # noqa: UP007  a union of types that only exist at run time
+
+
+def _sensor(noise: bool) -> Any:
+    from registration.render.studio.shoot import Sensor
+
+    return Sensor(shot_noise=0.01, read_noise=0.002, exposure_spread=0.05, colour_spread=0.03) if noise else Sensor()
+
+
+def _share_or_file(text: str | None) -> float | Path | None:
+    try:
+        return None if text is None else float(text)
+    except ValueError:
+        return Path(str(text))
 
 
 def _target_weights(pairs: Sequence[str]) -> dict[str, float]:

@@ -26,7 +26,7 @@ _FILES = (MANIFEST, PAGE, VERTICES)
 
 
 def evaluate_models(
-    model_paths: Sequence[Path],
+    model_paths: Sequence[Path] | Mapping[str, Path],
     *,
     held_out: Path,
     out: Path,
@@ -38,13 +38,15 @@ def evaluate_models(
     """Evaluate model files on held-out subjects and write the folder `out` (docs/formats.md); returns its manifest.
 
     A folder made from the same inputs is left as it is, unless `force`. Others are compared with the first model.
+    Models are named as in the mapping, or after their files.
 
     Raises:
         InputError: as `read_held_out`, `coregister.evaluate.check` and `check_out`, before anything is computed.
     """
     settings = settings or Settings()
     check_out(out)
-    models = {name: gnm_npz.read(path) for name, path in _named(model_paths).items()}
+    named = model_paths if isinstance(model_paths, Mapping) else _named(model_paths)
+    models = {name: gnm_npz.read(path) for name, path in named.items()}
     found = read_held_out(held_out, captures)
     check(models, found.subjects, found.triangles, settings)
     inputs = {**{f"model {name}": gnm_npz.content_hash(data) for name, data in models.items()}, **found.inputs}

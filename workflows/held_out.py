@@ -19,9 +19,8 @@ from registration.evaluate.face import face_ball, seen
 from registration.hashes import content_of, hash_capture
 from registration.stabilize import folder as stabilized
 from registration.types import Registration
-from workflows.stabilize_folder import USABLE
 from workflows.stabilize_run import OUT as STABILIZED
-from workflows.subject_folder import MANIFEST
+from workflows.subject_folder import MANIFEST, USABLE
 
 TAG = "tag_"  # prefix of an NPZ file's tags
 _CATEGORY = "category"

@@ -15,7 +15,7 @@ from registration.errors import InputError
 from registration.evaluate.evaluation import evaluate
 from registration.model import gnm_npz
 from registration.model.landmarks import read_scheme
-from registration.progress import Progress, Silent
+from registration.progress import Named, Progress, Silent
 from registration.register import register
 from registration.render.backend import Variant
 from registration.stages import RECIPES
@@ -62,7 +62,7 @@ def register_subject(
     progress = progress or Silent()
     subject_dir, out, model_path = Path(subject_dir), Path(out), Path(model_path)
     landmark_files = {name: Path(file) for name, file in (landmark_files or {}).items()}
-    _check_recipe(recipe)
+    check_recipe(recipe)
     captures = read_captures(subject_dir, neutral)
     check_subject_out(out, captures)
     model = _checked_model(model_path, landmark_files)
@@ -109,19 +109,6 @@ class _Record:
         save_subject(self.subject, self.out, write_subject_page(self.subject, self._thumbnails))
 
 
-class _Named:
-    """A progress that says which capture it is about."""
-
-    def __init__(self, progress: Progress, name: str):
-        self._progress, self._name = progress, name
-
-    def note(self, text: str) -> None:
-        self._progress.note(f"{self._name}: {text}")
-
-    def at(self, done: int, total: int, what: str) -> None:
-        self._progress.at(done, total, f"{self._name}: {what}")
-
-
 @dataclass(frozen=True, kw_only=True)
 class _Neutral:
     registration: Registration
@@ -140,7 +127,7 @@ def _loop(
             reason = f"the neutral failed: {record.row(captures[0]).reason}"
             record.put(replace(row, status="skipped", reason=reason))
             continue
-        told = _Named(progress, f"{row.name} ({number} of {len(captures)})")
+        told = Named(progress, f"{row.name} ({number} of {len(captures)})")
         told.note("registering")
         row, result = _registered(row, capture, record.out / row.name, one, neutral, told)
         picture = None if result is None else _attempt(partial(thumbnail, result), told)[0]
@@ -210,22 +197,18 @@ def _attempt(action: Callable[[], T], progress: Progress) -> tuple[T | None, str
     try:
         return action(), ""
     except InputError as error:
-        return None, _line(error)
+        return None, error.line
     except Exception as error:
         progress.note(traceback.format_exc())
         first, *_ = str(error).splitlines() or [""]  # the log has it all
         return None, f"{type(error).__name__}: {first}"
 
 
-def _line(error: InputError) -> str:
-    return f"{error.what}: {error.where}; expected {error.expected}, got {error.got}; {error.fix}"
-
-
 def _waiting(captures: Captures) -> tuple[Row, ...]:
     """A row for each capture, the neutral's first; those that cannot be read are told as errors."""
     rows = [Row(name=capture.root.name, expression=capture.expression) for capture in captures.captures]
     broken = [
-        Row(name=name, expression="", status="error", reason=_line(error)) for name, error in captures.broken.items()
+        Row(name=name, expression="", status="error", reason=error.line) for name, error in captures.broken.items()
     ]
     return (*rows, *broken)
 
@@ -238,7 +221,8 @@ def _checked_model(model_path: Path, landmark_files: Mapping[str, Path]) -> str:
     return gnm_npz.content_hash(data)
 
 
-def _check_recipe(recipe: str) -> None:
+def check_recipe(recipe: str) -> None:
+    """Raises InputError for a name that no recipe has."""
     if recipe not in RECIPES:
         raise InputError(
             "There is no such recipe",

@@ -3,7 +3,7 @@
 import json
 import os
 import secrets
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from getpass import getuser
@@ -20,9 +20,7 @@ from registration.model.fetch import cache_folder, cached_path
 from registration.model.gnm_npz import GNMData
 from registration.stabilize.decisions import ACTIONS, Decision
 from registration.stabilize.meshes import SkullSkin, SubjectMeshes, subject_meshes
-from workflows.subject_folder import KIND, MANIFEST
-
-USABLE = ("converged", "stopped")
+from workflows.subject_folder import KIND, MANIFEST, USABLE
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -51,15 +49,18 @@ class Run:
             yield subject_meshes(one.subject, load_registration(one.folder / one.neutral), expressions, self.skin)
 
 
-def read_run(folder: Path, data: GNMData, *, skip_failed: bool = False) -> Run:
+def read_run(folder: Path, data: GNMData, *, skip_failed: bool = False, only: Collection[str] | None = None) -> Run:
     """The subjects in a folder of subject folders, or the one whose folder it is, in the order of their folders' names.
+
+    `only`: names of the folders that count, if not all do.
 
     Raises:
         InputError: no subject; one without a usable neutral or without expressions; two of one name; registrations that
             failed or are missing, unless `skip_failed` leaves them out; of another topology than the model; not finite.
     """
     skin, wanted = SkullSkin.of(data), gnm_npz.topology_hash(data.triangles)
-    subjects = tuple(_subject(path, skip_failed) for path in _subject_folders(folder))
+    folders = [path for path in _subject_folders(folder) if only is None or path.name in only]
+    subjects = tuple(_subject(path, skip_failed) for path in folders)
     inputs = {"model": gnm_npz.content_hash(data)}
     for one in subjects:
         for name in (one.neutral, *(name for name, _ in one.expressions)):

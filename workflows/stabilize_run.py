@@ -1,6 +1,6 @@
 """`gnmreg stabilize`: both stages over a run's registrations, subject after subject on disk."""
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -47,14 +47,16 @@ def stabilize_run(
     decisions: Path | None = None,
     settings: Stabilization | None = None,
     skip_failed: bool = False,
+    only: Collection[str] | None = None,
     force: bool = False,
     whatever_decided: bool = False,
     progress: Progress | None = None,
 ) -> Outcome:
     """Stabilize all registrations of a run and write the folder `out` (docs/formats.md), by default RUN/stabilized.
 
-    The same as `stabilize` of the registrations. A folder made from the same inputs is left as it is, unless `force`;
-    with `whatever_decided` also one that other decisions made: its components are the same.
+    The same as `stabilize` of the registrations, or of `only` the subjects in folders of these names. A folder made
+    from the same inputs is left as it is, unless `force`; with `whatever_decided` also one that other decisions made:
+    its components are the same.
 
     Raises:
         InputError: as `read_run`, `read_decisions`, `check_out`; fewer than two expressions. Nothing is written then.
@@ -63,7 +65,7 @@ def stabilize_run(
     out = Path(run) / OUT if out is None else Path(out)
     data = gnm_npz.read(model_path)
     head = Head.of(data)
-    found = read_run(run, data, skip_failed=skip_failed)
+    found = read_run(run, data, skip_failed=skip_failed, only=only)
     disk.check_out(out)
     _check_count(found, run)
     dataset = input_hash(found.inputs, plain(settings))

@@ -18,6 +18,7 @@ KIND = "gnm-subject"
 MANIFEST, PAGE = "subject.json", "index.html"
 NEUTRAL = "neutral"  # the expression of a neutral's capture.toml
 
+USABLE = ("converged", "stopped")  # statuses
 # "waiting": not reached yet. "error": no registration could be made. "skipped": not tried, for the neutral failed.
 RowStatus = Literal["waiting", "converged", "stopped", "failed", "error", "skipped"]
 
@@ -51,7 +52,7 @@ class Row:
 
     @property
     def usable(self) -> bool:
-        return self.status in ("converged", "stopped")
+        return self.status in USABLE
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -120,6 +121,29 @@ def check_subject_out(out: Path, captures: Captures) -> None:
         check_out(place)
     for name in captures.names:
         check_out(place / name)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Usable:
+    """What of a subject's folder can be used."""
+
+    subject: str
+    neutral: str  # name of its registration's folder
+    expressions: Mapping[str, str]  # of the others that can be used -> what was performed
+
+
+def read_usable(folder: Path) -> Usable | None:
+    """The usable registrations that `subject.json` tells of; None without it, or if the neutral is not among them."""
+    try:
+        told = json.loads((Path(folder) / MANIFEST).read_text("utf-8"))
+        rows = {str(row["name"]): row for row in told["captures"] if row["status"] in USABLE}
+        subject, neutral = str(told["subject"]), str(told["neutral"])
+    except (OSError, ValueError, KeyError, TypeError):
+        return None
+    if neutral not in rows:
+        return None
+    expressions = {name: str(row["expression"]) for name, row in rows.items() if name != neutral}
+    return Usable(subject=subject, neutral=neutral, expressions=expressions)
 
 
 def save_subject(subject: Subject, out: Path, page: str) -> None:
