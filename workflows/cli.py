@@ -14,6 +14,7 @@ import tyro
 from tyro.conf import Positional, arg, subcommand
 
 from registration.errors import InputError
+from workflows import farm_cli
 
 CaptureFolder = Positional[Annotated[Path, arg(metavar="CAPTURE")]]
 RegistrationFolder = Positional[Annotated[Path, arg(metavar="REG")]]
@@ -508,6 +509,7 @@ COMMANDS: Mapping[str, Command | Group] = {
         "Look at head models, measure them, make the first one, get the official one.",
         {"info": describe_model, "evaluate": evaluate_model, "bootstrap": bootstrap_model, "fetch": fetch_model},
     ),
+    **farm_cli.COMMANDS,
 }
 
 

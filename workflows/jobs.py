@@ -17,7 +17,7 @@ from registration.errors import InputError
 
 GPU, SUBJECTS, DRIVER, REBUILD = "gpu", "subjects", "driver", "rebuild"  # the queues
 NEUTRAL_PRIORITY, EXPRESSION_PRIORITY, STABILIZE_PRIORITY = 5, 10, 3  # the lowest number goes first
-MAX_BYTES = 64 * 1024  # of a job's arguments, and of a step's result, as JSON: arrays travel as files
+MAX_BYTES = 512 * 1024  # of a job's arguments, and of a step's result, as JSON: arrays travel as files
 
 _ID = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,99}(/[A-Za-z0-9][A-Za-z0-9._-]{0,99}){0,7}")
 _SCHEMES = ("", "file", "s3")
@@ -67,7 +67,14 @@ class Unusable(Exception):
 
 
 STEPS: Mapping[str, Step] = {
-    "register": Step(function="workflows.farm_steps:register_stored", places=("capture", "model", "store")),
+    "register stored": Step(function="workflows.farm_steps:register_stored", places=("capture", "model", "store")),
+    "register": Step(function="workflows.farm_steps:register_capture", places=("capture", "model", "out", "neutral")),
+    "collect": Step(function="workflows.steps:register_subject", places=("subject_dir", "model", "out")),
+    "hold out": Step(function="workflows.steps:hold_out", places=("dataset", "registrations", "model", "out")),
+    "stabilize": Step(function="workflows.steps:stabilize", places=("run", "model", "out")),
+    "build": Step(function="workflows.steps:build", places=("run", "steady", "dataset", "previous", "out")),
+    "evaluate": Step(function="workflows.steps:evaluate", places=("models", "people", "out")),
+    "end round": Step(function="workflows.farm_steps:end_round", places=("plan",)),
 }
 
 
@@ -94,6 +101,7 @@ def checked(spec: Any, steps: Mapping[str, Step], roots: Sequence[str]) -> tuple
         raise _refused(name, expected=f"arguments of at most {MAX_BYTES} bytes", got=f"{size} bytes")
     for key in steps[name].places:
         value = arguments.get(key)
+        value = list(value.values()) if isinstance(value, dict) else value
         for place in value if isinstance(value, list) else [value]:
             if place is not None:
                 check_place(place, roots, where=f"{name}: {key}")

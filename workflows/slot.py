@@ -155,9 +155,7 @@ def _call(dotted: str, arguments: dict[str, Any], log: str) -> Outcome:
             return _done(function(**arguments))
         except InputError as error:
             print(error, flush=True)
-            return _outcome(
-                "bad input", f"{error.what}: {error.where}; expected {error.expected}, got {error.got}; {error.fix}"
-            )
+            return _outcome("bad input", error.line)
         except Unusable as error:
             print(error, flush=True)
             return _outcome("unusable", str(error))

@@ -79,7 +79,15 @@ class Queue:
             gone += len(ids)
         return gone
 
-    def retry(self, run: str, *, cancelled: bool = False) -> list[str]:
+    def again(self, ids: Sequence[str]) -> list[str]:
+        """Let flows that have ended begin anew, in place. Returns those that had."""
+        ended = [i for i in ids for row in [self._rows(i).get(i)] if row is not None and row["status"] not in ACTIVE]
+        queues = self._queues(ended)
+        for identity in ended:
+            self._client.rewind_workflow(identity, start_step=1, queue_name=queues[identity])
+        return ended
+
+    def retry(self, run: str, *, failed: bool = True, cancelled: bool = False) -> list[str]:
         """Put what failed in a run into its queue again, in place, and what followed from it. Returns the ids.
 
         What followed: the flows above a failed job, from their beginning, and those of their jobs that were put in after
@@ -89,10 +97,10 @@ class Queue:
         rows = self._rows(check_id(run))
         iterations = [row["iteration"] for row in rows.values() if row["iteration"]]
         last = max(iterations, default="")
-        wanted = (*FAILED, "CANCELLED") if cancelled else FAILED
-        failed = {i: r for i, r in rows.items() if r["status"] in wanted and r["iteration"] in ("", last)}
-        chosen = set(failed)
-        for identity, row in failed.items():
+        wanted = (*(FAILED if failed else ()), *(("CANCELLED",) if cancelled else ()))
+        found = {i: r for i, r in rows.items() if r["status"] in wanted and r["iteration"] in ("", last)}
+        chosen = set(found)
+        for identity, row in found.items():
             above = [i for i in _ancestors(identity) if i in rows]
             chosen |= {i for i in above if rows[i]["status"] not in ACTIVE}
             chosen |= {

@@ -1,14 +1,16 @@
 """What a flow may do. Everything here is durable: a flow that is started again walks past what is done already."""
 
 import asyncio
+import json
 import random
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 from dbos import DBOS
 
 from workflows.engine.control import CHUNK, Queue
-from workflows.engine.reads import DONE, Reader, Row, ended
+from workflows.engine.reads import CANCELLED, DONE, FAILED, Reader, Row, ended
 from workflows.engine.rows import JobFailed
 from workflows.jobs import FlowJob, Job
 
@@ -43,6 +45,15 @@ class Scope:
         await self.wait(jobs)
         results: dict[str, Any] = await self._step("results", _results, self._url, [job.id for job in jobs])
         return results
+
+    async def failures(self, jobs: Sequence[Job | FlowJob]) -> dict[str, str]:
+        """Why those of the jobs that failed, or were cancelled, did: id -> reason."""
+        reasons: dict[str, str] = await self._step("failures", _failures, self._url, [job.id for job in jobs])
+        return reasons
+
+    async def read(self, file: str) -> Any:
+        """A JSON file, as it is now and for the rest of this flow's life."""
+        return await self._step("read", _read, file)
 
     async def tell(self, key: str, value: Any) -> None:
         """Leave a small value under a key for whoever watches."""
@@ -89,15 +100,29 @@ async def _polled(url: str, count: Any, total: int) -> dict[str, int]:
 
 
 async def _results(url: str, ids: list[str]) -> dict[str, Any]:
-    def read() -> dict[str, Row]:
-        reader = Reader(url)
-        try:
-            return reader.rows(ids)
-        finally:
-            reader.close()
-
-    rows = await asyncio.to_thread(read)
+    rows = await asyncio.to_thread(_rows, url, ids)
     return {identity: _value(row) for identity, row in rows.items() if row.state == DONE}
+
+
+async def _failures(url: str, ids: list[str]) -> dict[str, str]:
+    rows = await asyncio.to_thread(_rows, url, ids)
+    return {
+        identity: f"{row.failure['status']}: {row.failure['reason']}" if row.failure else row.state
+        for identity, row in rows.items()
+        if row.state in (FAILED, CANCELLED)
+    }
+
+
+async def _read(file: str) -> Any:
+    return json.loads(await asyncio.to_thread(Path(file).read_text, "utf-8"))
+
+
+def _rows(url: str, ids: list[str]) -> dict[str, Row]:
+    reader = Reader(url)
+    try:
+        return reader.rows(ids)
+    finally:
+        reader.close()
 
 
 def _value(row: Row) -> Any:

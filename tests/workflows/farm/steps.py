@@ -53,7 +53,7 @@ def return_an_object() -> object:
 
 
 def return_much() -> str:
-    return "x" * 100_000
+    return "x" * 1_000_000
 
 
 def crash(trace: str | None = None) -> None:

@@ -49,7 +49,7 @@ def test_one_warm_process_serves_all_steps(slot: Slot, tmp_path: Path) -> None:
         ("fail", {}, "failed", "ValueError: as asked, at postgresql://me:***@host/db"),
         ("leave", {}, "failed", "SystemExit: 0"),
         ("return_an_object", {}, "failed", "the step's result is not JSON"),
-        ("return_much", {}, "failed", "more than 65536"),
+        ("return_much", {}, "failed", "more than 524288"),
         ("talk", {"word": 1}, "bad input", "the step cannot be called so"),
         ("nothing", {}, "bad input", "the step cannot be called so"),
         ("crash", {}, "died", "was killed by SIGSEGV"),
