@@ -19,9 +19,7 @@ class Batch:
     roots: tuple[str, ...]  # below which all its places lie
 
 
-def batch_jobs(
-    captures: Sequence[str], *, model: str, out: str, run: str | None = None, **settings: Any
-) -> Batch:
+def batch_jobs(captures: Sequence[str], *, model: str, out: str, run: str | None = None, **settings: Any) -> Batch:
     """Jobs for captures: folders, URLs, or @FILE with one a line. Local ones are checked to be captures.
 
     Raises:
@@ -68,7 +66,8 @@ def _listed(word: str) -> list[str]:
     try:
         return [line.strip() for line in file.read_text("utf-8").splitlines() if line.strip()]
     except (OSError, UnicodeDecodeError) as error:
-        raise _wrong("The list of captures cannot be read", where=file, expected="a path or URL a line", got=error) from None
+        expected = "a path or URL a line"
+        raise _wrong("The list of captures cannot be read", where=file, expected=expected, got=error) from None
 
 
 def _names(places: Sequence[str]) -> Mapping[str, str]:

@@ -6,7 +6,7 @@ Like `cli.py`: nothing heavy is imported but inside the commands.
 import os
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
@@ -152,9 +152,7 @@ def batch(
     return 0 if counts.get("done", 0) == sum(counts.values()) else 1
 
 
-def status(
-    folder: Folder = Path("."), db: Database = None, run: RunName = None, watch: bool = False
-) -> int:
+def status(folder: Folder = Path("."), db: Database = None, run: RunName = None, watch: bool = False) -> int:
     """Tell how far the queue is: counts, throughput, what failed and why, who works.
 
     Args:
@@ -290,7 +288,7 @@ def retire_store(
     return 0
 
 
-COMMANDS = {
+COMMANDS: Mapping[str, Callable[..., int] | tuple[str, Mapping[str, Callable[..., int]]]] = {
     "batch": batch,
     "worker": worker,
     "coordinator": coordinator,
@@ -310,7 +308,8 @@ def _lines(figures: "Figures") -> list[str]:
     flows = ", ".join(f"{figures.flows[state]} {state}" for state in sorted(figures.flows)) or "none"
     lines = [f"jobs: {total} ({counts})", f"flows: {sum(figures.flows.values())} ({flows})"]
     share = 100 * figures.a_day / A_DAY
-    lines.append(f"done at a rate of {figures.a_day:,.0f} a day, {share:.0f} % of {A_DAY:,}; {figures.ended_last_hour} ended in the last hour")
+    rate = f"done at a rate of {figures.a_day:,.0f} a day, {share:.0f} % of {A_DAY:,}"
+    lines.append(f"{rate}; {figures.ended_last_hour} ended in the last hour")
     lines += [f"{name}: {count} running" for name, count in sorted(figures.workers.items())]
     if figures.failures:
         lines.append("failed:")

@@ -37,7 +37,7 @@ class LocalFarm:
 def run_until_done(farm: LocalFarm, run: str, progress: Progress) -> dict[str, int]:
     """Start the farm, wait until a run's driver has ended, end the farm. Returns state -> jobs of the run.
 
-    Whatever ends this function, Ctrl-C and kill -9 among it, ends the processes. What was not done is done by the next call.
+    Whatever ends this function, Ctrl-C and kill -9 among it, ends the processes. What is left is done by the next call.
 
     Raises:
         InputError: a process refused to start.

@@ -168,7 +168,7 @@ def end_round(
 
 def _rows(subject: Path) -> dict[str, Any]:
     try:
-        rows: dict[str, Any] = json.loads((subject / "subject.json").read_text("utf-8"))["captures"]
+        rows: list[dict[str, Any]] = json.loads((subject / "subject.json").read_text("utf-8"))["captures"]
     except (OSError, ValueError, KeyError):
         return {"all": {"status": "error", "reason": "its jobs failed", "usable": False}}
     usable = ("converged", "stopped")

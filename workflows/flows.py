@@ -176,7 +176,7 @@ async def _one(scope: "Scope", part: str, step: str, **arguments: Any) -> dict[s
 
 
 def _named(identity: str, arguments: Mapping[str, Any]) -> str:
-    """An id of these very arguments: a retried run may come here with others, and an id that is there is left as it is."""
+    """An id of these very arguments: a retried run may come here with others, and what is there is left as it is."""
     digest = hashlib.sha256(json.dumps(arguments, sort_keys=True).encode()).hexdigest()
     return f"{identity}-{digest[:8]}"
 
@@ -185,4 +185,4 @@ def _without(values: Mapping[str, Any], name: str) -> dict[str, Any]:
     return {key: value for key, value in values.items() if key != name}
 
 
-FLOWS = {"batch": batch, "subject": subject, "coregister": coregister}
+FLOWS: Mapping[str, Any] = {"batch": batch, "subject": subject, "coregister": coregister}

@@ -102,5 +102,5 @@ def _is_scheme(path: str) -> bool:
 
 def _unusable(place: str, *, expected: Any, got: Any) -> InputError:
     return InputError(
-        "The input cannot be fetched", where=redacted(place), expected=expected, got=got, fix="check the URL and its files"
+        "The input cannot be fetched", where=redacted(place), expected=expected, got=got, fix="check the URL's files"
     )

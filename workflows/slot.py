@@ -36,7 +36,7 @@ _PR_SET_PDEATHSIG = 1
 
 
 class Slot:
-    """The child process of one worker. It starts with the first `warm` or `run` and serves until it has to be killed."""
+    """The child process of one worker. It starts with the first `warm` or `run` and serves until it must be killed."""
 
     def __init__(self, *, modules: tuple[str, ...] = ()) -> None:
         """`modules` are imported when a child starts, not when its first job does."""
@@ -192,14 +192,20 @@ def _how(exitcode: int) -> str:
 def _printing_to(log: str) -> Iterator[None]:
     """Point the file descriptors of stdout and stderr at the log, so that what C++ prints lands there too."""
     flush = ctypes.CDLL(None).fflush
-    sys.stdout.flush(), sys.stderr.flush(), flush(None)
+
+    def turn(out: int, err: int) -> None:
+        sys.stdout.flush()
+        sys.stderr.flush()
+        flush(None)
+        os.dup2(out, 1)
+        os.dup2(err, 2)
+
     kept = os.dup(1), os.dup(2)
     target = os.open(log, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o644)
-    os.dup2(target, 1), os.dup2(target, 2)
-    os.close(target)
+    turn(target, target)
     try:
         yield
     finally:
-        sys.stdout.flush(), sys.stderr.flush(), flush(None)
-        os.dup2(kept[0], 1), os.dup2(kept[1], 2)
-        os.close(kept[0]), os.close(kept[1])
+        turn(*kept)
+        for descriptor in (target, *kept):
+            os.close(descriptor)

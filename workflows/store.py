@@ -324,7 +324,7 @@ def _parsed(content: bytes, *, where: str, key: str) -> Artifact:
             input_hash=str(value["input_hash"]),
             content_id=str(value["content_id"]),
             attempt=str(value["attempt"]),
-            files={str(name): {"sha256": str(f["sha256"]), "bytes": int(f["bytes"])} for name, f in value["files"].items()},
+            files={str(n): {"sha256": str(f["sha256"]), "bytes": int(f["bytes"])} for n, f in value["files"].items()},
             about=dict(value["about"]),
         )
     except (KeyError, TypeError, ValueError, AttributeError) as error:

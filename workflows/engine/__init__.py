@@ -1,1 +1,1 @@
-"""The durable queue: the one room that imports dbos. docs/operations.md tells how it is run, docs/adr/0005 why it is so."""
+"""The durable queue: the one room that imports dbos. How it is run: docs/operations.md; why so: docs/adr."""

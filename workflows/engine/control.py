@@ -90,9 +90,9 @@ class Queue:
     def retry(self, run: str, *, failed: bool = True, cancelled: bool = False) -> list[str]:
         """Put what failed in a run into its queue again, in place, and what followed from it. Returns the ids.
 
-        What followed: the flows above a failed job, from their beginning, and those of their jobs that were put in after
-        it ended, the stabilization after an expression for one. What has the same input as before returns at once. Of
-        a run with iterations the last one is retried only: the others' models are superseded.
+        What followed: the flows above a failed job, from their beginning, and those of their jobs that were put in
+        after it ended, a subject's record after an expression for one. What has the same input as before returns at
+        once. Of a run with iterations the last one is retried only: the others' models are superseded.
         """
         rows = self._rows(check_id(run))
         iterations = [row["iteration"] for row in rows.values() if row["iteration"]]
@@ -106,7 +106,9 @@ class Queue:
             chosen |= {
                 i
                 for i, r in rows.items()
-                if r["name"] == "job" and r["status"] == "SUCCESS" and r["created"] >= (row["ended"] or 0)
+                if r["name"] == "job"
+                and r["status"] == "SUCCESS"
+                and r["created"] >= (row["ended"] or 0)
                 and _nearest(i, rows) in above
             }
         ordered = sorted(chosen, key=lambda i: (-i.count("/"), i))  # jobs before the flows that wait for them
@@ -158,7 +160,7 @@ class Queue:
             }
 
     def _queues(self, ids: Sequence[str]) -> dict[str, str]:
-        """The queue of each job. A dead letter's and a cancelled job's were taken from them, so they lie in the input."""
+        """The queue of each job, as its input says: from dead letters and cancelled jobs it was taken."""
         found = {}
         query = sa.text(
             f"SELECT w.workflow_uuid, coalesce(i.inputs, w.inputs) FROM {table(self.url, 'workflow_status')} w "

@@ -17,12 +17,12 @@ from typing import Any, NoReturn
 from dbos import DBOS, DBOSConfig
 
 from registration.errors import InputError
-from workflows.slot import RETRIED, Slot, Outcome
 from workflows.engine.database import ENVIRONMENT, checked_url, prepare
 from workflows.engine.liveness import Liveness, Patience
 from workflows.engine.rows import APPLICATION, VERSION, JobFailed, Json
 from workflows.engine.scope import Scope
 from workflows.jobs import DRIVER, GPU, REBUILD, SUBJECTS, Step, check_id, checked, redacted, resolved_roots
+from workflows.slot import RETRIED, Outcome, Slot
 
 log = logging.getLogger("gnmreg")
 

@@ -22,6 +22,7 @@ STATES = {
     "MAX_RECOVERY_ATTEMPTS_EXCEEDED": FAILED,
     "CANCELLED": CANCELLED,
 }
+_FAILED = "('ERROR', 'MAX_RECOVERY_ATTEMPTS_EXCEEDED')"
 DEAD = "killed its worker every time"
 
 
@@ -100,13 +101,16 @@ class Reader:
 
     def failed(self, run: str, limit: int = 1000) -> list[Row]:
         """The jobs and flows of a run that failed, the oldest first."""
-        where = f"{BELOW.replace('workflow_uuid', 'w.workflow_uuid')} AND w.status IN ('ERROR', 'MAX_RECOVERY_ATTEMPTS_EXCEEDED')"
-        query = f"{self._select(where)} ORDER BY w.created_at LIMIT {int(limit)}"
+        among = BELOW.replace("workflow_uuid", "w.workflow_uuid")
+        query = self._select(f"{among} AND w.status IN {_FAILED} ORDER BY w.created_at LIMIT {int(limit)}")
         return [_row(row) for row in self._rows(query, below(check_id(run)))]
 
     def runs(self) -> list[str]:
         """Ids of the drivers, the newest first."""
-        query = f"SELECT workflow_uuid FROM {self._status} WHERE name = 'flow' AND workflow_uuid NOT LIKE '%/%' ORDER BY created_at DESC"
+        query = (
+            f"SELECT workflow_uuid FROM {self._status} WHERE name = 'flow' AND workflow_uuid NOT LIKE '%/%' "
+            "ORDER BY created_at DESC"
+        )
         return [row[0] for row in self._rows(query, {})]
 
     def figures(self, run: str | None = None) -> Figures:
@@ -122,8 +126,9 @@ class Reader:
             {**parameters, "since": int(now_ms - 3600 * 1000)},
         )
         last = self._rows(
-            f"SELECT count(*), min(completed_at) FROM (SELECT completed_at FROM {self._status} WHERE {among}name = 'job' "
-            "AND status = 'SUCCESS' AND completed_at IS NOT NULL ORDER BY completed_at DESC LIMIT 1000) AS last",
+            "SELECT count(*), min(completed_at) FROM ("
+            f"SELECT completed_at FROM {self._status} WHERE {among}name = 'job' AND status = 'SUCCESS' "
+            "AND completed_at IS NOT NULL ORDER BY completed_at DESC LIMIT 1000) AS last",
             parameters,
         )
         workers = self._rows(
@@ -146,7 +151,7 @@ class Reader:
         rows = self._rows(
             f"SELECT coalesce(o.error, w.error), count(*) FROM {self._status} w "
             f"LEFT JOIN {self._output} o ON o.workflow_uuid = w.workflow_uuid "
-            f"WHERE {among}w.name = 'job' AND w.status IN ('ERROR', 'MAX_RECOVERY_ATTEMPTS_EXCEEDED') "
+            f"WHERE {among}w.name = 'job' AND w.status IN {_FAILED} "
             "GROUP BY coalesce(o.error, w.error)",
             parameters,
         )

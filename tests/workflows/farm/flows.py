@@ -23,9 +23,7 @@ async def graph(scope: Scope, *, subjects: int, expressions: int, folder: str, s
 
 async def subject(scope: Scope, *, expressions: int, folder: str, seconds: float) -> dict[str, Any]:
     await scope.do([_work(f"{scope.id}/neutral", folder, seconds, priority=NEUTRAL_PRIORITY)])
-    jobs = [
-        _work(f"{scope.id}/e{n:02d}", folder, seconds, priority=EXPRESSION_PRIORITY) for n in range(expressions)
-    ]
+    jobs = [_work(f"{scope.id}/e{n:02d}", folder, seconds, priority=EXPRESSION_PRIORITY) for n in range(expressions)]
     done = await scope.do(jobs)
     await scope.do([_work(f"{scope.id}/stab", folder, seconds, priority=STABILIZE_PRIORITY)])
     return {"expressions": len(done)}

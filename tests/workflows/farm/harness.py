@@ -44,7 +44,7 @@ class Farm:
                     stderr=out,
                 )
         for name in names:
-            self.until(lambda name=name: self._started(name, before[name]) or not self.runs(name), what=f"{name} to start")
+            self.until(lambda n=name: self._started(n, before[n]) or not self.runs(n), what=f"{name} to start")
             assert self.runs(name), self.said(name)
 
     def _started(self, name: str, before: int) -> bool:
@@ -75,9 +75,7 @@ class Farm:
     def ends(self, *identities: str, within_s: float = 60.0) -> None:
         """Wait until these jobs have ended."""
         over = ("done", "failed", "cancelled")
-        self.until(
-            lambda: all(self.job(i)["state"] in over for i in identities), within_s, what=f"{identities} to end"
-        )
+        self.until(lambda: all(self.job(i)["state"] in over for i in identities), within_s, what=f"{identities} to end")
 
     def until(self, condition: Callable[[], bool], within_s: float = 60.0, what: str = "it") -> float:
         begun = time.monotonic()
@@ -125,5 +123,3 @@ def children_of(pid: int) -> list[int]:
     for task in Path(f"/proc/{pid}/task").iterdir():
         found += [int(child) for child in (task / "children").read_text().split()]
     return found
-
-

@@ -5,6 +5,7 @@ import pwd
 import shutil
 import socket
 import subprocess
+import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -24,15 +25,13 @@ class Server:
     """One server on a free port of this machine."""
 
     def __init__(self, folder: Path) -> None:
+        """`folder` is to be readable by all: what pytest makes is not."""
         found = programs()
         assert found is not None
         self._programs, self._data = found, folder / "data"
         self._user = next((u for u in USERS if _exists(u)), None) if os.getuid() == 0 else None
         folder.mkdir(parents=True, exist_ok=True)
         if self._user:
-            for path in (folder, *folder.parents):  # pytest's folders let nobody else in
-                if path.stat().st_uid == os.getuid() and path.is_relative_to("/tmp") and path != Path("/tmp"):
-                    path.chmod(0o755)
             shutil.chown(folder, self._user)
         with socket.socket() as free:
             free.bind(("127.0.0.1", 0))
@@ -61,12 +60,14 @@ class Server:
 
 
 @contextmanager
-def server(folder: Path) -> Iterator[Server]:
-    made = Server(folder)
-    try:
-        yield made
-    finally:
-        made.stop()
+def server() -> Iterator[Server]:
+    with tempfile.TemporaryDirectory(prefix="gnmreg-postgres-") as name:
+        Path(name).chmod(0o755)
+        made = Server(Path(name) / "server")
+        try:
+            yield made
+        finally:
+            made.stop()
 
 
 def _exists(user: str) -> bool:

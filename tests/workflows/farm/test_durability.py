@@ -24,10 +24,10 @@ RESULTS = Path(os.environ.get("GNMREG_DURABILITY", "build/durability.txt"))
 
 
 @pytest.fixture(scope="session")
-def postgres(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
+def postgres() -> Iterator[Server]:
     if programs() is None:
         pytest.fail("no PostgreSQL here: sudo apt-get install -y postgresql")
-    with server(tmp_path_factory.mktemp("postgres") / "server") as made:
+    with server() as made:
         yield made
 
 
@@ -118,8 +118,10 @@ def test_a_frozen_worker_whose_connection_broke_is_fenced(made: Farm) -> None:
     frozen = executor(made, "run/a")
     made.signal(frozen, signal.SIGSTOP)
     with engine(checked_url(made.url)).connect() as connection:
-        connection.execute(sa.text("SELECT pg_terminate_backend(pid) FROM pg_locks WHERE locktype = 'advisory' "
-                                   "AND objid = :key"), {"key": _key(frozen)})
+        connection.execute(
+            sa.text("SELECT pg_terminate_backend(pid) FROM pg_locks WHERE locktype = 'advisory' AND objid = :key"),
+            {"key": _key(frozen)},
+        )
     begun(made, "run/a", 2)
     made.signal(frozen, signal.SIGCONT)
     made.ends("run/a")

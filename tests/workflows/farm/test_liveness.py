@@ -79,7 +79,9 @@ def test_sqlite_gets_its_write_ahead_log_and_readers_cannot_write(tmp_path: Path
         connection.exec_driver_sql("CREATE TABLE x (y)")
 
 
-@pytest.mark.parametrize("url", ["", "queue.sqlite", "mysql://h/d", "sqlite://", "sqlite:///:memory:", "postgresql://h"])
+@pytest.mark.parametrize(
+    "url", ["", "queue.sqlite", "mysql://h/d", "sqlite://", "sqlite:///:memory:", "postgresql://h"]
+)
 def test_urls_that_are_none_of_ours_are_refused(url: str) -> None:
     with pytest.raises(InputError):
         checked_url(url)
@@ -97,5 +99,3 @@ def test_a_server_that_does_not_answer_is_told_without_its_password() -> None:
         prepare(checked_url(url))
     assert "secret" not in str(refused.value) + redacted_url(url)
     assert refused.value.__cause__ is None
-
-

@@ -64,9 +64,7 @@ def test_what_goes_wrong_is_told_apart(
     assert "secret" not in (tmp_path / "log").read_text() + outcome["reason"]
 
 
-def test_a_step_that_takes_too_long_is_killed_though_it_holds_the_interpreter(
-    slot: Slot, tmp_path: Path
-) -> None:
+def test_a_step_that_takes_too_long_is_killed_though_it_holds_the_interpreter(slot: Slot, tmp_path: Path) -> None:
     trace = tmp_path / "trace"
     pid = slot.warm()
     begun = time.monotonic()
