@@ -14,9 +14,6 @@ from registration.render.shading import GROUPS, MASK, Surface
 _SAMPLED = 1 << 12  # values of a tensor tell how large it is
 _UNIT = 2.0**-22  # of a sum, in the largest adjoint sampled (per metre): integers below count such units
 _MOST = 2.0**42  # units of one lane: a million such lanes still fit
-# That threads may hold to sum apart. With copies of 256 MB (textures of 2048 px) kernels were seen to reach for memory
-# that was gone; sums are the same without copies, only slower.
-_COPIES_BYTES = 1 << 27
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -91,9 +88,8 @@ class RowSum:
         number = mi.Float if unit is None else mi.Int64
         self._packet = mi.ArrayXf if unit is None else dr.int64_array_t(mi.ArrayXf)
         self.total = dr.zeros(number, columns * rows)
-        copies = dr.thread_count() * columns * rows * dr.itemsize_v(number)
-        apart = "llvm" in mi.variant() and copies < _COPIES_BYTES
-        self._mode = dr.ReduceMode.Expand if apart else dr.ReduceMode.Auto
+        # On the CPU every thread sums apart.
+        self._mode = dr.ReduceMode.Expand if "llvm" in mi.variant() else dr.ReduceMode.Auto
 
     def add(self, row: mi.UInt32, value: Iterable[mi.Float]) -> None:
         """Up to eight numbers, if there are so many columns; those of three or four go to the first columns."""

@@ -7,6 +7,7 @@ import gc
 from dataclasses import replace
 from pathlib import Path
 
+import mitsuba as mi
 import numpy as np
 import pytest
 import torch
@@ -20,6 +21,7 @@ from registration.model.atlas import texture_atlas
 from registration.model.regions import vertex_classes
 from registration.render import backend
 from registration.render.renderer import Renderer
+from registration.render.shading import Footprint
 from registration.types import Camera, Pixels, Rendered
 
 TINY = gnm_npz.read(Path(__file__).resolve().parents[1] / "fixtures" / "tiny_gnm.npz")
@@ -253,6 +255,15 @@ def test_unwrap_reuses_what_was_just_drawn_and_nothing_else():
     older.mask.sum().backward()
     again = renderer.unwrap(vertices, values, weights, pixels, 32)
     torch.testing.assert_close(again, fresh, atol=1e-4, rtol=1e-4)
+
+
+def test_a_place_that_is_no_number_reads_the_texture_and_nothing_else():
+    """Barycentrics of rays that miss are anything; a texel far outside the texture would end the process."""
+    size = 7
+    for u, v in ((np.nan, 0.5), (0.5, np.nan), (np.inf, -np.inf), (1e30, -1e30)):
+        footprint = Footprint.of(mi.Point2f(mi.Float([u, 0.3]), mi.Float([v, 0.3])), size)
+        for texel, _ in footprint.texels():
+            assert (np.array(texel) < size**2).all()
 
 
 def test_another_forward_between_forward_and_backward():
