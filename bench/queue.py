@@ -53,7 +53,7 @@ def _measure(url: str, folder: Path, captures: int, seconds: float) -> None:
     begun = time.perf_counter()
     queue.put(jobs)
     took = time.perf_counter() - begun
-    queue.put([FlowJob(id="bench", flow="batch", arguments={"total": captures}, queue=DRIVER)])
+    queue.put([FlowJob(id="bench", flow="batch", queue=DRIVER)])
     _row("enqueue", f"{captures / took:.0f} jobs/s ({captures:,} in {took:.1f} s)")
     full = _size_mb(url)
     _row("database", f"{(full - empty) * 10_000 / captures:.1f} MB per 10,000 jobs that wait")

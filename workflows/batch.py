@@ -51,7 +51,7 @@ def put_batch(url: str, batch: Batch) -> int:
     queue = Queue(url)
     try:
         count = queue.put(batch.jobs)
-        driver = FlowJob(id=batch.run, flow="batch", arguments={"total": count}, queue=DRIVER)
+        driver = FlowJob(id=batch.run, flow="batch", queue=DRIVER)
         queue.put([driver])
         queue.again([batch.run])  # it waits for what is new, if it had ended
     finally:
@@ -71,15 +71,18 @@ def _listed(word: str) -> list[str]:
 
 
 def _names(places: Sequence[str]) -> Mapping[str, str]:
-    """Key -> place: as many of a place's last folders as it takes to tell all apart."""
+    """Key -> place. A key is a place's last two folders, whatever else is in the batch: the same again is no new job."""
     for place in places:
         if not is_remote(place) and not (local_path(place) / "capture.toml").is_file():
             raise _wrong("A capture cannot be found", where=place, expected="a folder with capture.toml", got="none")
-    for depth in range(1, 5):
-        names = {"/".join(PurePosixPath(place).parts[-depth:]): place for place in places}
-        if len(names) == len(places):
-            return names
-    raise _wrong("Two captures are the same", where="CAPTURE", expected="each once", got=f"{len(places)} places")
+    names: dict[str, str] = {}
+    for place in places:
+        key = "/".join(PurePosixPath(place).parts[-2:])
+        if key in names:
+            expected = "captures that differ in the names of their last two folders"
+            raise _wrong("Two captures cannot be told apart", where=place, expected=expected, got=names[key])
+        names[key] = place
+    return names
 
 
 def _absolute(place: str) -> str:

@@ -25,9 +25,9 @@ if TYPE_CHECKING:
 FIRST = "model 0"
 
 
-async def batch(scope: "Scope", *, total: int) -> dict[str, int]:
+async def batch(scope: "Scope") -> dict[str, int]:
     """Wait for the jobs of a batch, which lie in the queue already. Returns state -> how many."""
-    return await scope.wait_below(scope.id, total)
+    return await scope.wait_below(scope.id)
 
 
 async def subject(

@@ -138,6 +138,8 @@ def _born(parent: int, modules: tuple[str, ...]) -> None:
         os._exit(1)
     for module in modules:
         importlib.import_module(module)
+    # Whatever libraries put there since: die at once, without a word, even while the interpreter's lock is held.
+    signal.signal(signal.SIGTERM, signal.SIG_DFL)
 
 
 def _call(dotted: str, arguments: dict[str, Any], log: str) -> Outcome:

@@ -10,7 +10,7 @@ import sqlalchemy as sa
 from dbos import DBOSClient, EnqueueOptions
 
 from registration.errors import InputError
-from workflows.engine.database import BELOW, below, checked_url, engine, redacted_url, table
+from workflows.engine.database import BELOW, below, checked_url, engine, require_queue, table
 from workflows.engine.rows import APPLICATION, VERSION, Json
 from workflows.jobs import MAX_BYTES, FlowJob, Job, check_id
 
@@ -26,20 +26,8 @@ class Queue:
     def __init__(self, url: str) -> None:
         """Raises InputError if there is no queue at the URL: `migrate` makes one."""
         self.url = checked_url(url)
+        require_queue(self.url)
         self._engine = engine(self.url)
-        try:
-            with self._engine.connect() as connection:
-                connection.execute(sa.text(f"SELECT 1 FROM {table(self.url, 'workflow_status')} LIMIT 1"))
-        except sa.exc.SQLAlchemyError as error:
-            self._engine.dispose()
-            first, *_ = str(getattr(error, "orig", error)).splitlines() or [""]
-            raise InputError(
-                "There is no queue",
-                where=redacted_url(self.url),
-                expected="a database that `gnmreg migrate` prepared",
-                got=first,
-                fix="check the URL, or run `gnmreg migrate`",
-            ) from None
         self._client = DBOSClient(
             system_database_engine=self._engine,
             serializer=Json(),

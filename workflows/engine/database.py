@@ -89,6 +89,30 @@ def prepare(url: str) -> None:
         ) from None
 
 
+def require_queue(url: str) -> None:
+    """Make sure that there is a queue at the URL. Raises InputError if there is none, or it cannot be reached."""
+    got = ""
+    if is_sqlite(url) and not Path(str(sa.make_url(url).database)).is_file():
+        got = "no such file"  # connecting would make it
+    else:
+        made = engine(url, read_only=True)
+        try:
+            with made.connect() as connection:
+                connection.execute(sa.text(f"SELECT 1 FROM {table(url, 'workflow_status')} LIMIT 1"))
+        except sa.exc.SQLAlchemyError as error:
+            got, *_ = str(getattr(error, "orig", error)).splitlines() or ["nothing"]
+        finally:
+            made.dispose()
+    if got:
+        raise InputError(
+            "There is no queue",
+            where=redacted_url(url),
+            expected="a database that `gnmreg migrate` prepared",
+            got=got,
+            fix="check the URL, or run `gnmreg migrate`",
+        )
+
+
 def engine(url: str, *, read_only: bool = False) -> sa.Engine:
     """Our own connections, one at a time; with `read_only` the database itself refuses to write."""
     if not is_sqlite(url):

@@ -8,7 +8,7 @@ from typing import Any
 
 import sqlalchemy as sa
 
-from workflows.engine.database import BELOW, below, checked_url, engine, table
+from workflows.engine.database import BELOW, below, checked_url, engine, require_queue, table
 from workflows.jobs import check_id
 
 DAY_S = 24 * 3600.0
@@ -57,7 +57,9 @@ class Reader:
     """Read-only questions to the queue's database."""
 
     def __init__(self, url: str) -> None:
+        """Raises InputError if there is no queue at the URL."""
         self.url = checked_url(url)
+        require_queue(self.url)
         self._engine = engine(self.url, read_only=True)
         self._status, self._output, self._input = (
             table(self.url, name) for name in ("workflow_status", "workflow_output", "workflow_input")

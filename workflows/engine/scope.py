@@ -3,7 +3,8 @@
 import asyncio
 import json
 import random
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -34,9 +35,9 @@ class Scope:
         counts: dict[str, int] = await self._step("wait", _counted, self._url, [job.id for job in jobs])
         return counts
 
-    async def wait_below(self, part: str, total: int) -> dict[str, int]:
-        """Like `wait` for the `total` flows and jobs that lie directly below an id: no list of ids is needed."""
-        counts: dict[str, int] = await self._step("wait", _counted_below, self._url, part, total)
+    async def wait_below(self, part: str) -> dict[str, int]:
+        """Like `wait` for whatever lies in the queue directly below an id: no list of ids is needed."""
+        counts: dict[str, int] = await self._step("wait", _counted_below, self._url, part)
         return counts
 
     async def do(self, jobs: Sequence[Job | FlowJob]) -> dict[str, Any]:
@@ -80,19 +81,22 @@ async def _put(url: str, jobs: list[Job | FlowJob]) -> int:
 
 
 async def _counted(url: str, ids: list[str]) -> dict[str, int]:
-    return await _polled(url, lambda reader: reader.counts_of(ids), len(ids))
+    return await _polled(url, lambda reader: reader.counts_of(ids), lambda counts: ended(counts) >= len(ids))
 
 
-async def _counted_below(url: str, part: str, total: int) -> dict[str, int]:
-    return await _polled(url, lambda reader: reader.counts(part, direct=True), total)
+async def _counted_below(url: str, part: str) -> dict[str, int]:
+    count = partial(Reader.counts, run=part, direct=True)
+    return await _polled(url, count, lambda counts: ended(counts) == sum(counts.values()))
 
 
-async def _polled(url: str, count: Any, total: int) -> dict[str, int]:
+async def _polled(
+    url: str, count: Callable[[Reader], dict[str, int]], over: Callable[[dict[str, int]], bool]
+) -> dict[str, int]:
     reader = Reader(url)
     try:
         while True:
             counts: dict[str, int] = await asyncio.to_thread(count, reader)
-            if ended(counts) >= total:
+            if over(counts):
                 return counts
             await asyncio.sleep(LOOK_S * random.uniform(0.8, 1.2))
     finally:
