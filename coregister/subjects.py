@@ -36,9 +36,10 @@ def capture(
     """Photograph the subject that a seed draws and write a native capture folder; returns `root`.
 
     `spanned` draws from the people that the first model's identity basis is made of; otherwise subjects are asymmetric
-    and of any adult age and build, which the basis does not span. `targets` sets weights of MakeHuman targets by name,
-    `tags` are told besides the subject's own. One seed is one subject, with one look (the studio's own is not used), in whatever expression. Raises InputError
-    for unknown names, settings out of range, an existing folder, and where MakeHuman's head cannot be had.
+    and of any adult age and build, which the basis does not span. `targets` sets weights of MakeHuman targets by name;
+    `tags` are told besides the subject's own. One seed is one subject, with one look (the studio's own is not used), in
+    whatever expression. Raises InputError for unknown names, settings out of range, an existing folder, and where
+    MakeHuman's head cannot be had.
     """
     studio = studio or Studio()
     check(root, studio)

@@ -17,8 +17,10 @@ from registration.report.style import CSS, SCRIPT
 
 SIGMAS = 2.0
 IDENTITY, EXPRESSION = 4, 2  # components drawn, of the head and of each region
+SIDES, SIZE = ("front", "subject's left"), (300, 325)  # of each picture; px
 _CSS = """
 .pair { display: grid; grid-template-columns: 1fr 1fr; gap: 16px; margin-bottom: 16px; }
+.pair .sides { grid-template-columns: 1fr 1fr; }
 h3 { margin: 0 0 10px; font-size: 15.5px; } .panel + .panel { margin-top: 16px; } td.kind { color: var(--soft); }
 """
 
@@ -88,7 +90,7 @@ def _expressions(data: GNMData) -> dict[str, np.ndarray]:
 
 
 def _drawn(data: GNMData, components: Mapping[str, np.ndarray]) -> str:
-    """Each at both ends, from three sides, coloured by how far vertices move; one scale for all."""
+    """Each at both ends, coloured by how far vertices move; one scale for all."""
     if not components:
         return ""
     skin = regions.exterior(data)
@@ -107,7 +109,7 @@ def _drawn(data: GNMData, components: Mapping[str, np.ndarray]) -> str:
             told = escape(f"{name}, {sign}{SIGMAS:g}")
             sides = "".join(
                 f'<figure><img class="zoom" loading="lazy" alt="{told}, {side}" src="{data_uri(picture)}"></figure>'
-                for side, picture in heat_pictures(heat, limit)
+                for side, picture in heat_pictures(heat, limit, sides=SIDES, size=SIZE)
             )
             ends.append(f'<div class="panel"><h3>{told}</h3><div class="sides">{sides}</div></div>')
         panels.append(f'<div class="pair">{"".join(ends)}</div>')

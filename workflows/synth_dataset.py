@@ -1,7 +1,7 @@
 """`gnmreg dataset synth`: a population of synthetic subjects as a dataset; one seed is one population."""
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any

@@ -1,5 +1,7 @@
 """Distances drawn on the mesh, softly shaded, from three sides."""
 
+from collections.abc import Sequence
+
 import cv2
 import numpy as np
 import torch
@@ -28,14 +30,19 @@ def scale_limit_mm(distance_mm: Float[np.ndarray, "V"]) -> float:
     return next((limit for limit in LIMITS_MM if limit >= wanted), LIMITS_MM[-1])
 
 
-def heat_pictures(heat: HeatMap, limit_mm: float) -> list[tuple[str, Picture]]:
-    """(side, picture) for three sides of the head."""
+def heat_pictures(
+    heat: HeatMap, limit_mm: float, *, sides: Sequence[str] = tuple(SIDES), size: tuple[int, int] = SIZE
+) -> list[tuple[str, Picture]]:
+    """(side, picture of this width and height, px) for three sides of the head, or some of them."""
     head = transform_points(heat.T_head_world, heat.vertices.astype(np.float64))
     head -= (head.min(0) + head.max(0)) / 2
-    return [(side, _picture(heat, head, camera, limit_mm)) for side, camera in _cameras(head).items()]
+    cameras = _cameras(head, size)
+    return [(side, _picture(heat, head, cameras[side], limit_mm, size)) for side in sides]
 
 
-def _picture(heat: HeatMap, head: Float[np.ndarray, "V 3"], camera: Camera, limit_mm: float) -> Picture:
+def _picture(
+    heat: HeatMap, head: Float[np.ndarray, "V 3"], camera: Camera, limit_mm: float, size: tuple[int, int]
+) -> Picture:
     face, barycentric = rasterize(head, heat.triangles, camera)
     shown = face >= 0
     corners = heat.triangles[face[shown]]
@@ -48,7 +55,7 @@ def _picture(heat: HeatMap, head: Float[np.ndarray, "V 3"], camera: Camera, limi
     picture = np.empty((*face.shape, 3))
     picture[:] = PAPER
     picture[shown] = albedo * _shading(normal @ camera.T_cam_world[:3, :3].T)[:, None]
-    small = cv2.resize(picture.astype(np.float32), SIZE, interpolation=cv2.INTER_AREA)
+    small = cv2.resize(picture.astype(np.float32), size, interpolation=cv2.INTER_AREA)
     return np.clip(small + 0.5, 0, 255).astype(np.uint8)
 
 
@@ -59,9 +66,9 @@ def _shading(normal: Float[np.ndarray, "P 3"]) -> Float[np.ndarray, "P"]:
     return 0.50 + 0.42 * np.clip(normal @ key, 0, 1) + 0.16 * np.clip(normal @ fill, 0, 1)
 
 
-def _cameras(head: Float[np.ndarray, "V 3"]) -> dict[str, Camera]:
+def _cameras(head: Float[np.ndarray, "V 3"], size_px: tuple[int, int]) -> dict[str, Camera]:
     """One camera a side, looking at the origin; all of one focal length, at which the head fills the pictures."""
-    size = np.array(SIZE) * _OVERSAMPLING
+    size = np.array(size_px) * _OVERSAMPLING
     poses = {side: _pose(np.radians(yaw)) for side, yaw in SIDES.items()}
     tangents = {side: _tangents(pose, head) for side, pose in poses.items()}
     focal = _FILLED * min((size / np.ptp(tangent, axis=0)).min() for tangent in tangents.values())

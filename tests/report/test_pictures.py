@@ -211,5 +211,5 @@ def test_report_views_of_targets_and_a_rendering():
 def test_heat_cameras_see_the_mesh_they_are_fitted_to():
     head = np.asarray(trimesh.creation.icosphere(subdivisions=2, radius=0.1).vertices)
     triangles = np.asarray(trimesh.creation.icosphere(subdivisions=2, radius=0.1).faces)
-    for camera in heat._cameras(head).values():
+    for camera in heat._cameras(head, heat.SIZE).values():
         assert 0.4 < (rasterize(head, triangles, camera)[0] >= 0).mean() < 0.9

@@ -1,0 +1,117 @@
+"""Two rounds of coregistration from the first model: what registrations teach a model about people it has not seen.
+
+    python bench/coregistration.py [--out DIR] [--training 40] [--held-out 10] [--rounds 2] [--jobs 2]
+
+A synthetic population of any adult age and build, neutrals only, 8 views of 256 x 256 (`gnmreg dataset synth`), goes
+through the loop of `gnmreg coregister`. Held-out people are measured on their true meshes: mean vertex distance on the
+head's skin, in mm, with the same number of identity components for every model (coregister/generalization.py).
+Specificity: of 100 random heads. `gain`: by which share of model 0's error the last model is nearer, with 20
+components. `negative_control`: the same gain of a model that is built from random heads of model 0 itself, as many as
+there are subjects: what a build alone does. Run again with the same --out it goes on where it was interrupted.
+"""
+
+import argparse
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+
+if not __package__:  # run as a file: the packages lie beside `bench`
+    sys.path[0] = str(Path(__file__).resolve().parents[1])
+
+from coregister import bootstrap  # noqa: E402
+from coregister.build import build  # noqa: E402
+from coregister.decide import Rule  # noqa: E402
+from coregister.generalization import fit, identity_part  # noqa: E402
+from coregister.samples import NEUTRAL, Mesh, Subject  # noqa: E402
+from coregister.synth import Studio  # noqa: E402
+from registration.model import gnm_npz  # noqa: E402
+from registration.model.gnm_npz import GNMData  # noqa: E402
+from registration.progress import shown  # noqa: E402
+from workflows import steps  # noqa: E402
+from workflows.coregistration import FIRST, coregister  # noqa: E402
+from workflows.held_out import read_held_out  # noqa: E402
+from workflows.synth_dataset import Population, synth_dataset  # noqa: E402
+
+COMPONENTS = (10, 20, 40)
+AT = "20"  # what counts
+SAMPLES = 100
+STUDIO = Studio(cameras=8, size_px=(256, 256), texture_size=1024)
+ALWAYS_ON = {"gain": -1e9, "drift_mm": 1e9, "failures": 1.0}  # a bench wants all rounds
+
+
+def own_samples(data: GNMData, count: int, seed: int) -> list[Subject]:
+    """Random heads of a model, coefficients of unit variance, seen everywhere."""
+    drawn = np.random.default_rng(seed).standard_normal((count, len(data.vertex_identity_basis)))
+    heads = data.template_vertex_positions + np.tensordot(drawn, data.vertex_identity_basis, 1)
+    sure = np.ones(len(data.template_vertex_positions), np.float32)
+    subjects = []
+    for number, head in enumerate(heads.astype(np.float32)):
+        mesh = Mesh(name=NEUTRAL, label=NEUTRAL, vertices=head, confidence=sure, triangles=data.triangles)
+        subjects.append(Subject(name=f"sample_{number:03d}", neutral=mesh))
+    return subjects
+
+
+def generalization_mm(data: GNMData, people: Path) -> dict[str, float]:
+    """Number of components -> mean over the people."""
+    part = identity_part(data)
+    counts = [k for k in COMPONENTS if k <= len(part.basis)]
+    found = [fit(part, one.neutral[part.rows], counts) for one in read_held_out(people).subjects]
+    means = np.array([[one.distance_mm.mean() for one in fits] for fits in found]).mean(0)
+    return dict(zip(map(str, counts), means.tolist(), strict=True))
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--out", type=Path, default=Path("build/bench_coregistration"))
+    parser.add_argument("--training", type=int, default=40)
+    parser.add_argument("--held-out", type=int, default=10)
+    parser.add_argument("--rounds", type=int, default=2)
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--jobs", type=int, default=2)
+    parser.add_argument("--recipe", default="draft")
+    options = parser.parse_args()
+    count = options.training + options.held_out
+    first = bootstrap.bootstrap(options.out / "first" / "gnm_head_first.npz")
+    people = Population(subjects=count, seed=options.seed, held_out=options.held_out, studio=STUDIO)
+    begun = time.perf_counter()
+    with shown() as progress:
+        synth_dataset(options.out / "dataset", people, jobs=options.jobs, progress=progress)
+        captured = time.perf_counter()
+        state = coregister(
+            options.out / "dataset",
+            model_path=first,
+            out=options.out / "rounds",
+            recipe=options.recipe,
+            seed=options.seed,
+            components=COMPONENTS,
+            samples=SAMPLES,
+            jobs=options.jobs,
+            rule=Rule(rounds=options.rounds, **ALWAYS_ON),
+            progress=progress,
+        )
+    print(f"captures {count} seconds {captured - begun:.0f}; rounds {time.perf_counter() - captured:.0f}")
+    held_out = options.out / "rounds" / "held_out" / steps.PEOPLE
+    figures = {name: generalization_mm(gnm_npz.read(Path(file)), held_out) for name, file in state.models.items()}
+    data = gnm_npz.read(first)
+    control = build(own_samples(data, options.training, options.seed), data, steps.builder()).data
+    figures["control"] = generalization_mm(control, held_out)
+    print("model      " + "".join(f"{k:>9} mm" for k in COMPONENTS) + "   specificity")
+    for name, row in figures.items():
+        cells = "".join(f"{row[str(k)]:12.3f}" if str(k) in row else f"{'–':>12}" for k in COMPONENTS)
+        random = state.specificity_mm.get(name, {}).get(AT)
+        print(f"{name:11}{cells}" + (f"{random:14.3f}" if random is not None else ""))
+    for one in state.rounds:
+        print(f"{one['name']} {one['decide']} rejected {[r['name'] for r in one['build']['rejected']]}")
+    names = list(state.models)
+    for number, name in enumerate(names):
+        print(f"specificity {number} {state.specificity_mm[name].get(AT, float('nan')):.3f}")
+    print(f"negative_control {1 - figures['control'].get(AT, np.nan) / figures[FIRST][AT]:.3f}")
+    for number, name in enumerate(names):
+        print(f"generalization_mm {number} {figures[name].get(AT, float('nan')):.3f}")
+    print(f"gain {1 - figures[names[-1]].get(AT, np.nan) / figures[FIRST][AT]:.3f}")
+
+
+if __name__ == "__main__":
+    main()

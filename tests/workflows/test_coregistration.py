@@ -1,0 +1,305 @@
+"""Round after round on disk. The registrations are stand-ins, but for the slow test; all else is real."""
+
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import workflows.coregistration
+import workflows.coregistration_page
+import workflows.evaluate_models
+import workflows.local
+import workflows.stabilize_run
+from coregister.decide import Rule
+from registration.errors import InputError
+from registration.model import gnm_npz
+from tests.workflows.conftest import Notes, change
+from tests.workflows.rounds import ACTS, MODEL, Finds, beside, head, world, write_people, write_person
+from workflows import model_page, steps
+from workflows.cli import main
+from workflows.coregistration import State, coregister
+from workflows.dataset import read_dataset, split
+from workflows.model_subjects import Registered
+
+TWICE = Rule(rounds=2, gain=-10.0, drift_mm=1e3, failures=1.0)
+
+
+@pytest.fixture
+def finds(monkeypatch) -> Finds:
+    """Registrations that find the truth, in this process; and no pictures, which other tests look at."""
+    found = Finds()
+    monkeypatch.setattr(workflows.local, "register", found)
+    monkeypatch.setattr(workflows.local, "thumbnail", lambda registration: None)
+    monkeypatch.setattr(workflows.coregistration, "in_children", beside)
+    monkeypatch.setattr(workflows.evaluate_models, "write_evaluate_page", lambda *a: "<html></html>")
+    monkeypatch.setattr(workflows.stabilize_run, "write_stabilize_page", lambda *a: "<html></html>")
+    monkeypatch.setattr(workflows.coregistration_page, "number_curves", lambda *a: "<svg></svg>")
+    monkeypatch.setattr(model_page, "number_curves", lambda *a: "<svg></svg>")
+    monkeypatch.setattr(model_page, "heat_pictures", lambda *a, **k: [])
+    return found
+
+
+@pytest.fixture
+def dataset(capture: Path, tmp_path: Path) -> Path:
+    """Three subjects to build from and two that are held out, each with a smile."""
+    return write_people(capture, tmp_path / "dataset", 5)
+
+
+def go(dataset: Path, out: Path, **options) -> State:
+    settings = dict(model_path=MODEL, rule=TWICE, components=(2,), samples=2)
+    return coregister(dataset, out=out, **{**settings, **options})
+
+
+def told(out: Path) -> dict:
+    return json.loads((out / "coregistration.json").read_text())
+
+
+def written(out: Path) -> dict[Path, int]:
+    """When each product was written."""
+    names = ("manifest.json", "gnm_head.npz", "registration.npz", "people.npz", "step.json")
+    return {path: path.stat().st_mtime_ns for name in names for path in out.rglob(name)}
+
+
+def test_two_rounds_without_those_who_are_held_out(dataset, finds, tmp_path):
+    out, progress = tmp_path / "out", Notes()
+    state = go(dataset, out, progress=progress)
+    assert [path.relative_to(out).parts[:2] for path in finds.made] == 6 * [("it00", "registrations")] + 6 * [
+        ("it01", "registrations")
+    ]
+    assert {path.name for path in out.iterdir()} == {"coregistration.json", "index.html", "held_out", "it00", "it01"}
+    assert {path.name for path in (out / "it00").iterdir()} == {"registrations", "model", "evaluation"}
+    assert {path.name for path in (out / "it00" / "model").iterdir()} == {
+        *("gnm_head.npz", "gnm_head.manifest.json", "gnm_head.expressions.npz", "head_sparse_68.txt"),
+        *("index.html", "step.json"),
+    }
+    record = told(out)
+    assert record["verdict"] == {"go_on": False, "reason": "all 2 rounds done"}
+    assert list(record["models"]) == list(record["generalization_mm"]) == ["model 0", "model 1", "model 2"]
+    assert record["sources"] == {"p3": "true meshes", "p4": "true meshes"} and record["at"] == 2
+    first, last = (json.loads((out / f"it0{k}/model/gnm_head.manifest.json").read_text()) for k in range(2))
+    assert first["inputs"]["previous"] == gnm_npz.content_hash(gnm_npz.read(MODEL))
+    assert last["inputs"]["previous"] == first["content_id"]  # round n + 1 starts from model n
+    for manifest in (first, last):  # held-out subjects enter no model
+        assert [one["subject"] for one in manifest["subjects"]] == ["p0", "p1", "p2"]
+        assert not any(name.startswith(("p3", "p4")) for name in manifest["inputs"])
+        assert not {"held_out", "category"} & set(manifest["demographics"])
+    assert {path.parts[-2] for path in finds.made} == {"p0", "p1", "p2"}
+    one = json.loads((out / "it01/registrations/p0/subject.json").read_text())
+    assert one["model"] == first["content_id"]
+    page = (out / "index.html").read_text()
+    for text in ("it00/model/index.html", "it01/evaluation/index.html", "true meshes", "all 2 rounds done"):
+        assert text in page
+    assert any(note.startswith("it01: p2: smile") for note in progress.notes)
+    assert state.rounds[0]["decide"]["registered"] == 6 and state.rounds[0]["decide"]["failed"] == 0
+
+
+@pytest.mark.parametrize("where", ["registering", "building", "evaluating"])
+def test_a_killed_loop_goes_on_without_computing_anything_twice(dataset, finds, tmp_path, monkeypatch, where):
+    out, built = tmp_path / "out", []
+    real, evaluated = steps.build_model, steps.evaluate_models
+
+    def build(*arguments):
+        built.append(1)
+        if where == "building" and len(built) == 2:
+            raise KeyboardInterrupt
+        return real(*arguments)
+
+    def evaluate(*arguments, **options):
+        if where == "evaluating" and len(built) == 2 and not stopped:
+            stopped.append(1)
+            raise KeyboardInterrupt
+        return evaluated(*arguments, **options)
+
+    stopped: list[int] = []
+    monkeypatch.setattr(steps, "build_model", build)
+    monkeypatch.setattr(steps, "evaluate_models", evaluate)
+    if where == "registering":
+        finds.outcomes["p1/smile"] = KeyboardInterrupt()
+    with pytest.raises(KeyboardInterrupt):
+        go(dataset, out)
+    assert told(out)["kind"] == "gnm-coregistration" and not list(out.rglob("*.tmp"))
+    before, made = written(out), len(finds.made)
+    assert before and made
+    finds.outcomes.clear()
+    go(dataset, out)
+    after = written(out)
+    assert {path: after[path] for path in before} == before
+    assert len(finds.made) == 12 == len(set(finds.made))
+    whole = go(dataset, tmp_path / "whole")
+    for number, one in enumerate(whole.rounds):
+        again = told(out)["rounds"][number]
+        assert again["build"]["content_id"] == one["build"]["content_id"]
+        assert again["evaluate"]["generalization_mm"] == one["evaluate"]["generalization_mm"]
+    count = len(built)
+    last = written(out)
+    go(dataset, out)
+    assert len(built) == count and written(out) == last
+
+
+def test_one_failing_capture_does_not_stop_the_rest(dataset, finds, tmp_path):
+    finds.outcomes = {"p0/smile": RuntimeError("out of luck"), "p1/neutral": ValueError("odd")}
+    write_person(dataset / "p0" / "neutral", dataset / "p5", 5)
+    state = go(dataset, tmp_path / "out", rule=Rule(rounds=1))
+    assert len(finds.made) == 5  # p0's neutral, and both of p2 and p5
+    manifest = json.loads((tmp_path / "out/it00/model/gnm_head.manifest.json").read_text())
+    assert [one["subject"] for one in manifest["subjects"]] == ["p0", "p2", "p5"]
+    assert state.rounds[0]["decide"]["failed"] == 3 and state.rounds[0]["decide"]["registered"] == 5
+    assert state.verdict is not None and "too many failures: 38 %" in state.verdict["reason"]
+    page = (tmp_path / "out/index.html").read_text()
+    assert "out of luck" in page and "p1, neutral" in page
+
+
+def test_a_spoiled_registration_is_named(capture, finds, tmp_path):
+    dataset = write_people(capture, tmp_path / "dataset", 9, acts=())
+    rough = np.random.default_rng(0).normal(0, 8e-3, (1163, 3))
+    finds.outcomes["p2/neutral"] = lambda vertices: vertices + rough
+    state = go(dataset, tmp_path / "out", rule=Rule(rounds=1))
+    (rejected,) = state.rounds[0]["build"]["rejected"]
+    assert rejected["name"] == "p2" and state.rounds[0]["decide"]["failed"] == 1
+    for page in ("it00/model/index.html", "index.html"):
+        text = (tmp_path / "out" / page).read_text()
+        assert "p2" in text and rejected["reason"].split(" mm")[0] in text
+
+
+def test_neutrals_alone_will_do_and_bare_captures_are_measured_by_registrations(capture, finds, tmp_path):
+    dataset = write_people(capture, tmp_path / "dataset", 5, acts=())
+    (dataset / "p4" / "neutral" / "ground_truth.npz").unlink()
+    finds.outcomes["p4/neutral"] = lambda vertices: vertices
+    real = finds.__class__.__call__
+    np.savez(tmp_path / "truth.npz", vertices=head(gnm_npz.read(MODEL), 4))
+
+    def with_truth(self, capture_path, **options):
+        if "p4" in capture_path.parts:
+            shutil.copy(tmp_path / "truth.npz", capture_path / "ground_truth.npz")
+        try:
+            return real(self, capture_path, **options)
+        finally:
+            if "p4" in capture_path.parts:
+                (capture_path / "ground_truth.npz").unlink()
+
+    finds.__class__ = type("Bare", (Finds,), {"__call__": with_truth})
+    state = go(dataset, tmp_path / "out", rule=Rule(rounds=1))
+    assert state.sources == {"p3": "true meshes", "p4": "registrations"}
+    assert state.rounds[0]["stabilize"]["out"] is None
+    manifest = json.loads((tmp_path / "out/it00/model/gnm_head.manifest.json").read_text())
+    assert "previous" in manifest["expression"]
+
+
+def test_expressions_reach_the_builder_in_the_neutrals_own_frame(dataset, finds, tmp_path):
+    """Captures turn heads at will; the builder gets the displacement on the unposed neutral, and its confidence."""
+    run, data = tmp_path / "run", gnm_npz.read(MODEL)
+    for name in ("p0", "p1"):
+        steps.register_subject(subject_dir=str(dataset / name), model=str(MODEL), out=str(run / name))
+    still = steps.stabilize(run=str(run), names=["p0", "p1"], model=str(MODEL), out=str(run / "stabilized"))
+    subjects = list(Registered(run=run, names=["p0", "p1"], model=data, steady=Path(still["out"])))
+    assert [subject.name for subject in subjects] == ["p0", "p1"]
+    for seed, subject in enumerate(subjects):
+        assert subject.neutral is not None
+        np.testing.assert_allclose(subject.neutral.vertices, head(data, seed), atol=1e-6)
+        (smile,) = subject.expressions
+        moved = 1e3 * (smile.vertices - subject.neutral.vertices - data.expression_basis[ACTS["smile"]])
+        assert np.sqrt((moved**2).sum(1).mean()) < 0.3  # what stabilization makes of a tiny skull
+        assert (smile.label, smile.confidence[0]) == ("smile", 0.5)
+        turn, _ = world(seed, "neutral")
+        assert np.abs(turn - np.eye(3)).max() > 0.02
+
+
+def twice(dataset: Path) -> None:
+    shutil.copytree(dataset / "p0", dataset / "p9")
+
+
+def without_neutral(dataset: Path) -> None:
+    shutil.rmtree(dataset / "p1" / "neutral")
+
+
+def another_label(dataset: Path) -> None:
+    record = {"kind": "gnm-dataset", "schema": 1, "complete": True, "categories": {"jaw": "jaw"}}
+    (dataset / "dataset.json").write_text(json.dumps(record))
+
+
+def incomplete(dataset: Path) -> None:
+    record = {"kind": "gnm-dataset", "schema": 1, "complete": False, "categories": {"smile": "flexing"}}
+    (dataset / "dataset.json").write_text(json.dumps(record))
+
+
+def empty(dataset: Path) -> None:
+    shutil.rmtree(dataset)
+    dataset.mkdir()
+
+
+def all_tagged(dataset: Path) -> None:
+    for name in ("p0", "p1"):
+        change(dataset / name / "neutral", "age", "held_out = true\nage")
+
+
+@pytest.mark.parametrize(
+    ("spoil", "what"),
+    [
+        (empty, "no subjects"),
+        (without_neutral, "no neutral"),
+        (twice, "same subject"),
+        (another_label, "label is unknown"),
+        (incomplete, "not all there"),
+        (all_tagged, "too few subjects to build a model from"),
+    ],
+)
+def test_datasets_that_cannot_be_used_are_refused(dataset, finds, tmp_path, spoil, what):
+    spoil(dataset)
+    with pytest.raises(InputError) as error:
+        go(dataset, tmp_path / "out")
+    assert what in error.value.what and not finds.made and not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(
+    ("options", "what"),
+    [
+        ({"components": (2, 60)}, "too few subjects for so many components"),
+        ({"components": (4, 2)}, "out of order"),
+        ({"recipe": "magic"}, "no such recipe"),
+        ({"held_out": 1.5}, "share to hold out"),
+        ({"held_out": 0.9}, "too few subjects to build"),
+        ({"held_out": Path("nobody.txt")}, "cannot be read"),
+        ({"jobs": 0}, "number of jobs"),
+        ({"rule": Rule(rounds=0)}, "no round"),
+        ({"model_path": Path("none.npz")}, ""),
+    ],
+)
+def test_settings_that_cannot_be_used_are_refused(dataset, finds, tmp_path, options, what):
+    with pytest.raises(InputError) as error:
+        go(dataset, tmp_path / "out", **options)
+    assert what in error.value.what and not finds.made and not (tmp_path / "out").exists()
+
+
+def test_a_foreign_folder_is_refused(dataset, finds, tmp_path):
+    (tmp_path / "notes.txt").write_text("mine")
+    with pytest.raises(InputError, match="cannot be used"):
+        go(dataset, tmp_path)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["dataset", "notes.txt"]
+
+
+def test_who_is_held_out(dataset, tmp_path):
+    found = read_dataset(dataset)
+    assert split(found).held_out == ("p3", "p4") and split(found).how == "by the tag held_out"
+    (tmp_path / "list.txt").write_text("p1\n\np0\n")
+    assert split(found, tmp_path / "list.txt").held_out == ("p0", "p1")
+    one, two = (split(found, 0.4, seed) for seed in (0, 1))
+    assert split(found, 0.4, 0) == one and len(one.held_out) == len(two.held_out) == 2
+    assert set(one.training) | set(one.held_out) == set(found.subjects)
+    assert len({split(found, 0.4, seed).held_out for seed in range(6)}) > 1
+    (tmp_path / "list.txt").write_text("p1\nnobody\n")
+    with pytest.raises(InputError, match="no such subject"):
+        split(found, tmp_path / "list.txt")
+
+
+def test_the_command(dataset, finds, tmp_path, capsys, monkeypatch):
+    monkeypatch.setitem(coregister.__kwdefaults__, "samples", 2)
+    out = tmp_path / "out"
+    arguments = ["coregister", str(dataset), "--model", str(MODEL), "--out", str(out), "--components", "2"]
+    assert main(arguments) == 2
+    assert "--local" in capsys.readouterr().err and not out.exists()
+    assert main([*arguments, "--local", "--iterations", "1", "--held-out", "0.4"]) == 0
+    shown = capsys.readouterr().out
+    assert "model 1, 2 components: generalization" in shown and str(out / "index.html") in shown
+    assert told(out)["plan"]["split"]["how"] == "a share of 0.4 by seed 0"
