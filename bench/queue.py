@@ -2,7 +2,7 @@
 
     python -m bench.queue [--captures 20000] [--db URL] [--seconds 60]
 
-Workers run for some seconds only: with one job at a time a worker is bound by its asking the queue, four times a second.
+Workers run for some seconds only: with one job at a time they are bound by their asking the queue, four times a second.
 """
 
 import argparse

@@ -71,7 +71,7 @@ def _listed(word: str) -> list[str]:
 
 
 def _names(places: Sequence[str]) -> Mapping[str, str]:
-    """Key -> place. A key is a place's last two folders, whatever else is in the batch: the same again is no new job."""
+    """Key -> place. A key is a place's last two folders, whatever else is in the batch: so it is always the same."""
     for place in places:
         if not is_remote(place) and not (local_path(place) / "capture.toml").is_file():
             raise _wrong("A capture cannot be found", where=place, expected="a folder with capture.toml", got="none")

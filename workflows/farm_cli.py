@@ -14,8 +14,10 @@ from typing import TYPE_CHECKING, Annotated, Literal
 from tyro.conf import Positional, UseAppendAction, arg
 
 from registration.errors import InputError
+from workflows import store_cli
 
 if TYPE_CHECKING:
+    from workflows.coregistration import Plan
     from workflows.engine.control import Queue
     from workflows.engine.reads import Figures, Row
 
@@ -191,6 +193,33 @@ def logs(
     return 0
 
 
+def debug(
+    job: Positional[Annotated[str, arg(metavar="JOB")]],
+    /,
+    out: Annotated[Path, arg(metavar="DIR")],
+    folder: Folder = Path("."),
+    db: Database = None,
+) -> int:
+    """Run a job again, here and now, with a picture after every stage. The queue and its results stay as they are.
+
+    Args:
+        job: Its id.
+        out: A new folder for what it makes: stages/, registration/, and inputs/ if they had to be fetched.
+        folder: The farm's folder.
+        db: The queue's database, as for worker.
+    """
+    from registration.progress import shown
+    from workflows.debug import debug
+
+    row = _row(folder, db, job)
+    if row.failure:
+        print(f"in the farm: {row.failure['status']}: {row.failure['reason']}")
+    with shown() as progress:
+        print(debug(row, out, progress))
+    print(out)
+    return 0
+
+
 def retry(
     run: Positional[Annotated[str, arg(metavar="RUN")]],
     /,
@@ -237,68 +266,25 @@ def cancel(
     return 0
 
 
-def verify_store(store: Positional[Annotated[str, arg(metavar="STORE")]], /, tidy: bool = False) -> int:
-    """Read every file of a store and compare it with the manifests. Exit code 1 if something is missing or altered.
-
-    Args:
-        store: The folder or URL.
-        tidy: Delete files of attempts that nobody published and that are older than a day.
-    """
-    from workflows.store import Store
-
-    opened = Store(store)
-    found = opened.verify()
-    for what, names in (("missing", found.missing), ("altered", found.altered), ("orphaned", found.orphaned)):
-        for name in names:
-            print(f"{what}: {name}")
-    for name, why in found.unreadable.items():
-        print(f"unreadable: {name}: {why}")
-    if tidy:
-        print(f"{opened.tidy()} orphaned files deleted")
-    print(
-        f"{found.artifacts} artifacts; {len(found.missing)} files missing, {len(found.altered)} altered, "
-        f"{len(found.orphaned)} orphaned; {len(found.unreadable)} manifests unreadable"
-    )
-    return 0 if found.sound else 1
-
-
-def retire_store(
-    store: Positional[Annotated[str, arg(metavar="STORE")]],
-    run: Positional[Annotated[str, arg(metavar="RUN")]],
-    /,
-    keep: Annotated[int, arg(metavar="N")],
-    folder: Folder = Path("."),
-    db: Database = None,
-) -> int:
-    """Delete the results of a run's iterations but the last ones, and their rows in the queue.
-
-    Args:
-        store: The folder or URL.
-        run: The run.
-        keep: How many iterations to keep.
-        folder: The farm's folder.
-        db: The queue's database, as for worker.
-    """
-    from workflows.store import Store
-
-    gone = Store(store).retire(run, keep)
-    with _queue(folder, db) as queue:
-        for part in gone:
-            print(f"{part}: {queue.forget(part)} rows deleted")
-    return 0
-
-
 COMMANDS: Mapping[str, Callable[..., int] | tuple[str, Mapping[str, Callable[..., int]]]] = {
     "batch": batch,
     "worker": worker,
     "coordinator": coordinator,
     "status": status,
     "logs": logs,
+    "debug": debug,
     "retry": retry,
     "cancel": cancel,
     "migrate": migrate,
-    "store": ("Look after published results.", {"verify": verify_store, "retire": retire_store}),
+    "store": ("Look after published results.", {"verify": store_cli.verify, "retire": store_cli.retire}),
 }
+
+
+def put_coregistration(plan: "Plan", folder: Path, db: str | None) -> str:
+    """Put a coregistration into the queue and say so."""
+    from workflows.farm_coregistration import put_coregistration
+
+    return f"{put_coregistration(_url(folder, db), plan)} is in the queue; see gnmreg status"
 
 
 def _lines(figures: "Figures") -> list[str]:

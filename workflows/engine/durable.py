@@ -104,7 +104,7 @@ def _config(url: str, name: str) -> DBOSConfig:
         "system_database_url": url,
         "executor_id": name,
         "application_version": VERSION,  # by default a hash of the code: an edit would strand a backlog
-        "sys_db_pool_size": 4,
+        "sys_db_pool_size": 6,
         "use_listen_notify": False,  # we count rows and wait for no events: a connection less for each process
         "notification_listener_polling_interval_sec": 30.0,
         "serializer": Json(),

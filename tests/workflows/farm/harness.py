@@ -72,12 +72,12 @@ class Farm:
         row = self.reader.rows([identity]).get(identity)
         return {"state": row.state, "result": row.result, "failure": row.failure} if row else {"state": "none"}
 
-    def ends(self, *identities: str, within_s: float = 60.0) -> None:
+    def ends(self, *identities: str, within_s: float = 300.0) -> None:
         """Wait until these jobs have ended."""
         over = ("done", "failed", "cancelled")
         self.until(lambda: all(self.job(i)["state"] in over for i in identities), within_s, what=f"{identities} to end")
 
-    def until(self, condition: Callable[[], bool], within_s: float = 60.0, what: str = "it") -> float:
+    def until(self, condition: Callable[[], bool], within_s: float = 300.0, what: str = "it") -> float:
         begun = time.monotonic()
         while not condition():
             if time.monotonic() - begun > within_s:

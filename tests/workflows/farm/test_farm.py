@@ -93,7 +93,7 @@ def test_cancelling_stops_what_runs_and_what_waits(small: Farm) -> None:
     small.until(lambda: small.lines("begin stop").total() == 2)
     assert small.queue.cancel("stop") == 4
     small.queue.put([work(small, "after/a")])
-    small.ends("after/a", within_s=20.0)
+    small.ends("after/a")
     assert small.reader.counts("stop") == {"cancelled": 4}
     assert small.lines("begin stop").total() == 2 and not small.lines("end stop")
 
