@@ -2,6 +2,7 @@
 # make demo    sets up, makes a head model and a capture from nothing, and registers it: about five minutes
 # make check   sets up, then style, types and import directions
 # make test    sets up, checks and runs the tests
+# make test-durability   kills workers, drivers and a PostgreSQL server under load: minutes, not part of make test
 #
 # Needs git, make and Python 3.11 to 3.13. PYTHON=python3.12 names one; an existing .venv keeps the one it was made with.
 
@@ -11,6 +12,7 @@ SHELL := /bin/bash
 
 BIN := .venv/bin
 DEMO := build/demo
+DURABILITY := build/durability.txt
 PYTHONS := $(or $(PYTHON),python3.13 python3.12 python3.11 python3)
 INSTALLED := .venv/installed-$(shell cat pyproject.toml constraints.txt | sha256sum | cut -c1-16)
 IN_RANGE := import sys; sys.exit(not (3, 11) <= sys.version_info[:2] <= (3, 13))
@@ -20,7 +22,7 @@ PIP := $(BIN)/python -m pip --disable-pip-version-check install --constraint con
 packages = { [ "$$(id -u)" = 0 ] && command -v apt-get >/dev/null && apt-get update -q \
 	&& DEBIAN_FRONTEND=noninteractive apt-get install -y -q --no-install-recommends $(1); }
 
-.PHONY: setup demo check test
+.PHONY: setup demo check test test-durability
 
 setup: $(INSTALLED)
 	@$(BIN)/python -m registration.render.llvm --install
@@ -42,6 +44,15 @@ check: setup
 
 test: check
 	$(BIN)/python -m pytest
+
+test-durability: setup
+	@ls /usr/lib/postgresql/*/bin/initdb >/dev/null 2>&1 || command -v initdb >/dev/null || $(call packages,postgresql) || {
+		echo "No PostgreSQL here. On Debian and Ubuntu: sudo apt-get install -y postgresql" >&2
+		exit 1
+	}
+	rm -f $(DURABILITY)
+	GNMREG_DURABILITY=$(DURABILITY) $(BIN)/python -m pytest -m durability tests/workflows/farm
+	cat $(DURABILITY)
 
 $(INSTALLED): .venv/bin/python
 	@rm -f .venv/installed-*

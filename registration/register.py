@@ -29,6 +29,7 @@ from registration.progress import Progress, Silent
 from registration.render import backend
 from registration.report.inputs import ReportInputs, heat_map, report_views
 from registration.report.page import write_report
+from registration.report.stages import write_stage
 from registration.stages import RECIPES, Recipe, Stage, expression_of
 from registration.start import LEAST_LANDMARKS, LEAST_OVERLAP, from_landmarks, from_masks, spread_views
 from registration.targets.classes import BACKGROUND, class_map
@@ -41,6 +42,7 @@ SETTLED_MM = 0.05  # 95th percentile of vertex motion over the last tenth of the
 LANDMARK_PX = 3.0  # median residual at 512 px of head height
 _MANY = 2  # times LANDMARK_PX: views this far off are named
 _REPORT_VIEWS = 8
+_STAGE_VIEWS = 3
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -70,6 +72,7 @@ def register(
     force: bool = False,
     variant: backend.Variant = "llvm",
     landmark_files: Mapping[str, Path] | None = None,
+    pictures: Path | None = None,
     progress: Progress | None = None,
 ) -> Registration:
     """Register one capture and write the registration folder `out`.
@@ -87,6 +90,7 @@ def register(
         force: compute even if `out` already holds this result.
         variant: "llvm" (CPU) or "cuda".
         landmark_files: scheme name -> file, instead of those beside the model.
+        pictures: a folder for a picture of the fit at its start and after each stage, for debugging.
         progress: where to report to.
 
     Returns:
@@ -112,7 +116,7 @@ def register(
         return same
     device = backend.activate(variant, deterministic=deterministic)
     torch.manual_seed(seed)
-    fit, start, outcome = _fit(inputs, seed, device, progress)
+    fit, start, outcome = _fit(inputs, seed, device, pictures, progress)
     registration = _collect(inputs, fit, start, outcome)
     registration, page = _judge(inputs, fit, registration, progress)
     save_registration(registration, out, page)
@@ -231,7 +235,9 @@ def _check_topology(neutral: Registration, data: gnm_npz.GNMData, neutral_path: 
         )
 
 
-def _fit(inputs: Inputs, seed: int, device: torch.device, progress: Progress) -> tuple[Fit, Start, Outcome]:
+def _fit(
+    inputs: Inputs, seed: int, device: torch.device, pictures: Path | None, progress: Progress
+) -> tuple[Fit, Start, Outcome]:
     """Read the targets, find the start, run the stages."""
     begun = time.perf_counter()
     mapping = class_map(inputs.capture.classes)
@@ -256,12 +262,23 @@ def _fit(inputs: Inputs, seed: int, device: torch.device, progress: Progress) ->
     outcome.seconds["start"] = time.perf_counter() - begun
     total, done = sum(stage.steps for stage in recipe.stages), 0
 
+    shown = spread_views([v.camera for v in inputs.capture.views], _STAGE_VIEWS)
+    drawn = ["start"]
+
+    def draw(at: str) -> None:
+        """What the fit looks like when `at` begins, under the name of what was before."""
+        if pictures is not None and at != drawn[-1]:
+            write_stage(pictures / f"{len(drawn) - 1:02d}_{drawn[-1]}.png", report_views(*fit.picture(shown)))
+            drawn.append(at)
+
     def on_step(stage: Stage, step: int) -> None:
         nonlocal done
+        draw(stage.name)
         done += 1
         progress.at(done, total, stage.name)
 
     fit.run(recipe.stages, outcome, on_step)
+    draw("end")
     return fit, start, outcome
 
 

@@ -14,6 +14,7 @@ import tyro
 from tyro.conf import Positional, arg, subcommand
 
 from registration.errors import InputError
+from workflows import farm_cli
 
 CaptureFolder = Positional[Annotated[Path, arg(metavar="CAPTURE")]]
 RegistrationFolder = Positional[Annotated[Path, arg(metavar="REG")]]
@@ -378,6 +379,8 @@ def coregister(
     views: Annotated[int | None, arg(metavar="N")] = None,
     components: Annotated[tuple[int, ...], arg(metavar="K")] = (),
     jobs: Annotated[int, arg(metavar="N")] = 1,
+    folder: farm_cli.Folder = Path("."),
+    db: farm_cli.Database = None,
 ) -> int:
     """Register a dataset, build the next model from it, measure it on people held out, and again. It can be resumed.
 
@@ -385,7 +388,7 @@ def coregister(
         dataset: A folder of subject folders, each of capture folders.
         model: The first head model, a GNM NPZ file with its landmark schemes beside it.
         out: The folder to write; one that this command wrote before is gone on with.
-        local: Do everything on this machine; there is no other way yet.
+        local: Do everything in this process; otherwise put it into a farm's queue (docs/operations.md).
         iterations: At most so many rounds; it stops earlier when another one is not worth it.
         recipe: As for register.
         held_out: A share of the subjects, such as 0.2, or a file with a subject's folder name a line. Without it, those
@@ -394,33 +397,29 @@ def coregister(
         views: Use only this many views of each capture.
         components: Numbers of identity components to measure models with; the largest decides.
         jobs: Subjects that are registered side by side.
+        folder: Of the farm, if not local.
+        db: The queue's database, if not local.
     """
-    if not local:
-        raise InputError(
-            "There is no way to run this yet but on this machine",
-            where="--local",
-            expected="--local",
-            got="nothing",
-            fix="add --local",
-        )
     from coregister.decide import Rule
     from registration.progress import shown
-    from workflows.coregistration import PAGE, coregister
+    from workflows.coregistration import PAGE, coregister, planned
 
+    settings: dict[str, Any] = {
+        "model_path": model,
+        "out": out,
+        "recipe": recipe,
+        "held_out": _share_or_file(held_out),
+        "seed": seed,
+        "views": views,
+        "components": components or None,
+        "jobs": jobs,
+        "rule": Rule(rounds=iterations),
+    }
+    if not local:
+        print(farm_cli.put_coregistration(planned(dataset, **settings), folder, db))
+        return 0
     with shown() as progress:
-        state = coregister(
-            dataset,
-            model_path=model,
-            out=out,
-            recipe=recipe,
-            held_out=_share_or_file(held_out),
-            seed=seed,
-            views=views,
-            components=components or None,
-            jobs=jobs,
-            rule=Rule(rounds=iterations),
-            progress=progress,
-        )
+        state = coregister(dataset, **settings, progress=progress)
     for name, figures in state.generalization_mm.items():
         print(f"{name}, {state.at} components: generalization {figures[str(state.at)]:.3f} mm")
     print(f"{(state.verdict or {})['reason']}\n{out / PAGE}")
@@ -508,6 +507,7 @@ COMMANDS: Mapping[str, Command | Group] = {
         "Look at head models, measure them, make the first one, get the official one.",
         {"info": describe_model, "evaluate": evaluate_model, "bootstrap": bootstrap_model, "fetch": fetch_model},
     ),
+    **farm_cli.COMMANDS,
 }
 
 

@@ -94,7 +94,37 @@ def coregister(
         InputError: `read_dataset`, `split` or `check_out` refuses; no such recipe or model; more components than there
             can be. Nothing is computed or written then. Later: too few registrations are left to build a model from.
     """
-    progress = progress or Silent()
+    plan = planned(
+        dataset,
+        model_path=model_path,
+        out=out,
+        recipe=recipe,
+        held_out=held_out,
+        seed=seed,
+        views=views,
+        components=components,
+        samples=samples,
+        jobs=jobs,
+        rule=rule,
+    )
+    return _loop(plan, read_dataset(plan.dataset), progress or Silent())
+
+
+def planned(
+    dataset: Path,
+    *,
+    model_path: Path,
+    out: Path,
+    recipe: str = "draft",
+    held_out: float | Path | None = None,
+    seed: int = 0,
+    views: int | None = None,
+    components: Sequence[int] | None = None,
+    samples: int = 200,
+    jobs: int = 1,
+    rule: Rule | None = None,
+) -> Plan:
+    """All that `coregister` checks before it computes or writes anything. Raises InputError as it does."""
     check_recipe(recipe)
     found = read_dataset(dataset)
     plan = Plan(
@@ -112,7 +142,7 @@ def coregister(
     )
     _check(plan, asked=components is not None)
     check_out(plan.out)
-    return _loop(plan, found, progress)
+    return plan
 
 
 def _loop(plan: Plan, found: Dataset, progress: Progress) -> State:
@@ -152,7 +182,7 @@ def _loop(plan: Plan, found: Dataset, progress: Progress) -> State:
             progress=told,
         )
         done = {"name": name, "register": registered, "stabilize": still, "build": built, "evaluate": measured}
-        state = _decided(replace(state, rounds=(*state.rounds, done)), measured)
+        state = decided(replace(state, rounds=(*state.rounds, done)), measured)
         save(state)
         assert state.verdict is not None
         told.note(str(state.verdict["reason"]))
@@ -161,7 +191,7 @@ def _loop(plan: Plan, found: Dataset, progress: Progress) -> State:
     return state
 
 
-def _decided(state: State, measured: Mapping[str, Any]) -> State:
+def decided(state: State, measured: Mapping[str, Any]) -> State:
     """The state with the figures of all models, measured alike, and the verdict."""
     at, figures = str(measured["at"]), measured["generalization_mm"]
     rounds = []

@@ -39,6 +39,7 @@ def register_subject(
     force: bool = False,
     variant: Variant = "llvm",
     landmark_files: Mapping[str, Path] | None = None,
+    leave: Mapping[str, str] | None = None,
     progress: Progress | None = None,
 ) -> Subject:
     """Register all captures of a subject: the neutral, then every expression from it, each by `register`.
@@ -50,6 +51,7 @@ def register_subject(
     Args:
         subject_dir: its sub-folders that hold a capture.toml are the captures.
         neutral: the name of the neutral's sub-folder; None: the one whose expression is "neutral".
+        leave: captures that are not to be tried, and why: their rows are errors.
         model_path, recipe, views, seed, deterministic, force, variant, landmark_files, progress: as for `register`.
 
     Returns:
@@ -84,7 +86,7 @@ def register_subject(
         neutral=captures.captures[0].root.name,
         rows=_waiting(captures),
     )
-    return _loop(captures.captures, one, _Record(start, out), progress)
+    return _loop(captures.captures, one, _Record(start, out), leave or {}, progress)
 
 
 class _Record:
@@ -117,12 +119,19 @@ class _Neutral:
 
 
 def _loop(
-    captures: tuple[Capture, ...], one: Callable[..., Registration], record: _Record, progress: Progress
+    captures: tuple[Capture, ...],
+    one: Callable[..., Registration],
+    record: _Record,
+    leave: Mapping[str, str],
+    progress: Progress,
 ) -> Subject:
     """Register the first capture, the neutral, and each other one from it. `one` is `register` with its settings."""
     neutral: _Neutral | None = None
     for number, capture in enumerate(captures, 1):
         row = record.row(capture)
+        if row.name in leave:
+            record.put(replace(row, status="error", reason=leave[row.name]))
+            continue
         if number > 1 and neutral is None:
             reason = f"the neutral failed: {record.row(captures[0]).reason}"
             record.put(replace(row, status="skipped", reason=reason))

@@ -55,9 +55,11 @@ def register_subject(
     recipe: str = "draft",
     views: int | None = None,
     seed: int = 0,
+    leave: Mapping[str, str] | None = None,
     progress: Progress | None = None,
 ) -> Told:
-    """A subject's captures -> the folder that `gnmreg subject` writes. What ended in an error is tried anew each time.
+    """A subject's captures -> the folder that `gnmreg subject` writes. What ended in an error is tried anew each time,
+    but for the captures of `leave`, which tells why.
 
     Raises InputError as `local.register_subject`.
     """
@@ -80,6 +82,7 @@ def register_subject(
         recipe=recipe,
         views=views,
         seed=seed,
+        leave=leave,
         progress=progress,
     )
     rows = {row.name: {"status": row.status, "reason": row.reason, "usable": row.usable} for row in found.rows}

@@ -33,7 +33,8 @@ def read(root: Path) -> Capture:
     """Read a native capture folder; of images only the headers. Views come in natural order of their names.
 
     Raises InputError for a broken `capture.toml`, COLMAP model or landmark file, an unsupported camera model, a
-    singular or non-finite pose, a missing image, and an image of another size than its camera's.
+    singular or non-finite pose, a missing image, an image of another size than its camera's, and a symbolic link that
+    leads out of the folder: a capture may come from anyone, and must not make us read what is not in it.
     """
     root = Path(root)
     if not root.is_dir():
@@ -44,7 +45,9 @@ def read(root: Path) -> Capture:
             got="no such folder",
             fix="check the path",
         )
-    settings = _read_settings(root / "capture.toml")
+    settings = _read_settings(_inside(root, root / "capture.toml"))
+    for path in (root / "sparse", *sorted((root / "sparse").glob("*"))):
+        _inside(root, path)
     cameras = read_cameras(root / "sparse")
     views = tuple(_read_view(root, name, cameras[name]) for name in sorted(cameras, key=natural_key))
     _check_names(root, views)
@@ -56,8 +59,8 @@ def read(root: Path) -> Capture:
         views=views,
         classes=tuple(settings.get("segmentation", {}).get("classes", ())),
         tags={key: value for key, value in settings.items() if key not in _RESERVED},
-        scan=scan if scan.is_file() else None,
-        ground_truth=truth if truth.is_file() else None,
+        scan=_optional(root, scan),
+        ground_truth=_optional(root, truth),
     )
 
 
@@ -158,22 +161,35 @@ def _read_view(root: Path, file_name: str, camera: Camera) -> View:
             got=file_name,
             fix="rename the image",
         )
-    image = root / "images" / relative
+    image = _inside(root, root / "images" / relative)
     require_size(image, "image", camera.width_px, camera.height_px)
-    landmarks = _optional(root / "landmarks" / relative.with_suffix(".json"))
+    landmarks = _optional(root, root / "landmarks" / relative.with_suffix(".json"))
     return View(
         name=str(relative.with_suffix("")),
         camera=camera,
         image=image,
-        mask=_optional(root / "masks" / relative.with_suffix(".png")),
-        normals=_optional(root / "normals" / relative.with_suffix(".png")),
-        segmentation=_optional(root / "segmentation" / relative.with_suffix(".png")),
+        mask=_optional(root, root / "masks" / relative.with_suffix(".png")),
+        normals=_optional(root, root / "normals" / relative.with_suffix(".png")),
+        segmentation=_optional(root, root / "segmentation" / relative.with_suffix(".png")),
         landmarks={} if landmarks is None else read_landmarks(landmarks),
     )
 
 
-def _optional(path: Path) -> Path | None:
-    return path if path.is_file() else None
+def _optional(root: Path, path: Path) -> Path | None:
+    return _inside(root, path) if path.is_file() else None
+
+
+def _inside(root: Path, path: Path) -> Path:
+    """The path itself, if it stays within the capture when symbolic links are followed."""
+    if not (target := path.resolve()).is_relative_to(root.resolve()):
+        raise InputError(
+            "A link leads out of the capture",
+            where=path,
+            expected="a file inside the capture's folder",
+            got=f"a link to {target}",
+            fix="put the file itself there",
+        )
+    return path
 
 
 def _check_names(root: Path, views: tuple[View, ...]) -> None:

@@ -9,6 +9,9 @@ import trimesh
 from jaxtyping import Float, Int
 
 from registration.errors import InputError
+from registration.npz_files import check_unpacked
+
+MAX_TRUTH_BYTES = 2**30  # 40 million vertices
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -52,6 +55,7 @@ def read_truth(path: Path) -> Float[np.ndarray, "N 3"]:
         )
 
     try:
+        check_unpacked(path, MAX_TRUTH_BYTES)
         with np.load(path, allow_pickle=False) as content:
             if "vertices" not in content.files:
                 raise refuse('a field "vertices"', f"fields {', '.join(content.files)}")

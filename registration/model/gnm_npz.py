@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Float, Integer, Shaped
 
 from registration.errors import InputError
+from registration.npz_files import check_unpacked
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -74,6 +75,7 @@ AXES = {
     "vertex_group_names": ("text", "G"),
 }
 _KINDS = {"text": "U", "float": "f", "integer": "iu"}
+MAX_BYTES = 8 * 2**30  # of a model's arrays: ten times the official one
 _FETCH = "use the official gnm_head.npz (`gnmreg model fetch`) or a file that this project wrote"
 
 
@@ -142,6 +144,7 @@ def _load(path: Path) -> dict[str, np.ndarray]:
         raise InputError(what, where=path, expected="a GNM .npz file", got="no such file", fix=_FETCH)
     name: str | None = None
     try:
+        check_unpacked(path, MAX_BYTES)
         with np.load(path, allow_pickle=False) as archive:
             if not isinstance(archive, np.lib.npyio.NpzFile):
                 raise ValueError("a single array")

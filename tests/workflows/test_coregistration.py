@@ -297,8 +297,8 @@ def test_the_command(dataset, finds, tmp_path, capsys, monkeypatch):
     monkeypatch.setitem(coregister.__kwdefaults__, "samples", 2)
     out = tmp_path / "out"
     arguments = ["coregister", str(dataset), "--model", str(MODEL), "--out", str(out), "--components", "2"]
-    assert main(arguments) == 2
-    assert "--local" in capsys.readouterr().err and not out.exists()
+    assert main([*arguments, "--folder", str(tmp_path)]) == 2
+    assert "There is no queue" in capsys.readouterr().err and not out.exists()
     assert main([*arguments, "--local", "--iterations", "1", "--held-out", "0.4"]) == 0
     shown = capsys.readouterr().out
     assert "model 1, 2 components: generalization" in shown and str(out / "index.html") in shown

@@ -1,0 +1,123 @@
+"""The queue with 20,000 captures that need no work: what filling, asking, coordinating and storing it costs.
+
+    python -m bench.queue [--captures 20000] [--db URL] [--seconds 60]
+
+Workers run for some seconds only: with one job at a time they are bound by their asking the queue, four times a second.
+"""
+
+import argparse
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+from typing import Any
+
+import sqlalchemy as sa
+
+# As a file, this folder comes first on the path, and `import queue` anywhere would find this file.
+sys.path[:] = [str(Path(__file__).resolve().parents[1]), *(p for p in sys.path if Path(p).name != "bench")]
+
+from tests.workflows.farm.postgres import server  # noqa: E402
+from workflows.engine.control import Queue  # noqa: E402
+from workflows.engine.database import checked_url, default_url, engine, is_sqlite  # noqa: E402
+from workflows.engine.durable import migrate  # noqa: E402
+from workflows.engine.reads import Reader, ended  # noqa: E402
+from workflows.jobs import DRIVER, FlowJob, Job  # noqa: E402
+
+MB = 2**20
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--captures", type=int, default=20_000)
+    parser.add_argument("--db", default="sqlite", help="sqlite, postgres (a server is started), or a URL")
+    parser.add_argument("--seconds", type=float, default=60.0, help="how long two workers run")
+    told = parser.parse_args()
+    with tempfile.TemporaryDirectory(prefix="gnmreg-queue-") as name:
+        if told.db == "postgres":
+            with server() as made:
+                _measure(made.url, Path(name), told.captures, told.seconds)
+        else:
+            url = default_url(Path(name)) if told.db == "sqlite" else told.db
+            _measure(url, Path(name), told.captures, told.seconds)
+
+
+def _measure(url: str, folder: Path, captures: int, seconds: float) -> None:
+    migrate(url)
+    empty = _size_mb(url)
+    queue, reader = Queue(url), Reader(url)
+    arguments = {"capture": "/data/captures/subject_0000/expression_00", "model": "/data/model.npz", "seed": 0}
+    jobs = (Job(id=f"bench/s{n:05d}", step="nothing", arguments={**arguments, "key": n}) for n in range(captures))
+    begun = time.perf_counter()
+    queue.put(jobs)
+    took = time.perf_counter() - begun
+    queue.put([FlowJob(id="bench", flow="batch", queue=DRIVER)])
+    _row("enqueue", f"{captures / took:.0f} jobs/s ({captures:,} in {took:.1f} s)")
+    full = _size_mb(url)
+    _row("database", f"{(full - empty) * 10_000 / captures:.1f} MB per 10,000 jobs that wait")
+    _row("status, all waiting", f"{_asked(reader):.3f} s; as a command {_command(url, folder):.2f} s")
+    processes = {kind: _started(kind, url, folder, kind) for kind in ("coordinator",)}
+    time.sleep(15.0)
+    _row("coordinator", f"{_rss_mb(processes['coordinator'].pid):.0f} MB while {captures:,} jobs wait")
+    for number in (0, 1):
+        processes[f"worker{number}"] = _started("worker", url, folder, f"worker{number}")
+    while not ended(reader.counts("bench")):
+        time.sleep(0.2)
+    first, begun = ended(reader.counts("bench")), time.perf_counter()
+    time.sleep(seconds)
+    done = ended(reader.counts("bench"))
+    took = time.perf_counter() - begun
+    _row("complete, 2 workers", f"{(done - first) / took:.1f} jobs/s, {(done - first) / took * 86_400:,.0f} a day")
+    _row("status, at work", f"{_asked(reader):.3f} s")
+    grown = (_size_mb(url) - full) * 10_000 / max(done, 1)
+    _row("database", f"{(full - empty) * 10_000 / captures + grown:.1f} MB per 10,000 jobs that are done")
+    _row("memory", ", ".join(f"{name} {_rss_mb(process.pid):.0f} MB" for name, process in processes.items()))
+    for process in processes.values():
+        process.kill()
+        process.wait()
+    queue.close()
+    reader.close()
+
+
+def _started(kind: str, url: str, folder: Path, name: str) -> "subprocess.Popen[bytes]":
+    command = [sys.executable, "-m", "bench.queue_process", kind, url, str(folder), name]
+    return subprocess.Popen(command, cwd=Path(__file__).parents[1], stdout=subprocess.DEVNULL)
+
+
+def _asked(reader: Reader) -> float:
+    begun = time.perf_counter()
+    reader.figures("bench")
+    return time.perf_counter() - begun
+
+
+def _command(url: str, folder: Path) -> float:
+    begun = time.perf_counter()
+    command = [sys.executable, "-m", "workflows.cli", "status", "--folder", str(folder)]
+    environment = {**os.environ, "GNMREG_DB": url}
+    subprocess.run(command, cwd=Path(__file__).parents[1], env=environment, check=True, stdout=subprocess.DEVNULL)
+    return time.perf_counter() - begun
+
+
+def _size_mb(url: str) -> float:
+    if is_sqlite(url):
+        file = Path(str(sa.make_url(checked_url(url)).database))
+        with engine(url).connect() as connection:
+            connection.exec_driver_sql("PRAGMA wal_checkpoint(TRUNCATE)")  # else the log would be counted too
+        return sum(path.stat().st_size for path in file.parent.glob(f"{file.name}*") if path.is_file()) / MB
+    with engine(checked_url(url)).connect() as connection:
+        return float(connection.execute(sa.text("SELECT pg_database_size(current_database())")).scalar_one()) / MB
+
+
+def _rss_mb(pid: int) -> float:
+    fields: dict[str, Any] = dict(line.split(":", 1) for line in Path(f"/proc/{pid}/status").read_text().splitlines())
+    return int(fields["VmHWM"].split()[0]) / 1024
+
+
+def _row(what: str, value: str) -> None:
+    print(f"{what:22s} {value}", flush=True)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,26 @@
+"""A worker or coordinator for bench/queue.py, whose jobs do nothing."""
+
+import sys
+from pathlib import Path
+
+from workflows.engine.durable import Process, serve
+from workflows.flows import FLOWS
+from workflows.jobs import DRIVER, GPU, SUBJECTS, Step
+
+
+def nothing(**arguments: object) -> None:
+    """What a job does here."""
+
+
+if __name__ == "__main__":
+    kind, url, folder, name = sys.argv[1:]
+    serve(
+        Process(
+            url=url,
+            queues=(GPU,) if kind == "worker" else (DRIVER, SUBJECTS),
+            logs=Path(folder) / "logs",
+            names=(name,),
+            steps={"nothing": Step(function="bench.queue_process:nothing")} if kind == "worker" else {},
+            flows=FLOWS if kind == "coordinator" else {},
+        )
+    )

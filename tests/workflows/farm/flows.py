@@ -1,0 +1,37 @@
+"""Flows of the test steps: the shape of the real ones, nothing of their weight."""
+
+from typing import Any
+
+from workflows.engine.scope import Scope
+from workflows.jobs import EXPRESSION_PRIORITY, NEUTRAL_PRIORITY, STABILIZE_PRIORITY, FlowJob, Job
+
+
+async def graph(scope: Scope, *, subjects: int, expressions: int, folder: str, seconds: float) -> dict[str, Any]:
+    """Subjects of a neutral, expressions and a stabilization each, then a rebuild."""
+    flows = [
+        FlowJob(
+            id=f"{scope.id}/s{number:04d}",
+            flow="subject",
+            arguments={"expressions": expressions, "folder": folder, "seconds": seconds},
+        )
+        for number in range(subjects)
+    ]
+    results = await scope.do(flows)
+    rebuilt = await scope.do([_work(f"{scope.id}/rebuild", folder, seconds, queue="rebuild")])
+    return {"subjects": len(results), "rebuilt": len(rebuilt)}
+
+
+async def subject(scope: Scope, *, expressions: int, folder: str, seconds: float) -> dict[str, Any]:
+    await scope.do([_work(f"{scope.id}/neutral", folder, seconds, priority=NEUTRAL_PRIORITY)])
+    jobs = [_work(f"{scope.id}/e{n:02d}", folder, seconds, priority=EXPRESSION_PRIORITY) for n in range(expressions)]
+    done = await scope.do(jobs)
+    await scope.do([_work(f"{scope.id}/stab", folder, seconds, priority=STABILIZE_PRIORITY)])
+    return {"expressions": len(done)}
+
+
+def _work(identity: str, folder: str, seconds: float, **settings: Any) -> Job:
+    arguments = {"store": f"{folder}/store", "key": identity, "seconds": seconds, "trace": f"{folder}/trace.txt"}
+    return Job(id=identity, step="work", arguments=arguments, **settings)
+
+
+FLOWS = {"graph": graph, "subject": subject}

@@ -1,0 +1,28 @@
+"""A worker or a coordinator of the test steps and flows, as a process of its own that can be killed."""
+
+import json
+import sys
+from pathlib import Path
+
+from tests.workflows.farm.flows import FLOWS
+from tests.workflows.farm.steps import STEPS
+from workflows.engine.durable import Process, serve
+from workflows.engine.liveness import Patience
+from workflows.jobs import DRIVER, GPU, REBUILD, SUBJECTS
+
+if __name__ == "__main__":
+    kind, name, url, folder, settings = sys.argv[1:]
+    told = json.loads(settings)
+    serve(
+        Process(
+            url=url,
+            queues=(GPU, REBUILD) if kind == "worker" else (DRIVER, SUBJECTS),
+            logs=Path(folder) / "logs",
+            names=(name,),
+            roots=(folder,),
+            steps=STEPS if kind == "worker" else {},
+            flows=FLOWS if kind == "coordinator" else {},
+            patience=Patience(**told["patience"]) if told.get("patience") else None,
+            back_off_s=told.get("back_off_s", 0.2),
+        )
+    )

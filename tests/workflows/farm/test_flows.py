@@ -1,0 +1,177 @@
+"""Flows without a queue: a scope that does jobs at once, by what a table says of them."""
+
+import asyncio
+import json
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from workflows.engine.rows import JobFailed
+from workflows.flows import FLOWS, coregister, subject
+from workflows.jobs import STEPS, FlowJob, Job, check_id
+
+Told = dict[str, Any] | Exception
+
+
+class Inline:
+    """Stands in for a `Scope`; `step` says what a job's result is, or raises."""
+
+    def __init__(self, identity: str, step: Callable[[Job], Any], log: list[Job]) -> None:
+        self.id, self._step, self.log = identity, step, log
+        self._reasons: dict[str, str] = {}
+
+    async def do(self, jobs: Sequence[Job | FlowJob]) -> dict[str, Any]:
+        done = {}
+        for job in sorted(jobs, key=lambda one: one.priority):
+            try:
+                if isinstance(job, FlowJob):
+                    below = Inline(check_id(job.id), self._step, self.log)
+                    done[job.id] = await FLOWS[job.flow](below, **json.loads(json.dumps(job.arguments)))
+                else:
+                    assert job.step in STEPS and json.dumps(job.spec())
+                    self.log.append(job)
+                    done[check_id(job.id)] = self._step(job)
+            except JobFailed as error:
+                self._reasons[job.id] = str(error)
+        return done
+
+    async def failures(self, jobs: Sequence[Job]) -> dict[str, str]:
+        return {job.id: self._reasons[job.id] for job in jobs if job.id in self._reasons}
+
+    async def read(self, file: str) -> Any:
+        return json.loads(Path(file).read_text())
+
+    def park(self, reason: str) -> JobFailed:
+        return JobFailed({"status": "parked", "reason": reason})
+
+
+def failed(reason: str) -> JobFailed:
+    return JobFailed({"status": "failed", "reason": reason})
+
+
+def run_subject(step: Callable[[Job], Any]) -> tuple[dict[str, Any], list[Job]]:
+    scope = Inline("r/s1", step, [])
+    arguments = {
+        "subject_dir": "/c/ann",
+        "captures": ["rest", "smile", "jaw"],
+        "model": "/m",
+        "out": "/o/ann",
+        "settings": {"recipe": "draft", "views": None, "seed": 1, "variant": "llvm"},
+    }
+    return asyncio.run(subject(scope, **arguments)), scope.log  # type: ignore[arg-type]
+
+
+def test_a_subject_is_the_neutral_then_expressions_then_the_record() -> None:
+    result, log = run_subject(lambda job: {})
+    assert result == {"usable": 3, "failed": 0}
+    assert [(j.step, j.priority) for j in log] == [("register", 5), ("register", 10), ("register", 10), ("collect", 3)]
+    assert [j.id for j in log[:3]] == ["r/s1/neutral", "r/s1/e001", "r/s1/e002"]
+    assert [j.arguments.get("neutral") for j in log[:3]] == [None, "/o/ann/rest", "/o/ann/rest"]
+    assert log[1].arguments["capture"] == "/c/ann/smile" and log[1].arguments["out"] == "/o/ann/smile"
+    assert log[3].arguments["leave"] == {}
+
+
+def test_an_expression_that_fails_takes_no_other_along() -> None:
+    def step(job: Job) -> dict[str, Any]:
+        if job.id.endswith("e001"):
+            raise failed("broken")
+        return {}
+
+    result, log = run_subject(step)
+    assert result == {"usable": 2, "failed": 1}
+    assert log[-1].step == "collect" and log[-1].arguments["leave"] == {"smile": "failed: broken"}
+
+
+def test_without_a_neutral_nothing_else_is_registered() -> None:
+    def step(job: Job) -> dict[str, Any]:
+        if job.id.endswith("neutral"):
+            raise failed("broken")
+        return {}
+
+    result, log = run_subject(step)
+    assert result == {"usable": 0, "failed": 3}
+    assert [job.step for job in log] == ["register", "collect"]
+    assert set(log[-1].arguments["leave"]) == {"rest", "smile", "jaw"}
+
+
+class Rounds:
+    """Answers of the steps of a coregistration; `go_on` says after which rounds it goes on."""
+
+    def __init__(self, go_on: Sequence[bool], broken: Sequence[str] = ()) -> None:
+        self.go_on, self.broken = list(go_on), broken
+
+    def __call__(self, job: Job) -> dict[str, Any]:
+        if any(part in job.id for part in self.broken):
+            raise failed("broken")
+        if job.step == "hold out":
+            return {"people": "/o/people.npz", "sources": {}, "lost": []}
+        if job.step == "stabilize":
+            return {"out": job.arguments["out"]}
+        if job.step == "build":
+            return {"model": f"{job.arguments['out']}/gnm_head.npz"}
+        if job.step == "end round":
+            return {"go_on": self.go_on[len(job.arguments["rounds"]) - 1], "reason": "so it is"}
+        return {}
+
+
+@pytest.fixture
+def plan(tmp_path: Path) -> Path:
+    names = [f"p{n}" for n in range(5)]
+    told = {
+        "dataset": "/d",
+        "model": "/m0",
+        "out": "/o",
+        "recipe": "draft",
+        "views": None,
+        "seed": 0,
+        "components": [2],
+        "samples": 0,
+        "rule": {"rounds": 3, "failures": 0.2},
+        "split": {"training": names[:4], "held_out": names[4:], "how": ""},
+        "captures": {name: ["rest", "smile"] for name in names},
+        "bare": names[4:],
+    }
+    file = tmp_path / "plan.json"
+    file.write_text(json.dumps(told))
+    return file
+
+
+def run_loop(plan: Path, rounds: Rounds) -> tuple[dict[str, Any], list[Job]]:
+    scope = Inline("r", rounds, [])
+    return asyncio.run(coregister(scope, plan=str(plan))), scope.log  # type: ignore[arg-type]
+
+
+def test_the_loop_goes_round_with_the_model_that_it_built_until_told(plan: Path) -> None:
+    result, log = run_loop(plan, Rounds([True, False]))
+    assert result == {"rounds": 2, "model": "/o/it01/model/gnm_head.npz", "reason": "so it is"}
+    steps = [job.step for job in log if job.step not in ("register", "collect")]
+    assert steps == ["hold out", *["stabilize", "build", "evaluate", "end round"] * 2]
+    registered = [job for job in log if job.step == "register"]
+    assert len(registered) == 2 + 2 * 8  # the one held out without a truth, then four subjects twice
+    models = {job.id.split("/")[1]: job.arguments["model"] for job in registered}
+    assert models == {"held": "/m0", "it00": "/m0", "it01": "/o/it00/model/gnm_head.npz"}
+    assert log[-2].arguments["models"]["model 2"] == "/o/it01/model/gnm_head.npz"
+
+
+def test_too_many_failures_park_the_run_before_a_model_is_built(plan: Path) -> None:
+    with pytest.raises(JobFailed, match="parked: it00: 2 of 8 captures failed"):
+        run_loop(plan, Rounds([True], broken=("it00/s00001/neutral",)))
+
+
+def test_few_failures_do_not(plan: Path) -> None:
+    result, _ = run_loop(plan, Rounds([False], broken=("it00/s00001/e001",)))
+    assert result["rounds"] == 1
+
+
+def test_a_step_that_fails_parks_the_run_and_says_which(plan: Path) -> None:
+    with pytest.raises(JobFailed, match="parked: it01/build: failed: broken"):
+        run_loop(plan, Rounds([True, True], broken=("it01/build",)))
+
+
+def test_other_arguments_make_another_job(plan: Path) -> None:
+    _, first = run_loop(plan, Rounds([False]))
+    _, second = run_loop(plan, Rounds([False], broken=("it00/s00001/e001",)))
+    ids = [{job.id for job in log if "/collect" in job.id} for log in (first, second)]
+    assert len(ids[0] - ids[1]) == 1 and len(ids[0] & ids[1]) == 4

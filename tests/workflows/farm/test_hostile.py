@@ -1,0 +1,213 @@
+"""Captures, models, stores and jobs made to do harm: each is refused with a clear error, and the worker's child lives.
+
+Jobs go the way that they go in a worker: checked against the table of steps and the roots, then to the child.
+"""
+
+import asyncio
+import io
+import json
+import os
+import pickle
+import shutil
+import struct
+import zipfile
+import zlib
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from registration.errors import InputError
+from tests.capture import small
+from workflows.jobs import MAX_BYTES, STEPS, checked, resolved_roots
+from workflows.slot import Slot
+from workflows.store import MANIFEST, Store
+
+MODEL = Path(__file__).parents[2] / "fixtures" / "tiny_gnm.npz"
+
+
+class Trap:
+    """Unpickling one would leave a file."""
+
+    def __init__(self, file: Path) -> None:
+        self.file = file
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return os.mknod, (str(self.file),)
+
+
+@pytest.fixture(scope="module")
+def slot() -> Iterator[Slot]:
+    made = Slot(modules=("workflows.farm_steps",))
+    made.warm()
+    yield made
+    made.kill()
+
+
+@pytest.fixture(scope="module")
+def good(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return small.make(tmp_path_factory.mktemp("good") / "capture")
+
+
+@pytest.fixture
+def root(good: Path, tmp_path: Path) -> Path:
+    """What the worker may read and write: a capture and a model. A secret lies beside it."""
+    (tmp_path / "secret.txt").write_text("secret")
+    place = tmp_path / "root"
+    shutil.copytree(good, place / "capture")
+    shutil.copy(MODEL, place / "model.npz")
+    return place
+
+
+def job(root: Path, **changed: Any) -> dict[str, Any]:
+    arguments = {"capture": f"{root}/capture", "model": f"{root}/model.npz", "store": f"{root}/store", "key": "k"}
+    return {"step": "register stored", "arguments": {**arguments, **changed}}
+
+
+def first_image(root: Path) -> Path:
+    return sorted((root / "capture" / "images").rglob("*.png"))[0]
+
+
+def link_image(root: Path) -> None:
+    first = first_image(root)
+    shutil.move(first, root.parent / "image.png")
+    first.symlink_to(root.parent / "image.png")
+
+
+def link_scan(root: Path) -> None:
+    (root / "capture" / "scan.ply").unlink()
+    (root / "capture" / "scan.ply").symlink_to(root.parent / "secret.txt")
+
+
+def link_folder(root: Path) -> None:
+    shutil.move(root / "capture" / "sparse", root.parent / "sparse")
+    (root / "capture" / "sparse").symlink_to(root.parent / "sparse")
+
+
+def name_outside(name: str) -> Callable[[Path], None]:
+    def rename(root: Path) -> None:
+        file = root / "capture" / "sparse" / "images.txt"
+        old = first_image(root).relative_to(root / "capture" / "images").as_posix()
+        assert old in file.read_text()
+        file.write_text(file.read_text().replace(old, name))
+
+    return rename
+
+
+def bomb_image(root: Path) -> None:
+    """A PNG of a few bytes that declares 60,000 x 60,000 pixels."""
+    body = b"IHDR" + struct.pack(">IIBBBBB", 60_000, 60_000, 8, 2, 0, 0, 0)
+    chunk = struct.pack(">I", 13) + body + struct.pack(">I", zlib.crc32(body))
+    first_image(root).write_bytes(b"\x89PNG\r\n\x1a\n" + chunk + b"\x00\x00\x00\x00IEND\xaeB`\x82")
+
+
+def pickle_truth(root: Path) -> None:
+    trap = np.array([Trap(root.parent / "sprung")], object)
+    np.savez(root / "capture" / "ground_truth.npz", vertices=trap)
+
+
+def pickle_model(root: Path) -> None:
+    with np.load(MODEL) as archive:
+        fields = {name: archive[name] for name in archive.files}
+    fields[next(iter(fields))] = np.array([Trap(root.parent / "sprung")], object)
+    np.savez(root / "model.npz", **fields)
+
+
+def raw_pickle(root: Path) -> None:
+    (root / "model.npz").write_bytes(pickle.dumps(Trap(root.parent / "sprung")))
+
+
+def bomb_truth(root: Path) -> None:
+    """1.1 GB of zeros in 5 MB."""
+    head = io.BytesIO()
+    np.lib.format.write_array_header_1_0(head, {"descr": "<f8", "fortran_order": False, "shape": (46_000_000, 3)})
+    with zipfile.ZipFile(root / "capture" / "ground_truth.npz", "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive:
+        with archive.open("vertices.npy", "w", force_zip64=True) as member:
+            member.write(head.getvalue())
+            for _ in range(69):
+                member.write(bytes(16_000_000))
+
+
+def deep_landmarks(root: Path) -> None:
+    file = sorted((root / "capture" / "landmarks").rglob("*.json"))[0]
+    file.write_text("[" * 100_000)
+
+
+def endless_toml(root: Path) -> None:
+    (root / "capture" / "capture.toml").unlink()
+    os.symlink("/dev/zero", root / "capture" / "capture.toml")
+
+
+SPOILS: dict[str, tuple[Callable[[Path], None], str]] = {
+    "an image that is a link out": (link_image, "link leads out"),
+    "a scan that is a link out": (link_scan, "link leads out"),
+    "a folder that is a link out": (link_folder, "link leads out"),
+    "a device for a file": (endless_toml, "link leads out"),
+    "an image named ../..": (name_outside("../../../secret.png"), "image name cannot be used"),
+    "an image named from /": (name_outside("/etc/secret.png"), "image name cannot be used"),
+    "an image bomb": (bomb_image, "absurd size"),
+    "a truth that is a pickle": (pickle_truth, "ground truth cannot be used"),
+    "a truth that is a bomb": (bomb_truth, "ground truth cannot be used"),
+    "a model with a pickle": (pickle_model, "model file"),
+    "a model that is a pickle": (raw_pickle, "model file"),
+    "landmarks without a bottom": (deep_landmarks, "landmark file is malformed"),
+}
+
+
+@pytest.mark.parametrize("name", SPOILS)
+def test_a_hostile_capture_or_model_is_refused_and_the_worker_lives(slot: Slot, root: Path, name: str) -> None:
+    spoil, words = SPOILS[name]
+    spoil(root)
+    pid = slot.warm()
+    step, arguments = checked(job(root), STEPS, resolved_roots((root,)))
+    outcome = asyncio.run(slot.run(step.function, arguments, log=root.parent / "log", hard_s=120.0))
+    assert outcome["status"] == "bad input" and words in outcome["reason"], outcome
+    assert not (root.parent / "sprung").exists()
+    assert not [path for path in (root / "store").rglob("*") if path.is_file()]
+    assert slot.warm() == pid
+
+
+@pytest.mark.parametrize(
+    "changed",
+    [
+        {"capture": "/etc"},
+        {"capture": "file:///etc"},
+        {"capture": "s3://somebody/else"},
+        {"capture": "http://169.254.169.254/latest/meta-data"},
+        {"model": "{root}/../secret.txt"},
+        {"store": "{root}/out/link"},
+        {"store": "s3://key:password@bucket/x"},
+        {"capture": "x" * MAX_BYTES},
+    ],
+)
+def test_a_job_with_a_foreign_place_never_reaches_the_child(root: Path, changed: dict[str, str]) -> None:
+    (root / "out").mkdir()
+    (root / "out" / "link").symlink_to(root.parent)
+    changed = {key: value.replace("{root}", str(root)) for key, value in changed.items()}
+    with pytest.raises(InputError) as refused:
+        checked(job(root, **changed), STEPS, resolved_roots((root,)))
+    assert "password" not in str(refused.value)
+
+
+def test_a_step_that_is_not_in_the_table_never_reaches_the_child(root: Path) -> None:
+    for step in ("os:system", "workflows.farm_steps:register_stored", "__import__", ""):
+        with pytest.raises(InputError, match="refused"):
+            checked({"step": step, "arguments": {}}, STEPS, resolved_roots((root,)))
+
+
+def test_a_key_that_leads_out_of_the_store_is_refused(tmp_path: Path) -> None:
+    for key in ("../x", "/etc/x", "a/../../x", ".hidden", ""):
+        with pytest.raises(InputError):
+            Store(tmp_path / "store").produce(key, wanted="w", make=lambda folder: {})
+    assert not (tmp_path / "store").exists()
+
+
+def test_a_store_whose_manifest_lies_about_sizes_is_found_out(tmp_path: Path) -> None:
+    store = Store(tmp_path)
+    made = store.produce("k", wanted="w", make=lambda folder: (folder / "f").write_text("abc") and {})
+    value = json.loads((tmp_path / "k" / MANIFEST).read_text())
+    value["files"]["f"]["sha256"] = "0" * 64
+    (tmp_path / "k" / MANIFEST).write_text(json.dumps(value))
+    assert store.verify().unreadable and made.files["f"]["bytes"] == 3

@@ -1,0 +1,101 @@
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from registration.errors import InputError
+from tests.workflows.farm.harness import ROOT
+from workflows.engine.database import checked_url, default_url, prepare, reading, redacted_url
+from workflows.engine.liveness import FileLocks, Liveness, Patience
+
+HOLD = """
+import sys, time
+from workflows.engine.liveness import FileLocks
+locks = FileLocks(sys.argv[1])
+assert locks.take("w")
+print("held", flush=True)
+time.sleep(60)
+"""
+
+
+def holder(url: str) -> subprocess.Popen[str]:
+    held = FileLocks(url)
+    process = subprocess.Popen([sys.executable, "-c", HOLD, url], cwd=ROOT, stdout=subprocess.PIPE, text=True)
+    assert process.stdout is not None and process.stdout.readline() == "held\n"
+    assert held.free(["w", "never"]) == {"never"}
+    return process
+
+
+def test_a_lock_is_held_while_its_process_lives_even_frozen(tmp_path: Path) -> None:
+    url = default_url(tmp_path)
+    process, locks = holder(url), FileLocks(url)
+    try:
+        process.send_signal(signal.SIGSTOP)
+        assert not locks.free(["w"])
+        with pytest.raises(InputError, match="Another process has this place"):
+            Liveness(url).join(["w"])
+        assert Liveness(url).join(["w", "v"]) == "v"
+    finally:
+        process.kill()
+        process.wait()
+    assert locks.free(["w"]) == {"w"}
+
+
+def test_the_dead_are_told_when_patience_ends(tmp_path: Path) -> None:
+    liveness = Liveness(default_url(tmp_path), Patience(free_s=15.0, up_s=0.0))
+    assert liveness.join(["me"]) == "me"
+    assert liveness.dead(["w", "me"], now=100.0) == []
+    assert liveness.dead(["w", "me"], now=114.0) == []
+    assert liveness.dead(["w", "me"], now=115.0) == ["w"]
+
+
+def test_who_was_back_in_between_counts_anew(tmp_path: Path) -> None:
+    url = default_url(tmp_path)
+    liveness = Liveness(url, Patience(free_s=15.0, up_s=0.0))
+    assert liveness.dead(["w"], now=100.0) == []
+    process = holder(url)
+    assert liveness.dead(["w"], now=110.0) == []
+    process.kill()
+    process.wait()
+    assert liveness.dead(["w"], now=115.0) == []
+    assert liveness.dead(["w"], now=130.0) == ["w"]
+
+
+def test_a_server_that_has_just_started_is_waited_for(tmp_path: Path) -> None:
+    liveness = Liveness(default_url(tmp_path), Patience(free_s=0.0, up_s=60.0))
+    liveness._locks.up_s = lambda: 59.0  # type: ignore[method-assign]
+    assert liveness.dead(["w"], now=1.0) == []
+    liveness._locks.up_s = lambda: 60.0  # type: ignore[method-assign]
+    assert liveness.dead(["w"], now=1.0) == ["w"]
+
+
+def test_sqlite_gets_its_write_ahead_log_and_readers_cannot_write(tmp_path: Path) -> None:
+    url = default_url(tmp_path / "new")
+    prepare(url)
+    assert (tmp_path / "new" / "queue.sqlite").read_bytes()[18:20] == b"\x02\x02"  # the header's mark of WAL
+    with reading(url) as connection, pytest.raises(Exception, match="readonly"):
+        connection.exec_driver_sql("CREATE TABLE x (y)")
+
+
+@pytest.mark.parametrize(
+    "url", ["", "queue.sqlite", "mysql://h/d", "sqlite://", "sqlite:///:memory:", "postgresql://h"]
+)
+def test_urls_that_are_none_of_ours_are_refused(url: str) -> None:
+    with pytest.raises(InputError):
+        checked_url(url)
+
+
+def test_a_network_disk_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("workflows.engine.database._filesystem", lambda file: "nfs4")
+    with pytest.raises(InputError, match="network disk"):
+        checked_url(default_url(tmp_path))
+
+
+def test_a_server_that_does_not_answer_is_told_without_its_password() -> None:
+    url = "postgresql://me:secret@127.0.0.1:9/queue"
+    with pytest.raises(InputError) as refused:
+        prepare(checked_url(url))
+    assert "secret" not in str(refused.value) + redacted_url(url)
+    assert refused.value.__cause__ is None

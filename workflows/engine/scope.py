@@ -1,0 +1,134 @@
+"""What a flow may do. Everything here is durable: a flow that is started again walks past what is done already."""
+
+import asyncio
+import json
+import random
+from collections.abc import Callable, Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from dbos import DBOS
+
+from workflows.engine.control import CHUNK, Queue
+from workflows.engine.reads import CANCELLED, DONE, FAILED, Reader, Row, ended
+from workflows.engine.rows import JobFailed
+from workflows.jobs import FlowJob, Job
+
+LOOK_S = 1.0  # between two looks at the counts
+
+
+class Scope:
+    """Handed to a flow as its first argument."""
+
+    def __init__(self, url: str) -> None:
+        self.id = str(DBOS.workflow_id)  # of the flow: the ids of what it makes begin with it
+        self._url = url
+
+    async def put(self, jobs: Sequence[Job | FlowJob]) -> None:
+        """Put jobs into their queues, 1,000 with one transaction and one step."""
+        for start in range(0, len(jobs), CHUNK):
+            await self._step(f"put {start}", _put, self._url, list(jobs[start : start + CHUNK]))
+
+    async def wait(self, jobs: Sequence[Job | FlowJob]) -> dict[str, int]:
+        """Wait, in one step that counts, until all of the jobs have ended, and return state -> how many."""
+        counts: dict[str, int] = await self._step("wait", _counted, self._url, [job.id for job in jobs])
+        return counts
+
+    async def wait_below(self, part: str) -> dict[str, int]:
+        """Like `wait` for whatever lies in the queue directly below an id: no list of ids is needed."""
+        counts: dict[str, int] = await self._step("wait", _counted_below, self._url, part)
+        return counts
+
+    async def do(self, jobs: Sequence[Job | FlowJob]) -> dict[str, Any]:
+        """Put, wait, and return id -> result of those that were done; what is missing failed."""
+        await self.put(jobs)
+        await self.wait(jobs)
+        results: dict[str, Any] = await self._step("results", _results, self._url, [job.id for job in jobs])
+        return results
+
+    async def failures(self, jobs: Sequence[Job | FlowJob]) -> dict[str, str]:
+        """Why those of the jobs that failed, or were cancelled, did: id -> reason."""
+        reasons: dict[str, str] = await self._step("failures", _failures, self._url, [job.id for job in jobs])
+        return reasons
+
+    async def read(self, file: str) -> Any:
+        """A JSON file, as it is now and for the rest of this flow's life."""
+        return await self._step("read", _read, file)
+
+    async def tell(self, key: str, value: Any) -> None:
+        """Leave a small value under a key for whoever watches."""
+        await DBOS.set_event_async(key, value)
+
+    def park(self, reason: str) -> JobFailed:
+        """The error to raise when the run should stop until a person retries it."""
+        return JobFailed({"status": "parked", "reason": reason})
+
+    async def _step(self, name: str, function: Any, *arguments: Any) -> Any:
+        options = {"name": name, "preemptible": True}
+        return await DBOS.run_step_async(options, function, *arguments)  # type: ignore[call-overload]
+
+
+async def _put(url: str, jobs: list[Job | FlowJob]) -> int:
+    def put() -> int:
+        queue = Queue(url)
+        try:
+            return queue.put(jobs)
+        finally:
+            queue.close()
+
+    return await asyncio.to_thread(put)
+
+
+async def _counted(url: str, ids: list[str]) -> dict[str, int]:
+    return await _polled(url, lambda reader: reader.counts_of(ids), lambda counts: ended(counts) >= len(ids))
+
+
+async def _counted_below(url: str, part: str) -> dict[str, int]:
+    count = partial(Reader.counts, run=part, direct=True)
+    return await _polled(url, count, lambda counts: ended(counts) == sum(counts.values()))
+
+
+async def _polled(
+    url: str, count: Callable[[Reader], dict[str, int]], over: Callable[[dict[str, int]], bool]
+) -> dict[str, int]:
+    reader = Reader(url)
+    try:
+        while True:
+            counts: dict[str, int] = await asyncio.to_thread(count, reader)
+            if over(counts):
+                return counts
+            await asyncio.sleep(LOOK_S * random.uniform(0.8, 1.2))
+    finally:
+        reader.close()
+
+
+async def _results(url: str, ids: list[str]) -> dict[str, Any]:
+    rows = await asyncio.to_thread(_rows, url, ids)
+    return {identity: _value(row) for identity, row in rows.items() if row.state == DONE}
+
+
+async def _failures(url: str, ids: list[str]) -> dict[str, str]:
+    rows = await asyncio.to_thread(_rows, url, ids)
+    return {
+        identity: f"{row.failure['status']}: {row.failure['reason']}" if row.failure else row.state
+        for identity, row in rows.items()
+        if row.state in (FAILED, CANCELLED)
+    }
+
+
+async def _read(file: str) -> Any:
+    return json.loads(await asyncio.to_thread(Path(file).read_text, "utf-8"))
+
+
+def _rows(url: str, ids: list[str]) -> dict[str, Row]:
+    reader = Reader(url)
+    try:
+        return reader.rows(ids)
+    finally:
+        reader.close()
+
+
+def _value(row: Row) -> Any:
+    """What a step or a flow returned; a job's outcome wraps it."""
+    return row.result.get("result") if row.kind == "job" and row.result is not None else row.result

@@ -1,0 +1,360 @@
+"""The farm's commands: workers and coordinators, batches, and what an operator asks and does. See docs/operations.md.
+
+Like `cli.py`: nothing heavy is imported but inside the commands.
+"""
+
+import os
+import sys
+import time
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+from tyro.conf import Positional, UseAppendAction, arg
+
+from registration.errors import InputError
+from workflows import store_cli
+
+if TYPE_CHECKING:
+    from workflows.coregistration import Plan
+    from workflows.engine.control import Queue
+    from workflows.engine.reads import Figures, Row
+
+A_DAY = 10_000  # captures: what a farm is measured against
+Folder = Annotated[Path, arg(metavar="DIR")]
+Database = Annotated[str | None, arg(metavar="URL")]
+RunName = Annotated[str | None, arg(metavar="RUN")]
+
+
+def worker(
+    folder: Folder = Path("."),
+    db: Database = None,
+    root: UseAppendAction[Annotated[tuple[str, ...], arg(metavar="PLACE")]] = (),
+    gpu: Annotated[int | None, arg(metavar="N")] = None,
+    queue: Annotated[tuple[str, ...], arg(metavar="NAME")] = ("gpu",),
+) -> int:
+    """Take jobs from the queue and run them, one at a time, in a child process. One worker for each GPU or CPU place.
+
+    Args:
+        folder: The farm's folder: its logs, and its queue if no database is named.
+        db: The queue's database, better in the environment as GNMREG_DB if it holds a password.
+        root: Captures, models and results of jobs must lie below one of these folders and URLs; the farm's folder is
+            one. May come several times.
+        gpu: Use this GPU only; without it, none.
+        queue: Which jobs to take: gpu (registrations), rebuild (models: much memory), or both.
+    """
+    os.environ["CUDA_VISIBLE_DEVICES"] = "" if gpu is None else str(gpu)  # before anything looks for a GPU
+    from workflows.engine.durable import Process, known_queues, names, serve
+    from workflows.jobs import STEPS
+
+    serve(
+        Process(
+            url=_url(folder, db),
+            queues=known_queues(queue),
+            logs=folder.resolve() / "logs",
+            names=names("cpu") if gpu is None else names("gpu")[gpu : gpu + 1],
+            roots=(str(folder.resolve()), *root),
+            steps=STEPS,
+            modules=("workflows.farm_steps",),
+        )
+    )
+
+
+def coordinator(folder: Folder = Path("."), db: Database = None) -> int:
+    """Run the flows of the queue: batches, subjects, coregistrations. One is enough; a second takes over if it dies.
+
+    Args:
+        folder: The farm's folder.
+        db: The queue's database, as for worker.
+    """
+    from workflows.engine.durable import Process, names, serve
+    from workflows.flows import FLOWS
+    from workflows.jobs import DRIVER, SUBJECTS
+
+    serve(
+        Process(
+            url=_url(folder, db),
+            queues=(DRIVER, SUBJECTS),
+            logs=folder.resolve() / "logs",
+            names=names("coordinator"),
+            flows=FLOWS,
+        )
+    )
+
+
+def migrate(folder: Folder = Path("."), db: Database = None) -> int:
+    """Create the queue's tables or bring them up to date. Workers and coordinators do so too when they start.
+
+    Args:
+        folder: The farm's folder.
+        db: The queue's database, as for worker.
+    """
+    from workflows.engine.database import redacted_url
+    from workflows.engine.durable import migrate
+
+    url = _url(folder, db)
+    migrate(url)
+    print(f"the queue is ready: {redacted_url(url)}")
+    return 0
+
+
+def batch(
+    captures: Positional[Annotated[tuple[str, ...], arg(metavar="CAPTURE")]],
+    /,
+    model: Annotated[str, arg(metavar="NPZ")],
+    out: Annotated[str, arg(metavar="DIR|URL")],
+    recipe: Literal["draft", "studio", "in_model"] = "draft",
+    views: Annotated[int | None, arg(metavar="N")] = None,
+    seed: Annotated[int, arg(metavar="S")] = 0,
+    variant: Literal["llvm", "cuda"] = "llvm",
+    run: RunName = None,
+    local: bool = False,
+    workers: Annotated[int, arg(metavar="N")] = 1,
+    folder: Annotated[Path | None, arg(metavar="DIR")] = None,
+    db: Database = None,
+) -> int:
+    """Register many captures, each by itself: put them into the queue, and with --local do them here and now.
+
+    Args:
+        captures: Capture folders or URLs of such, or files with one a line, named @FILE.
+        model: The head model, a GNM NPZ file or its URL.
+        out: The store to publish results in, a folder or an s3:// URL.
+        recipe: As for register.
+        views: As for register.
+        seed: As for register.
+        variant: Render on the CPU (llvm) or on NVIDIA GPUs (cuda).
+        run: Name of the run; by default that of the store. The same run again adds what is new.
+        local: Start a coordinator and workers on this machine, wait, and end them.
+        workers: With --local, captures side by side; with cuda, one for each GPU instead.
+        folder: The farm's folder; by default DIR/farm beside the results with --local, else here.
+        db: The queue's database, as for worker.
+    """
+    from registration.progress import shown
+    from workflows.batch import batch_jobs, put_batch
+    from workflows.engine.durable import migrate
+    from workflows.farm_local import LocalFarm, gpus_here, run_until_done
+
+    made = batch_jobs(captures, model=model, out=out, run=run, recipe=recipe, views=views, seed=seed, variant=variant)
+    farm = folder or (_farm_beside(out) if local else Path("."))
+    url = _url(farm, db)
+    if local:
+        migrate(url)
+    count = put_batch(url, made)
+    print(f"{made.run}: {count} captures are in the queue", flush=True)
+    if not local:
+        return 0
+    roots = (*made.roots, str(farm.resolve()))
+    gpus = gpus_here(None) if variant == "cuda" else ()
+    with shown() as progress:
+        counts = run_until_done(
+            LocalFarm(url=url, folder=farm, roots=roots, workers=workers, gpus=gpus), made.run, progress
+        )
+    print("\n".join(_lines(_figures(url, made.run))))
+    return 0 if counts.get("done", 0) == sum(counts.values()) else 1
+
+
+def status(folder: Folder = Path("."), db: Database = None, run: RunName = None, watch: bool = False) -> int:
+    """Tell how far the queue is: counts, throughput, what failed and why, who works.
+
+    Args:
+        folder: The farm's folder.
+        db: The queue's database, as for worker.
+        run: Of this run, or part of a run, only.
+        watch: Tell again every two seconds, until Ctrl-C.
+    """
+    url = _url(folder, db)
+    while True:
+        text = "\n".join(_lines(_figures(url, run)))
+        print(f"\033[H\033[J{text}" if watch and sys.stdout.isatty() else text, flush=True)
+        if not watch:
+            return 0
+        time.sleep(2.0)
+
+
+def logs(
+    job: Positional[Annotated[str, arg(metavar="JOB")]], /, folder: Folder = Path("."), db: Database = None
+) -> int:
+    """Print what became of a job, and all that it printed.
+
+    Args:
+        job: Its id, such as RUN/it00/s00007/e003.
+        folder: The farm's folder, on the machine that ran it or shared.
+        db: The queue's database, as for worker.
+    """
+    from workflows.jobs import check_id
+
+    row = _row(folder, db, job)
+    print(f"{row.id}: {row.state}" + (f" on {row.executor}" if row.executor else ""))
+    if row.failure:
+        print(f"{row.failure['status']}: {row.failure['reason']}")
+    file = folder / "logs" / f"{check_id(job)}.log"
+    print(file.read_text("utf-8", "replace") if file.is_file() else f"no log here: {file}", end="")
+    return 0
+
+
+def debug(
+    job: Positional[Annotated[str, arg(metavar="JOB")]],
+    /,
+    out: Annotated[Path, arg(metavar="DIR")],
+    folder: Folder = Path("."),
+    db: Database = None,
+) -> int:
+    """Run a job again, here and now, with a picture after every stage. The queue and its results stay as they are.
+
+    Args:
+        job: Its id.
+        out: A new folder for what it makes: stages/, registration/, and inputs/ if they had to be fetched.
+        folder: The farm's folder.
+        db: The queue's database, as for worker.
+    """
+    from registration.progress import shown
+    from workflows.debug import debug
+
+    row = _row(folder, db, job)
+    if row.failure:
+        print(f"in the farm: {row.failure['status']}: {row.failure['reason']}")
+    with shown() as progress:
+        print(debug(row, out, progress))
+    print(out)
+    return 0
+
+
+def retry(
+    run: Positional[Annotated[str, arg(metavar="RUN")]],
+    /,
+    failed: bool = False,
+    cancelled: bool = False,
+    folder: Folder = Path("."),
+    db: Database = None,
+) -> int:
+    """Put what failed in a run into the queue again, in place, with what followed from it. Also unparks a run.
+
+    Args:
+        run: The run, or a part of it.
+        failed: Retry what failed (there is nothing else to retry, but it should be said).
+        cancelled: Also what was cancelled.
+        folder: The farm's folder.
+        db: The queue's database, as for worker.
+    """
+    if not failed and not cancelled:
+        raise InputError(
+            "Nothing is chosen to be retried",
+            where="retry",
+            expected="--failed, --cancelled or both",
+            got="neither",
+            fix="add --failed",
+        )
+    with _queue(folder, db) as queue:
+        again = queue.retry(run, failed=failed, cancelled=cancelled)
+    print(f"{len(again)} again" + "".join(f"\n  {identity}" for identity in again[:20]))
+    return 0
+
+
+def cancel(
+    run: Positional[Annotated[str, arg(metavar="RUN")]], /, folder: Folder = Path("."), db: Database = None
+) -> int:
+    """End a run, or a part of it: nothing more of it starts, and what is running is stopped within seconds.
+
+    Args:
+        run: The run, or a part of it such as RUN/it00/s00007.
+        folder: The farm's folder.
+        db: The queue's database, as for worker.
+    """
+    with _queue(folder, db) as queue:
+        print(f"{queue.cancel(run)} cancelled")
+    return 0
+
+
+COMMANDS: Mapping[str, Callable[..., int] | tuple[str, Mapping[str, Callable[..., int]]]] = {
+    "batch": batch,
+    "worker": worker,
+    "coordinator": coordinator,
+    "status": status,
+    "logs": logs,
+    "debug": debug,
+    "retry": retry,
+    "cancel": cancel,
+    "migrate": migrate,
+    "store": ("Look after published results.", {"verify": store_cli.verify, "retire": store_cli.retire}),
+}
+
+
+def put_coregistration(plan: "Plan", folder: Path, db: str | None) -> str:
+    """Put a coregistration into the queue and say so."""
+    from workflows.farm_coregistration import put_coregistration
+
+    return f"{put_coregistration(_url(folder, db), plan)} is in the queue; see gnmreg status"
+
+
+def _lines(figures: "Figures") -> list[str]:
+    """What status prints."""
+    total = sum(figures.counts.values())
+    counts = ", ".join(f"{figures.counts[state]} {state}" for state in sorted(figures.counts)) or "none"
+    flows = ", ".join(f"{figures.flows[state]} {state}" for state in sorted(figures.flows)) or "none"
+    lines = [f"jobs: {total} ({counts})", f"flows: {sum(figures.flows.values())} ({flows})"]
+    share = 100 * figures.a_day / A_DAY
+    rate = f"done at a rate of {figures.a_day:,.0f} a day, {share:.0f} % of {A_DAY:,}"
+    lines.append(f"{rate}; {figures.ended_last_hour} ended in the last hour")
+    lines += [f"{name}: {count} running" for name, count in sorted(figures.workers.items())]
+    if figures.failures:
+        lines.append("failed:")
+        lines += [f"{count:7d}  {reason[:200]}" for reason, count in list(figures.failures.items())[:20]]
+    return lines
+
+
+def _figures(url: str, run: str | None) -> "Figures":
+    from workflows.engine.reads import Reader
+
+    reader = Reader(url)
+    try:
+        return reader.figures(run)
+    finally:
+        reader.close()
+
+
+def _row(folder: Path, db: str | None, job: str) -> "Row":
+    from workflows.engine.reads import Reader
+
+    reader = Reader(_url(folder, db))
+    try:
+        row = reader.rows([job]).get(job)
+    finally:
+        reader.close()
+    if row is None:
+        raise InputError(
+            "There is no such job", where="JOB", expected="an id that the queue knows", got=job, fix="see gnmreg status"
+        )
+    return row
+
+
+@contextmanager
+def _queue(folder: Path, db: str | None) -> Iterator["Queue"]:
+    from workflows.engine.control import Queue
+
+    queue = Queue(_url(folder, db))
+    try:
+        yield queue
+    finally:
+        queue.close()
+
+
+def _url(folder: Path, db: str | None) -> str:
+    from workflows.engine.database import ENVIRONMENT, checked_url, default_url
+
+    return checked_url(db or os.environ.get(ENVIRONMENT) or default_url(folder))
+
+
+def _farm_beside(out: str) -> Path:
+    from workflows.places import is_remote, local_path
+
+    if is_remote(out):
+        raise InputError(
+            "A farm on this machine needs a folder",
+            where="--folder",
+            expected="a folder for its queue and logs, as the results go to a URL",
+            got="none",
+            fix="add --folder DIR",
+        )
+    place = local_path(out).resolve()
+    return place.with_name(f"{place.name}.farm")
