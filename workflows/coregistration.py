@@ -294,7 +294,7 @@ def _check(plan: Plan, asked: bool) -> None:
             "The numbers of components are out of order", where="components", expected=expected, got=plan.components
         )
     have = len(identity_part(gnm_npz.read(plan.model)).basis)
-    kept = have if steps.builder().identity.previous > 0 else 0
+    kept = have if steps.builder().identity.previous != 0 else 0
     most = min(have, len(plan.split.training) - 1 + kept)
     if asked and plan.components[-1] > most:
         raise InputError(
