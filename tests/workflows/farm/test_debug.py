@@ -1,0 +1,83 @@
+"""A job again in the foreground, with stand-ins for what takes minutes."""
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import registration.register
+from registration.errors import InputError
+from registration.progress import Silent
+from tests.report.test_page import a_registration
+from workflows.debug import debug
+from workflows.engine.reads import Row
+
+
+def row(step: str = "register", kind: str = "job", **arguments: Any) -> Row:
+    return Row(
+        id="run/s1/e001",
+        kind=kind,
+        state="failed",
+        executor="w",
+        spec={"step": step, "arguments": arguments},
+        result=None,
+        failure=None,
+        created=0.0,
+        ended=None,
+    )
+
+
+@pytest.fixture
+def calls(monkeypatch: pytest.MonkeyPatch) -> list[dict[str, Any]]:
+    made: list[dict[str, Any]] = []
+
+    def register(capture: Path, **settings: Any) -> Any:
+        made.append({"capture": capture, **settings})
+        return a_registration(status="failed", reason="so it is")
+
+    monkeypatch.setattr(registration.register, "register", register)
+    return made
+
+
+@pytest.mark.parametrize("step", ["register", "register stored"])
+def test_a_registration_is_made_again_with_pictures_and_out_of_the_way(
+    calls: list[dict[str, Any]], tmp_path: Path, step: str
+) -> None:
+    arguments = {"capture": "/c/e", "model": "/m.npz", "recipe": "studio", "views": 5, "seed": 3, "variant": "llvm"}
+    places = {
+        "register": {"out": "/results/e", "neutral": "/results/n"},
+        "register stored": {"store": "/s", "key": "k"},
+    }
+    told = debug(row(step, **arguments, **places[step]), tmp_path / "out", Silent())
+    assert told == "failed: so it is"
+    (call,) = calls
+    assert call["capture"] == Path("/c/e") and call["model_path"] == Path("/m.npz")
+    assert call["out"] == tmp_path / "out" / "registration" and call["pictures"] == tmp_path / "out" / "stages"
+    assert call["neutral"] == (Path("/results/n") if step == "register" else None)
+    assert {name: call[name] for name in ("recipe", "views", "seed", "variant")} == {
+        **{"recipe": "studio", "views": 5, "seed": 3, "variant": "llvm"}
+    }
+
+
+def test_a_capture_from_a_url_is_kept_for_looking(
+    calls: list[dict[str, Any]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("workflows.debug.fetch_folder", lambda place, folder: folder.mkdir(parents=True))
+    monkeypatch.setattr("workflows.debug.model_here", lambda place: Path("/cache/m.npz"))
+    stored = row("register stored", capture="s3://b/c/e", model="s3://b/m.npz", store="s3://b/s", key="k")
+    debug(stored, tmp_path / "out", Silent())
+    assert calls[0]["capture"] == tmp_path / "out" / "inputs" / "e" and calls[0]["capture"].is_dir()
+
+
+def test_what_cannot_be_debugged_is_refused(calls: list[dict[str, Any]], tmp_path: Path) -> None:
+    (tmp_path / "full").mkdir()
+    (tmp_path / "full" / "x").write_text("mine")
+    for wrong, out in (
+        (row(kind="flow"), tmp_path / "out"),
+        (row(), tmp_path / "full"),
+        (row(step="os:system"), tmp_path / "out"),
+        (row(capture="http://x/y"), tmp_path / "out"),
+    ):
+        with pytest.raises(InputError):
+            debug(wrong, out, Silent())
+    assert not calls and not (tmp_path / "out").exists()
