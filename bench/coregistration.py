@@ -29,6 +29,7 @@ from coregister.synth import Studio  # noqa: E402
 from registration.model import gnm_npz  # noqa: E402
 from registration.model.gnm_npz import GNMData  # noqa: E402
 from registration.progress import shown  # noqa: E402
+from registration.render.studio.shoot import Quality  # noqa: E402
 from workflows import steps  # noqa: E402
 from workflows.coregistration import FIRST, coregister  # noqa: E402
 from workflows.held_out import read_held_out  # noqa: E402
@@ -37,7 +38,7 @@ from workflows.synth_dataset import Population, synth_dataset  # noqa: E402
 COMPONENTS = (10, 20, 40)
 AT = "20"  # what counts
 SAMPLES = 100
-STUDIO = Studio(cameras=8, size_px=(256, 256), texture_size=1024)
+STUDIO = Studio(cameras=8, size_px=(256, 256), texture_size=512, quality=Quality(pixel_samples=2, light_rays=32))
 ALWAYS_ON = {"gain": -1e9, "drift_mm": 1e9, "failures": 1.0}  # a bench wants all rounds
 
 
@@ -70,7 +71,7 @@ def main() -> None:
     parser.add_argument("--rounds", type=int, default=2)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--jobs", type=int, default=2)
-    parser.add_argument("--recipe", default="draft")
+    parser.add_argument("--recipe", default="preview")
     options = parser.parse_args()
     count = options.training + options.held_out
     first = bootstrap.bootstrap(options.out / "first" / "gnm_head_first.npz")

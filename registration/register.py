@@ -81,7 +81,7 @@ def register(
         capture_path: a native capture folder.
         model_path: an official GNM NPZ file; landmark schemes lie beside it.
         out: replaced if we wrote it before; returned at once if it was made from the same inputs.
-        recipe: "draft", "studio", "in_model", or one of your own.
+        recipe: "preview", "draft", "studio", "in_model", or one of your own.
         views: use only so many views, spread around the head.
         seed: of view subsets and silhouette samples.
         neutral: folder of the subject's neutral registration: its identity, offsets and texture are the start, and

@@ -141,6 +141,21 @@ def studio(*, scale: bool = True) -> Recipe:
     return Recipe(name="studio", stages=wider, scale=scale, finest_head_px=1024)
 
 
+def preview(*, scale: bool = True) -> Recipe:
+    """Seconds, for small images: half of draft's levels and steps, and nothing looks after parts that touch."""
+    stages = (
+        _model(70),
+        _offsets(20, 12, 20, level=1, start=4e-3, end=2e-3),
+        _offsets(5, 8, 25, level=0, start=1e-3, end=5e-4),
+        _offsets(1.5, 5, 25, level=0, start=2e-4, end=2e-5, ssim=0.0),
+    )
+    plain = (
+        replace(stage, level=min(stage.level, 1), weights=replace(stage.weights, contacts=0.0, tongue=0.0))
+        for stage in stages
+    )
+    return Recipe(name="preview", stages=tuple(plain), scale=scale, levels=2, texture_px=512)
+
+
 def in_model(*, scale: bool = True) -> Recipe:
     """No offsets: the model's own parameters alone, as for testing how much a model can say."""
     fine = replace(_model(60), name="model, finer", level=1)
@@ -165,4 +180,9 @@ def expression_of(recipe: Recipe) -> Recipe:
     return replace(recipe, stages=stages)
 
 
-RECIPES: dict[str, Callable[[], Recipe]] = {"draft": draft, "studio": studio, "in_model": in_model}
+RECIPES: dict[str, Callable[[], Recipe]] = {
+    "preview": preview,
+    "draft": draft,
+    "studio": studio,
+    "in_model": in_model,
+}

@@ -38,6 +38,6 @@ def activate(variant: Variant = "llvm", *, deterministic: bool = False) -> torch
     torch.use_deterministic_algorithms(True, warn_only=variant == "cuda")
     torch.utils.deterministic.fill_uninitialized_memory = False  # type: ignore[attr-defined]
     if deterministic:
-        dr.set_thread_count(1)
         torch.set_num_threads(1)
+    dr.set_thread_count(torch.get_num_threads())  # OMP_NUM_THREADS is for both: processes side by side share the cores
     return torch.device("cuda" if variant == "cuda" else "cpu")
