@@ -20,7 +20,7 @@ from registration.stages import RECIPES
 from workflows.coregistration import FIRST, Plan, State, decided, save
 from workflows.dataset import Split, read_dataset
 from workflows.jobs import Unusable
-from workflows.local import check_recipe
+from workflows.local import begin_subject, check_recipe
 from workflows.model_subjects import has_truths
 from workflows.places import capture_here, model_here
 from workflows.store import Store
@@ -82,6 +82,7 @@ def register_capture(
     model: str,
     out: str,
     neutral: str | None = None,
+    subject_dir: str | None = None,
     recipe: str = "draft",
     views: int | None = None,
     seed: int = 0,
@@ -90,10 +91,14 @@ def register_capture(
 ) -> dict[str, Any]:
     """Register one capture of a subject into the folder `out`, from the folder of its neutral's registration.
 
+    With `subject_dir`, the folder of the subject's captures, it is the first of them: the subject's record is begun.
+
     Raises:
         InputError: as `register`.
         Unusable: the registration's status is failed; its folder is kept.
     """
+    if subject_dir is not None:
+        begin_subject(Path(subject_dir), model_path=Path(model), out=Path(out).parent, recipe=recipe)
     result = register(
         Path(capture),
         model_path=Path(model),

@@ -50,8 +50,7 @@ async def subject(
     def job(number: int, name: str) -> Job:
         kind = "neutral" if number == 0 else f"e{number:03d}"
         arguments = {"capture": f"{subject_dir}/{name}", "out": f"{out}/{name}", **place}
-        if number:
-            arguments["neutral"] = f"{out}/{neutral}"
+        arguments |= {"neutral": f"{out}/{neutral}"} if number else {"subject_dir": subject_dir}
         priority = NEUTRAL_PRIORITY if number == 0 else EXPRESSION_PRIORITY
         return Job(id=f"{scope.id}/{kind}", step="register", arguments=arguments, priority=priority)
 

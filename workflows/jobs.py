@@ -68,7 +68,9 @@ class Unusable(Exception):
 
 STEPS: Mapping[str, Step] = {
     "register stored": Step(function="workflows.farm_steps:register_stored", places=("capture", "model", "store")),
-    "register": Step(function="workflows.farm_steps:register_capture", places=("capture", "model", "out", "neutral")),
+    "register": Step(
+        function="workflows.farm_steps:register_capture", places=("capture", "model", "out", "neutral", "subject_dir")
+    ),
     "collect": Step(function="workflows.steps:register_subject", places=("subject_dir", "model", "out")),
     "hold out": Step(function="workflows.steps:hold_out", places=("dataset", "registrations", "model", "out")),
     "stabilize": Step(function="workflows.steps:stabilize", places=("run", "model", "out")),

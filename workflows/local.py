@@ -20,7 +20,7 @@ from registration.register import register
 from registration.render.backend import Variant
 from registration.stages import RECIPES
 from registration.types import Capture, Registration
-from workflows.subject_folder import Captures, Row, Subject, check_subject_out, read_captures, save_subject
+from workflows.subject_folder import MANIFEST, Captures, Row, Subject, check_subject_out, read_captures, save_subject
 from workflows.subject_page import thumbnail, write_subject_page
 
 HEADLINE = ("scan_to_mesh", "drift")  # of a manifest's figures, those of the face
@@ -64,10 +64,7 @@ def register_subject(
     progress = progress or Silent()
     subject_dir, out, model_path = Path(subject_dir), Path(out), Path(model_path)
     landmark_files = {name: Path(file) for name, file in (landmark_files or {}).items()}
-    check_recipe(recipe)
-    captures = read_captures(subject_dir, neutral)
-    check_subject_out(out, captures)
-    model = _checked_model(model_path, landmark_files)
+    captures, start = _begun(subject_dir, model_path, out, recipe, neutral, landmark_files)
     one = partial(
         register,
         model_path=model_path,
@@ -79,14 +76,39 @@ def register_subject(
         variant=variant,
         landmark_files=landmark_files,
     )
+    return _loop(captures.captures, one, _Record(start, out), leave or {}, progress)
+
+
+def begin_subject(subject_dir: Path, *, model_path: Path, out: Path, recipe: str) -> None:
+    """Write the record of a subject of which nothing is registered yet, so that registrations may be put beside it.
+
+    One that is there stays. Raises InputError as `register_subject`.
+    """
+    _, start = _begun(subject_dir, model_path, out, recipe, None, {})
+    if not (out / MANIFEST).exists():
+        _Record(start, out)
+
+
+def _begun(
+    subject_dir: Path,
+    model_path: Path,
+    out: Path,
+    recipe: str,
+    neutral: str | None,
+    landmark_files: Mapping[str, Path],
+) -> tuple[Captures, Subject]:
+    """A subject's captures, and what is known before the first is registered. Everything is checked."""
+    check_recipe(recipe)
+    captures = read_captures(subject_dir, neutral)
+    check_subject_out(out, captures)
     start = Subject(
         subject=captures.subject,
-        model=model,
+        model=_checked_model(model_path, landmark_files),
         recipe=recipe,
         neutral=captures.captures[0].root.name,
         rows=_waiting(captures),
     )
-    return _loop(captures.captures, one, _Record(start, out), leave or {}, progress)
+    return captures, start
 
 
 class _Record:

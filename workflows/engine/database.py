@@ -117,7 +117,7 @@ def engine(url: str, *, read_only: bool = False) -> sa.Engine:
     """Our own connections, one at a time; with `read_only` the database itself refuses to write."""
     if not is_sqlite(url):
         options = "-c default_transaction_read_only=on" if read_only else ""
-        arguments = {"connect_timeout": 10, "options": options}
+        arguments = {"connect_timeout": 30, "options": options}
         return sa.create_engine(url, poolclass=sa.pool.NullPool, connect_args=arguments)
     made = sa.create_engine(url, poolclass=sa.pool.NullPool, connect_args={"timeout": _BUSY_S})
 
