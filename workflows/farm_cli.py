@@ -104,7 +104,7 @@ def batch(
     /,
     model: Annotated[str, arg(metavar="NPZ")],
     out: Annotated[str, arg(metavar="DIR|URL")],
-    recipe: Literal["draft", "studio", "in_model"] = "draft",
+    recipe: Literal["preview", "draft", "studio", "in_model"] = "draft",
     views: Annotated[int | None, arg(metavar="N")] = None,
     seed: Annotated[int, arg(metavar="S")] = 0,
     variant: Literal["llvm", "cuda"] = "llvm",

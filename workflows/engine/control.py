@@ -23,10 +23,11 @@ _ITERATION = re.compile(r"^[^/]+/(it[0-9]+)(?:/|$)")
 class Queue:
     """A connection to the queue's database."""
 
-    def __init__(self, url: str) -> None:
-        """Raises InputError if there is no queue at the URL: `migrate` makes one."""
+    def __init__(self, url: str, *, known: bool = False) -> None:
+        """Raises InputError if there is no queue at the URL, unless one is `known` to be there: `migrate` makes it."""
         self.url = checked_url(url)
-        require_queue(self.url)
+        if not known:
+            require_queue(self.url)
         self._engine = engine(self.url)
         self._client = DBOSClient(
             system_database_engine=self._engine,

@@ -56,10 +56,11 @@ class Figures:
 class Reader:
     """Read-only questions to the queue's database."""
 
-    def __init__(self, url: str) -> None:
-        """Raises InputError if there is no queue at the URL."""
+    def __init__(self, url: str, *, known: bool = False) -> None:
+        """Raises InputError if there is no queue at the URL, unless it is `known` that there is one."""
         self.url = checked_url(url)
-        require_queue(self.url)
+        if not known:
+            require_queue(self.url)
         self._engine = engine(self.url, read_only=True)
         self._status, self._output, self._input = (
             table(self.url, name) for name in ("workflow_status", "workflow_output", "workflow_input")

@@ -2,12 +2,14 @@
 
 import asyncio
 import json
+import logging
 import random
 from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
+import sqlalchemy as sa
 from dbos import DBOS
 
 from workflows.engine.control import CHUNK, Queue
@@ -15,7 +17,13 @@ from workflows.engine.reads import CANCELLED, DONE, FAILED, Reader, Row, ended
 from workflows.engine.rows import JobFailed
 from workflows.jobs import FlowJob, Job
 
+log = logging.getLogger("gnmreg")
+
 LOOK_S = 1.0  # between two looks at the counts
+AGAIN_S = 2.0  # after which a database that did not answer is asked again
+
+T = TypeVar("T")
+Opened = TypeVar("Opened", Queue, Reader)
 
 
 class Scope:
@@ -70,14 +78,7 @@ class Scope:
 
 
 async def _put(url: str, jobs: list[Job | FlowJob]) -> int:
-    def put() -> int:
-        queue = Queue(url)
-        try:
-            return queue.put(jobs)
-        finally:
-            queue.close()
-
-    return await asyncio.to_thread(put)
+    return await _patiently(lambda: _with(Queue(url, known=True), lambda queue: queue.put(jobs)))
 
 
 async def _counted(url: str, ids: list[str]) -> dict[str, int]:
@@ -92,10 +93,10 @@ async def _counted_below(url: str, part: str) -> dict[str, int]:
 async def _polled(
     url: str, count: Callable[[Reader], dict[str, int]], over: Callable[[dict[str, int]], bool]
 ) -> dict[str, int]:
-    reader = Reader(url)
+    reader = Reader(url, known=True)
     try:
         while True:
-            counts: dict[str, int] = await asyncio.to_thread(count, reader)
+            counts = await _patiently(partial(count, reader))
             if over(counts):
                 return counts
             await asyncio.sleep(LOOK_S * random.uniform(0.8, 1.2))
@@ -104,12 +105,12 @@ async def _polled(
 
 
 async def _results(url: str, ids: list[str]) -> dict[str, Any]:
-    rows = await asyncio.to_thread(_rows, url, ids)
+    rows = await _rows(url, ids)
     return {identity: _value(row) for identity, row in rows.items() if row.state == DONE}
 
 
 async def _failures(url: str, ids: list[str]) -> dict[str, str]:
-    rows = await asyncio.to_thread(_rows, url, ids)
+    rows = await _rows(url, ids)
     return {
         identity: f"{row.failure['status']}: {row.failure['reason']}" if row.failure else row.state
         for identity, row in rows.items()
@@ -121,12 +122,26 @@ async def _read(file: str) -> Any:
     return json.loads(await asyncio.to_thread(Path(file).read_text, "utf-8"))
 
 
-def _rows(url: str, ids: list[str]) -> dict[str, Row]:
-    reader = Reader(url)
+async def _rows(url: str, ids: list[str]) -> dict[str, Row]:
+    return await _patiently(lambda: _with(Reader(url, known=True), lambda reader: reader.rows(ids)))
+
+
+async def _patiently(ask: Callable[[], T]) -> T:
+    """The answer of the database, however long it takes to come back: a restart of the server must end no flow."""
+    while True:
+        try:
+            return await asyncio.to_thread(ask)
+        except (sa.exc.OperationalError, sa.exc.InterfaceError) as error:
+            first, *_ = str(error.orig).splitlines() or [""]
+            log.warning("the queue's database does not answer, waiting: %s", first)
+            await asyncio.sleep(AGAIN_S)
+
+
+def _with(opened: Opened, use: Callable[[Opened], T]) -> T:
     try:
-        return reader.rows(ids)
+        return use(opened)
     finally:
-        reader.close()
+        opened.close()
 
 
 def _value(row: Row) -> Any:
