@@ -69,16 +69,13 @@ class Reader:
     def close(self) -> None:
         self._engine.dispose()
 
-    def counts(self, run: str, *, kind: str | None = None, direct: bool = False) -> dict[str, int]:
-        """State -> number of jobs and flows below a run, itself aside; `direct`: not those of flows below it."""
+    def counts(self, run: str, *, kind: str | None = None) -> dict[str, int]:
+        """State -> number of jobs and flows below a run, itself aside."""
         parameters = {"below": below(check_id(run))["below"]}
         query = f"SELECT status, count(*) FROM {self._status} WHERE workflow_uuid LIKE :below ESCAPE '\\'"
         if kind:
             query += " AND name = :kind"
             parameters["kind"] = kind
-        if direct:
-            query += " AND workflow_uuid NOT LIKE :deeper ESCAPE '\\'"
-            parameters["deeper"] = f"{parameters['below']}/%"
         return _by_state(self._rows(query + " GROUP BY status", parameters))
 
     def counts_of(self, ids: Sequence[str]) -> dict[str, int]:

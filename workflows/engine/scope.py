@@ -44,7 +44,7 @@ class Scope:
         return counts
 
     async def wait_below(self, part: str) -> dict[str, int]:
-        """Like `wait` for whatever lies in the queue directly below an id: no list of ids is needed."""
+        """Like `wait` for all jobs that lie in the queue below an id: no list of ids is needed."""
         counts: dict[str, int] = await self._step("wait", _counted_below, self._url, part)
         return counts
 
@@ -86,7 +86,7 @@ async def _counted(url: str, ids: list[str]) -> dict[str, int]:
 
 
 async def _counted_below(url: str, part: str) -> dict[str, int]:
-    count = partial(Reader.counts, run=part, direct=True)
+    count = partial(Reader.counts, run=part, kind="job")
     return await _polled(url, count, lambda counts: ended(counts) == sum(counts.values()))
 
 

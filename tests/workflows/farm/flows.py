@@ -3,6 +3,7 @@
 from typing import Any
 
 from workflows.engine.scope import Scope
+from workflows.flows import batch
 from workflows.jobs import EXPRESSION_PRIORITY, NEUTRAL_PRIORITY, STABILIZE_PRIORITY, FlowJob, Job
 
 
@@ -34,4 +35,4 @@ def _work(identity: str, folder: str, seconds: float, **settings: Any) -> Job:
     return Job(id=identity, step="work", arguments=arguments, **settings)
 
 
-FLOWS = {"graph": graph, "subject": subject}
+FLOWS = {"graph": graph, "subject": subject, "batch": batch}

@@ -74,6 +74,14 @@ def test_a_flow_is_done_once_and_again_is_nothing(small: Farm) -> None:
     assert small.reader.counts("flow") == {"done": 11}
 
 
+def test_a_batch_ends_when_the_last_of_its_jobs_does(small: Farm) -> None:
+    small.queue.put([work(small, f"many/ann/e{n}", seconds=0.4) for n in range(4)])
+    small.queue.put([Job(id="many/bob/e0", step="refuse")])
+    small.queue.put([FlowJob(id="many", flow="batch", queue="driver")])
+    small.ends("many")
+    assert small.job("many")["result"] == {"done": 4, "failed": 1}
+
+
 def test_what_failed_is_retried_in_place(small: Farm) -> None:
     blocked = small.folder / "store2"
     blocked.write_text("in the way")
