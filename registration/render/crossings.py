@@ -130,7 +130,6 @@ def _cross(
     shares = [side.shares(surface, camera.centre, ray(s)) for side in sides]
     for value in (*shares[0], *shares[1]):
         active &= value > -_SLACK
-    shares = [[dr.select(active, value, 0) for value in side] for side in shares]
     values = [drawn.channels(view, face, part) for face, part in zip(faces, shares, strict=True)]
     jump = adjoint.times([f - h for f, h in zip(*values, strict=True)], dr.select(s < 0.5, pixel, other))
     weight = drawn.share * jump * dr.square(sides[0].nearness(ray(s))) / (before - after)

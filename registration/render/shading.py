@@ -61,7 +61,7 @@ class Footprint:
     def of(cls, uv: mi.Point2f, size: int) -> Footprint:
         """Bilinear, clamped at the border. Row 0 of the texture is at v = 1. What is not a number lies in a corner."""
         position = mi.Point2f(uv.x, 1 - uv.y) * size - 0.5
-        # As an integer NaN would be a place 8 GB before the texture.
+        # Barycentrics of rays that miss are anything; as an integer NaN would be a place 8 GB before the texture.
         clamped = dr.clip(dr.select(dr.isnan(position), 0, position), 0, size - 1.001)
         column, row = mi.UInt32(clamped.x), mi.UInt32(clamped.y)
         return cls(

@@ -266,6 +266,5 @@ def _on(samples: _Samples, drawn: Drawn, edges: EdgeArrays, view: mi.UInt32, edg
 def _off(drawn: Drawn, view: mi.UInt32, face: mi.UInt32, shares: list[mi.Float]) -> list[mi.Float]:
     """The channels just beyond: of a face, or zeros of the background."""
     is_hit = face != NO_FACE
-    shares = [dr.select(is_hit, share, 0) for share in shares]  # of a miss they are anything
     channels = drawn.channels(view, dr.select(is_hit, face, 0), shares)
     return [dr.select(is_hit, value, 0) for value in channels]
