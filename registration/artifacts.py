@@ -10,7 +10,8 @@ import os
 import secrets
 import shutil
 import zipfile
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -73,11 +74,7 @@ def check_out(out: Path) -> None:
 
 def is_registration(path: Path) -> bool:
     """Whether the folder holds a manifest that we wrote, of any schema version."""
-    try:
-        manifest = json.loads((Path(path) / "manifest.json").read_text())
-    except (OSError, ValueError):
-        return False
-    return isinstance(manifest, dict) and manifest.get("kind") == KIND
+    return manifest_of_kind(Path(path) / "manifest.json", KIND) is not None
 
 
 def save_registration(registration: Registration, out: Path, report_html: str | None = None) -> Path:
@@ -95,10 +92,7 @@ def save_registration(registration: Registration, out: Path, report_html: str | 
     if problem := _problem(arrays, finite=registration.status != "failed"):
         raise ValueError("{}: expected {}, got {}".format(*problem))
     texture = _encode_texture(registration.texture)
-    out.parent.mkdir(parents=True, exist_ok=True)
-    fresh = out.with_name(f".{out.name}.{secrets.token_hex(4)}.tmp")
-    fresh.mkdir()
-    try:
+    with fresh_folder(out) as fresh:
         np.savez(fresh / "registration.npz", allow_pickle=False, **arrays)
         _write_png(fresh / "texture.png", texture)
         write_ply(fresh / "mesh.ply", arrays["vertices"], arrays["triangles"])
@@ -107,9 +101,6 @@ def save_registration(registration: Registration, out: Path, report_html: str | 
         if report_html is not None:
             (fresh / "report.html").write_text(report_html, encoding="utf-8")
         _write_json(fresh / "manifest.json", _manifest(registration, content_id(arrays, texture)))
-        replace_folder(fresh, out)
-    finally:
-        shutil.rmtree(fresh, ignore_errors=True)
     return out
 
 
@@ -314,6 +305,50 @@ def swap_in(file: Path, text: str) -> None:
         os.replace(fresh, file)
     finally:
         fresh.unlink(missing_ok=True)
+
+
+def manifest_of_kind(file: Path, kind: str) -> dict[str, Any] | None:
+    """The JSON object in a file, if there is one and it says that it is of this kind."""
+    try:
+        manifest = json.loads(file.read_text("utf-8"))
+    except (OSError, ValueError):
+        return None
+    return manifest if isinstance(manifest, dict) and manifest.get("kind") == kind else None
+
+
+def refuse_foreign(
+    out: Path, *, kind: str, command: str, manifest: str = "manifest.json", files: Sequence[str] | None = None
+) -> None:
+    """Refuse a folder that `gnmreg COMMAND` did not write, or that holds more than these files (None: any).
+
+    Raises InputError, for a file in its place too. A folder that is missing or empty will do.
+    """
+    if not out.exists():
+        return
+    names = sorted(path.name for path in out.iterdir()) if out.is_dir() else ["a file"]
+    foreign = [name for name in names if files is not None and name not in files]
+    if foreign or (names and manifest_of_kind(out / manifest, kind) is None):
+        raise InputError(
+            "The output folder cannot be used",
+            where=out,
+            expected=f"a new or empty folder, or one that `gnmreg {command}` wrote",
+            got=", ".join((foreign or names)[:3]),
+            fix="choose another output folder with --out",
+        )
+
+
+@contextmanager
+def fresh_folder(out: Path) -> Iterator[Path]:
+    """A folder beside `out` that takes its place in one rename, unless something goes wrong: then nothing is left."""
+    out = Path(out).resolve()
+    out.parent.mkdir(parents=True, exist_ok=True)
+    fresh = out.with_name(f".{out.name}.{secrets.token_hex(4)}.tmp")
+    fresh.mkdir()
+    try:
+        yield fresh
+        replace_folder(fresh, out)
+    finally:
+        shutil.rmtree(fresh, ignore_errors=True)
 
 
 def replace_folder(fresh: Path, out: Path) -> None:

@@ -12,7 +12,7 @@ from typing import Any
 
 from coregister.decide import Rule
 from coregister.generalization import identity_part
-from registration.artifacts import swap_in
+from registration.artifacts import refuse_foreign, swap_in
 from registration.errors import InputError
 from registration.hashes import plain, versions
 from registration.model import gnm_npz
@@ -263,22 +263,7 @@ def save(state: State, open_round: Mapping[str, Any] | None = None) -> None:
 
 def check_out(out: Path) -> None:
     """Refuse, before any work, a folder that is not ours to write into. Raises InputError."""
-    if not out.exists() or (out.is_dir() and not any(out.iterdir())):
-        return
-    try:
-        told = json.loads((out / MANIFEST).read_text("utf-8"))
-        ours = isinstance(told, dict) and told.get("kind") == KIND
-    except (OSError, ValueError):
-        ours = False
-    if not ours:
-        names = sorted(path.name for path in out.iterdir()) if out.is_dir() else ["a file"]
-        raise InputError(
-            "The output folder cannot be used",
-            where=out,
-            expected="a new or empty folder, or one that `gnmreg coregister` wrote",
-            got=", ".join(names[:3]),
-            fix="choose another output folder with --out",
-        )
+    refuse_foreign(out, kind=KIND, command="coregister", manifest=MANIFEST)
 
 
 def _check(plan: Plan, asked: bool) -> None:

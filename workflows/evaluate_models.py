@@ -1,8 +1,6 @@
 """`gnmreg model evaluate`: models and held-out subjects in, a folder with figures and a page out."""
 
 import json
-import secrets
-import shutil
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -10,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from coregister.evaluate import Evaluation, Settings, check, evaluate
-from registration.artifacts import replace_folder
+from registration.artifacts import fresh_folder, manifest_of_kind, refuse_foreign
 from registration.errors import InputError
 from registration.hashes import input_hash, plain, versions
 from registration.model import gnm_npz
@@ -51,12 +49,11 @@ def evaluate_models(
     check(models, found.subjects, found.triangles, settings)
     inputs = {**{f"model {name}": gnm_npz.content_hash(data) for name, data in models.items()}, **found.inputs}
     wanted = input_hash(inputs, plain(settings))
-    if not force and _is_evaluation(out):
-        manifest: dict[str, Any] = json.loads((Path(out) / MANIFEST).read_text("utf-8"))
-        if manifest.get("input_hash") == wanted and manifest.get("schema") == SCHEMA:
-            return manifest
+    known = None if force else manifest_of_kind(Path(out) / MANIFEST, KIND)
+    if known is not None and known.get("input_hash") == wanted and known.get("schema") == SCHEMA:
+        return known
     evaluation = evaluate(models, found.subjects, found.triangles, settings, progress)
-    manifest = plain(
+    manifest: dict[str, Any] = plain(
         {
             "kind": KIND,
             "schema": SCHEMA,
@@ -90,27 +87,7 @@ def lines(manifest: Mapping[str, Any]) -> list[str]:
 
 def check_out(out: Path) -> None:
     """Refuse, before any work, a folder that is not ours to replace. Raises InputError."""
-    out = Path(out)
-    if not out.exists():
-        return
-    names = sorted(path.name for path in out.iterdir()) if out.is_dir() else ["a file"]
-    foreign = [name for name in names if name not in _FILES]
-    if foreign or (names and not _is_evaluation(out)):
-        raise InputError(
-            "The output folder cannot be used",
-            where=out,
-            expected="a new or empty folder, or one that `gnmreg model evaluate` wrote",
-            got=", ".join((foreign or names)[:3]),
-            fix="choose another output folder with --out",
-        )
-
-
-def _is_evaluation(out: Path) -> bool:
-    try:
-        manifest = json.loads((Path(out) / MANIFEST).read_text("utf-8"))
-    except (OSError, ValueError):
-        return False
-    return isinstance(manifest, dict) and manifest.get("kind") == KIND
+    refuse_foreign(Path(out), kind=KIND, command="model evaluate", files=_FILES)
 
 
 def _named(paths: Sequence[Path]) -> dict[str, Path]:
@@ -130,11 +107,7 @@ def _named(paths: Sequence[Path]) -> dict[str, Path]:
 
 def _write(manifest: Mapping[str, Any], evaluation: Evaluation, models: Mapping[str, GNMData], out: Path) -> None:
     """The folder appears, or is replaced, in one rename."""
-    out = out.resolve()
-    out.parent.mkdir(parents=True, exist_ok=True)
-    fresh = out.with_name(f".{out.name}.{secrets.token_hex(4)}.tmp")
-    fresh.mkdir()
-    try:
+    with fresh_folder(out) as fresh:
         (fresh / MANIFEST).write_text(json.dumps(manifest, indent=1, allow_nan=False) + "\n", encoding="utf-8")
         distances = {name: one.vertex_mm.astype(np.float32) for name, one in evaluation.models.items()}
         np.savez(
@@ -144,6 +117,3 @@ def _write(manifest: Mapping[str, Any], evaluation: Evaluation, models: Mapping[
             distance_mm=np.stack(list(distances.values())),
         )
         (fresh / PAGE).write_text(write_evaluate_page(evaluation, models, manifest), encoding="utf-8")
-        replace_folder(fresh, out)
-    finally:
-        shutil.rmtree(fresh, ignore_errors=True)

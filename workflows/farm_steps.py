@@ -24,6 +24,7 @@ from workflows.local import begin_subject, check_recipe
 from workflows.model_subjects import has_truths
 from workflows.places import capture_here, model_here
 from workflows.store import Store
+from workflows.subject_folder import USABLE
 
 REGISTRATION = "registration"  # the folder within an attempt
 
@@ -176,9 +177,8 @@ def _rows(subject: Path) -> dict[str, Any]:
         rows: list[dict[str, Any]] = json.loads((subject / "subject.json").read_text("utf-8"))["captures"]
     except (OSError, ValueError, KeyError):
         return {"all": {"status": "error", "reason": "its jobs failed", "usable": False}}
-    usable = ("converged", "stopped")
     return {
-        row["name"]: {"status": row["status"], "reason": row["reason"], "usable": row["status"] in usable}
+        row["name"]: {"status": row["status"], "reason": row["reason"], "usable": row["status"] in USABLE}
         for row in rows
     }
 

@@ -1,8 +1,6 @@
 """What `gnmreg stabilize` is given: subject folders as `gnmreg subject` writes them, and a log of decisions."""
 
 import json
-import os
-import secrets
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
@@ -12,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from registration.artifacts import load_registration, read_manifest
+from registration.artifacts import load_registration, manifest_of_kind, read_manifest, swap_in
 from registration.capture.native import natural_key
 from registration.errors import InputError
 from registration.model import gnm_npz
@@ -114,11 +112,7 @@ def _subject_folders(folder: Path) -> list[Path]:
 
 
 def _is_subject(folder: Path) -> bool:
-    try:
-        manifest = json.loads((folder / MANIFEST).read_text("utf-8"))
-    except (OSError, ValueError):
-        return False
-    return isinstance(manifest, dict) and manifest.get("kind") == KIND
+    return manifest_of_kind(folder / MANIFEST, KIND) is not None
 
 
 def _subject(folder: Path, skip_failed: bool) -> RunSubject:
@@ -218,12 +212,7 @@ def append_decisions(file: Path, dataset: str, decisions: Sequence[Decision]) ->
         for d in decisions
     ]
     file.parent.mkdir(parents=True, exist_ok=True)
-    fresh = file.with_name(f".{file.name}.{secrets.token_hex(4)}.tmp")
-    try:
-        fresh.write_text(former + "".join(f"{line}\n" for line in lines), encoding="utf-8")
-        os.replace(fresh, file)
-    finally:
-        fresh.unlink(missing_ok=True)
+    swap_in(file, former + "".join(f"{line}\n" for line in lines))
 
 
 def _user() -> str:

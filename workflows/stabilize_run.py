@@ -75,7 +75,7 @@ def stabilize_run(
         manifest = disk.read_manifest(out)
         if manifest["input_hash"] == wanted or (whatever_decided and manifest["dataset"] == dataset):
             return Outcome(out=out, dataset=dataset, figures=manifest["figures"])
-    with disk.fresh_folder(out) as fresh:
+    with disk.fresh_set(out) as fresh:
         ids, components, moved = _write_subjects(fresh, found, data, head, settings, decided, progress)
         figures = _figures(components, moved, fresh, len(found.subjects))
         manifest = {

@@ -6,9 +6,6 @@ loop (`coregistration.py`) as by a queue.
 """
 
 import json
-import os
-import secrets
-import shutil
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -20,7 +17,7 @@ from coregister.build import build as build_model
 from coregister.evaluate import Settings
 from coregister.generalization import identity_part
 from registration import hashes
-from registration.artifacts import read_manifest, replace_folder, swap_in
+from registration.artifacts import fresh_folder, read_manifest, swap_in
 from registration.errors import InputError
 from registration.model import gnm_npz
 from registration.model.landmarks import schemes_beside
@@ -177,14 +174,10 @@ def build(
         "components": built.manifest["identity"]["components"],
         "drift_mm": built.manifest["figures"]["drift_mm"],
     }
-    fresh = _beside(Path(out))
-    try:
+    with fresh_folder(Path(out)) as fresh:
         provenance.write(built.data, built.manifest, built.coefficients, fresh / MODEL, Path(previous))
         (fresh / PAGE).write_text(write_model_page(built.data, built.manifest), encoding="utf-8")
         (fresh / STEP).write_text(_text(told), encoding="utf-8")
-        replace_folder(fresh, Path(out).resolve())
-    finally:
-        shutil.rmtree(fresh, ignore_errors=True)
     return told
 
 
@@ -266,14 +259,6 @@ def _known(place: Path, wanted: str) -> Told | None:
     except (OSError, ValueError):
         return None
     return told if isinstance(told, dict) and told.get("input_hash") == wanted else None
-
-
-def _beside(out: Path) -> Path:
-    """A fresh folder beside `out`, to take its place."""
-    out = out.resolve()
-    fresh = out.with_name(f".{out.name}.{os.getpid()}.{secrets.token_hex(4)}.tmp")
-    fresh.mkdir(parents=True)
-    return fresh
 
 
 def _text(value: Any) -> str:

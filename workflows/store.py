@@ -10,7 +10,6 @@ make the same thing at the same time disturb nobody, and one that dies leaves an
 import hashlib
 import json
 import posixpath
-import secrets
 import shutil
 import tempfile
 import time
@@ -23,6 +22,7 @@ from typing import Any
 
 import fsspec
 
+from registration.artifacts import swap_in
 from registration.errors import InputError
 from workflows.jobs import check_id, redacted
 
@@ -232,14 +232,7 @@ class Store:
         if self.local is None:
             self._fs.pipe_file(path, text.encode())
             return
-        file = Path(path)
-        fresh = file.with_name(f".{file.name}.{secrets.token_hex(4)}.tmp")
-        try:
-            with fresh.open("w", encoding="utf-8") as stream:
-                stream.write(text)
-            fresh.replace(file)
-        finally:
-            fresh.unlink(missing_ok=True)
+        swap_in(Path(path), text)
 
     def _complete(self, artifact: Artifact) -> bool:
         """Whether all files are there in their length; `verify` is for more."""

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any, Literal
 
-from registration.artifacts import check_out, swap_in
+from registration.artifacts import check_out, manifest_of_kind, swap_in
 from registration.capture.native import natural_key, read
 from registration.errors import InputError
 from registration.hashes import plain
@@ -209,12 +209,8 @@ def _neutral(
 
 def _owner(out: Path) -> str | None:
     """The subject whose folder `out` is; None if it is not ours."""
-    try:
-        manifest = json.loads((out / MANIFEST).read_text("utf-8"))
-    except (OSError, ValueError):
-        return None
-    ours = isinstance(manifest, dict) and manifest.get("kind") == KIND
-    return str(manifest.get("subject")) if ours else None
+    manifest = manifest_of_kind(out / MANIFEST, KIND)
+    return None if manifest is None else str(manifest.get("subject"))
 
 
 def _refused(out: Path, *, got: str, fix: str) -> InputError:

@@ -1,8 +1,6 @@
 """A stabilized set <-> its folder on disk. Files and fields are described in docs/formats.md."""
 
 import json
-import secrets
-import shutil
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -12,7 +10,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from registration.artifacts import replace_folder
+from registration.artifacts import fresh_folder, manifest_of_kind, refuse_foreign
 from registration.errors import InputError
 from registration.hashes import content_of, plain
 from registration.stabilize.components import Components
@@ -42,53 +40,31 @@ class StoredComponents:
 
 def check_out(out: Path) -> None:
     """Refuse, before any work, a folder that is not ours to replace. Raises InputError."""
-    out = Path(out)
-    if not out.exists():
-        return
-    names = sorted(path.name for path in out.iterdir()) if out.is_dir() else ["a file"]
-    foreign = [name for name in names if name not in _FILES]
-    if foreign or (names and not is_stabilized(out)):
-        raise InputError(
-            "The output folder cannot be used",
-            where=out,
-            expected="a new or empty folder, or one that `gnmreg stabilize` wrote",
-            got=", ".join((foreign or names)[:3]),
-            fix="choose another output folder with --out",
-        )
+    refuse_foreign(Path(out), kind=KIND, command="stabilize", files=_FILES)
 
 
 def is_stabilized(out: Path) -> bool:
     """Whether the folder holds a manifest that we wrote."""
-    try:
-        manifest = json.loads((out / MANIFEST).read_text("utf-8"))
-    except (OSError, ValueError):
-        return False
-    return isinstance(manifest, dict) and manifest.get("kind") == KIND
+    return manifest_of_kind(out / MANIFEST, KIND) is not None
 
 
 def read_manifest(out: Path) -> dict[str, Any]:
     """Raises InputError for a folder that is not ours, or of another schema version."""
-    if not is_stabilized(out):
+    manifest = manifest_of_kind(out / MANIFEST, KIND)
+    if manifest is None:
         raise _unreadable(out, expected=f'{MANIFEST} with "kind": "{KIND}"', got="none")
-    manifest: dict[str, Any] = json.loads((out / MANIFEST).read_text("utf-8"))
     if manifest.get("schema") != SCHEMA:
         raise _unreadable(out / MANIFEST, expected=f"schema {SCHEMA}", got=manifest.get("schema"))
     return manifest
 
 
 @contextmanager
-def fresh_folder(out: Path) -> Iterator[Path]:
-    """A folder beside `out` that takes its place in one rename, unless something goes wrong: then nothing is left."""
-    out = Path(out).resolve()
+def fresh_set(out: Path) -> Iterator[Path]:
+    """As `artifacts.fresh_folder`, for a stabilized set. Raises InputError as `check_out`."""
     check_out(out)
-    out.parent.mkdir(parents=True, exist_ok=True)
-    fresh = out.with_name(f".{out.name}.{secrets.token_hex(4)}.tmp")
-    (fresh / SUBJECTS).mkdir(parents=True)
-    try:
+    with fresh_folder(out) as fresh:
+        (fresh / SUBJECTS).mkdir()
         yield fresh
-        replace_folder(fresh, out)
-    finally:
-        shutil.rmtree(fresh, ignore_errors=True)
 
 
 def write_subject(subject: StabilizedSubject, folder: Path, number: int) -> str:
