@@ -31,7 +31,10 @@ from registration.model.gnm_npz import GNMData  # noqa: E402
 from registration.progress import shown  # noqa: E402
 from registration.render.studio.shoot import Quality  # noqa: E402
 from workflows import steps  # noqa: E402
-from workflows.coregistration import FIRST, coregister  # noqa: E402
+from workflows.coregistration import FIRST, planned  # noqa: E402
+from workflows.engine.database import default_url  # noqa: E402
+from workflows.engine.durable import migrate  # noqa: E402
+from workflows.farm_coregistration import coregister  # noqa: E402
 from workflows.held_out import read_held_out  # noqa: E402
 from workflows.synth_dataset import Population, synth_dataset  # noqa: E402
 
@@ -80,7 +83,7 @@ def main() -> None:
     with shown() as progress:
         synth_dataset(options.out / "dataset", people, jobs=options.jobs, progress=progress)
         captured = time.perf_counter()
-        state = coregister(
+        plan = planned(
             options.out / "dataset",
             model_path=first,
             out=options.out / "rounds",
@@ -88,26 +91,30 @@ def main() -> None:
             seed=options.seed,
             components=COMPONENTS,
             samples=SAMPLES,
-            jobs=options.jobs,
             rule=Rule(rounds=options.rounds, **ALWAYS_ON),
-            progress=progress,
         )
+        farm = options.out / "farm"
+        url = default_url(farm)
+        migrate(url)
+        told = coregister(plan, url=url, folder=farm, workers=options.jobs, progress=progress)
+    if "stopped" in told:
+        sys.exit(told["stopped"])
     print(f"captures {count} seconds {captured - begun:.0f}; rounds {time.perf_counter() - captured:.0f}")
     held_out = options.out / "rounds" / "held_out" / steps.PEOPLE
-    figures = {name: generalization_mm(gnm_npz.read(Path(file)), held_out) for name, file in state.models.items()}
+    figures = {name: generalization_mm(gnm_npz.read(Path(file)), held_out) for name, file in told["models"].items()}
     data = gnm_npz.read(first)
     control = build(own_samples(data, options.training, options.seed), data, steps.builder()).data
     figures["control"] = generalization_mm(control, held_out)
     print("model      " + "".join(f"{k:>9} mm" for k in COMPONENTS) + "   specificity")
     for name, row in figures.items():
         cells = "".join(f"{row[str(k)]:12.3f}" if str(k) in row else f"{'–':>12}" for k in COMPONENTS)
-        random = state.specificity_mm.get(name, {}).get(AT)
+        random = told["specificity_mm"].get(name, {}).get(AT)
         print(f"{name:11}{cells}" + (f"{random:14.3f}" if random is not None else ""))
-    for one in state.rounds:
+    for one in told["rounds"]:
         print(f"{one['name']} {one['decide']} rejected {[r['name'] for r in one['build']['rejected']]}")
-    names = list(state.models)
+    names = list(told["models"])
     for number, name in enumerate(names):
-        print(f"specificity {number} {state.specificity_mm[name].get(AT, float('nan')):.3f}")
+        print(f"specificity {number} {told['specificity_mm'][name].get(AT, float('nan')):.3f}")
     print(f"negative_control {1 - figures['control'].get(AT, np.nan) / figures[FIRST][AT]:.3f}")
     for number, name in enumerate(names):
         print(f"generalization_mm {number} {figures[name].get(AT, float('nan')):.3f}")

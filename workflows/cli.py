@@ -366,66 +366,6 @@ def synth_dataset(
     return 0
 
 
-def coregister(
-    dataset: Positional[Annotated[Path, arg(metavar="DATASET")]],
-    /,
-    model: Annotated[Path, arg(metavar="NPZ")],
-    out: Annotated[Path, arg(metavar="DIR")],
-    local: bool = False,
-    iterations: Annotated[int, arg(metavar="K")] = 3,
-    recipe: Literal["preview", "draft", "studio", "in_model"] = "draft",
-    held_out: Annotated[str | None, arg(metavar="SHARE|FILE")] = None,
-    seed: Annotated[int, arg(metavar="S")] = 0,
-    views: Annotated[int | None, arg(metavar="N")] = None,
-    components: Annotated[tuple[int, ...], arg(metavar="K")] = (),
-    jobs: Annotated[int, arg(metavar="N")] = 1,
-    folder: farm_cli.Folder = Path("."),
-    db: farm_cli.Database = None,
-) -> int:
-    """Register a dataset, build the next model from it, measure it on people held out, and again. It can be resumed.
-
-    Args:
-        dataset: A folder of subject folders, each of capture folders.
-        model: The first head model, a GNM NPZ file with its landmark schemes beside it.
-        out: The folder to write; one that this command wrote before is gone on with.
-        local: Do everything in this process; otherwise put it into a farm's queue (docs/operations.md).
-        iterations: At most so many rounds; it stops earlier when another one is not worth it.
-        recipe: As for register.
-        held_out: A share of the subjects, such as 0.2, or a file with a subject's folder name a line. Without it, those
-            whose neutral has the tag held_out, or else a fifth.
-        seed: Seed of everything random.
-        views: Use only this many views of each capture.
-        components: Numbers of identity components to measure models with; the largest decides.
-        jobs: Subjects that are registered side by side.
-        folder: Of the farm, if not local.
-        db: The queue's database, if not local.
-    """
-    from coregister.decide import Rule
-    from registration.progress import shown
-    from workflows.coregistration import PAGE, coregister, planned
-
-    settings: dict[str, Any] = {
-        "model_path": model,
-        "out": out,
-        "recipe": recipe,
-        "held_out": _share_or_file(held_out),
-        "seed": seed,
-        "views": views,
-        "components": components or None,
-        "jobs": jobs,
-        "rule": Rule(rounds=iterations),
-    }
-    if not local:
-        print(farm_cli.put_coregistration(planned(dataset, **settings), folder, db))
-        return 0
-    with shown() as progress:
-        state = coregister(dataset, **settings, progress=progress)
-    for name, figures in state.generalization_mm.items():
-        print(f"{name}, {state.at} components: generalization {figures[str(state.at)]:.3f} mm")
-    print(f"{(state.verdict or {})['reason']}\n{out / PAGE}")
-    return 0
-
-
 def evaluate_model(
     models: Positional[Annotated[tuple[Path, ...], arg(metavar="MODEL")]],
     /,
@@ -497,7 +437,6 @@ COMMANDS: Mapping[str, Command | Group] = {
     "evaluate": evaluate,
     "stabilize": stabilize,
     "stabilize review": review_stabilization,
-    "coregister": coregister,
     "dataset": ("Make whole datasets.", {"synth": synth_dataset}),
     "capture": (
         "Look at captures, make synthetic ones, spoil good ones.",
@@ -548,13 +487,6 @@ def _sensor(noise: bool) -> Any:
     from registration.render.studio.shoot import Sensor
 
     return Sensor(shot_noise=0.01, read_noise=0.002, exposure_spread=0.05, colour_spread=0.03) if noise else Sensor()
-
-
-def _share_or_file(text: str | None) -> float | Path | None:
-    try:
-        return None if text is None else float(text)
-    except ValueError:
-        return Path(str(text))
 
 
 def _target_weights(pairs: Sequence[str]) -> dict[str, float]:

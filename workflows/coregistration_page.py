@@ -53,28 +53,22 @@ def _rounds(told: Mapping[str, Any]) -> str:
 def _row(number: int, one: Mapping[str, Any], told: Mapping[str, Any], at: str) -> str:
     every = [row for rows in one["register"].values() for row in rows.values()]
     failed = sum(not row["usable"] for row in every)
-    built, model = one.get("build"), f"model {number}"
+    built, model = one["build"], f"model {number}"
     figures = [told[name].get(model, {}).get(at) for name in ("generalization_mm", "specificity_mm")]
     cells = [
         one["name"],
         len(every) - failed,
         failed,
-        "–" if built is None else len(built["rejected"]),
-        "–" if built is None else built["components"],
-        "–" if built is None else f"{built['drift_mm']:.3f}",
+        len(built["rejected"]),
+        built["components"],
+        f"{built['drift_mm']:.3f}",
         *("–" if figure is None else f"{figure:.3f}" for figure in figures),
     ]
-    places = {"model": built, "evaluation": one.get("evaluate"), "registrations/stabilized": _steady(one)}
+    places = ("model", "evaluation", *(["registrations/stabilized"] if one["stabilize"]["out"] else []))
     links = " · ".join(
-        f'<a href="{quote(one["name"])}/{place}/index.html">{place.split("/")[-1]}</a>'
-        for place, there in places.items()
-        if there
+        f'<a href="{quote(one["name"])}/{place}/index.html">{place.split("/")[-1]}</a>' for place in places
     )
     return "<tr>" + "".join(f"<td>{escape(str(value))}</td>" for value in cells) + f"<td>{links}</td></tr>"
-
-
-def _steady(one: Mapping[str, Any]) -> bool:
-    return bool(one.get("stabilize", {}).get("out"))
 
 
 def _curves(told: Mapping[str, Any]) -> str:
@@ -101,7 +95,7 @@ def _failures(told: Mapping[str, Any]) -> str:
         for subject, captures in one["register"].items():
             lost = [(name, row["reason"]) for name, row in captures.items() if not row["usable"]]
             rows += [(one["name"], f"{subject}, {name}", "failed", reason) for name, reason in lost]
-        for spoiled in one.get("build", {}).get("rejected", ()):
+        for spoiled in one["build"]["rejected"]:
             rows.append((one["name"], spoiled["name"], "left out", spoiled["reason"]))
     if not rows:
         return ""

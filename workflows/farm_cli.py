@@ -17,7 +17,6 @@ from registration.errors import InputError
 from workflows import store_cli
 
 if TYPE_CHECKING:
-    from workflows.coregistration import Plan
     from workflows.engine.control import Queue
     from workflows.engine.reads import Figures, Row
 
@@ -127,7 +126,7 @@ def batch(
         run: Name of the run; by default that of the store. The same run again adds what is new.
         local: Start a coordinator and workers on this machine, wait, and end them.
         workers: With --local, captures side by side; with cuda, one for each GPU instead.
-        folder: The farm's folder; by default DIR/farm beside the results with --local, else here.
+        folder: The farm's folder; by default DIR.farm beside the results with --local, else here.
         db: The queue's database, as for worker.
     """
     from registration.progress import shown
@@ -147,11 +146,80 @@ def batch(
     roots = (*made.roots, str(farm.resolve()))
     gpus = gpus_here(None) if variant == "cuda" else ()
     with shown() as progress:
-        counts = run_until_done(
+        ended = run_until_done(
             LocalFarm(url=url, folder=farm, roots=roots, workers=workers, gpus=gpus), made.run, progress
         )
-    print("\n".join(_lines(_figures(url, made.run))))
-    return 0 if counts.get("done", 0) == sum(counts.values()) else 1
+    print("\n".join((*_lines(_figures(url, made.run)), *filter(None, [ended.reason]))))
+    return 0 if ended.counts.get("done", 0) == sum(ended.counts.values()) else 1
+
+
+def coregister(
+    dataset: Positional[Annotated[Path, arg(metavar="DATASET")]],
+    /,
+    model: Annotated[Path, arg(metavar="NPZ")],
+    out: Annotated[Path, arg(metavar="DIR")],
+    iterations: Annotated[int, arg(metavar="K")] = 3,
+    recipe: Literal["preview", "draft", "studio", "in_model"] = "draft",
+    held_out: Annotated[str | None, arg(metavar="SHARE|FILE")] = None,
+    seed: Annotated[int, arg(metavar="S")] = 0,
+    views: Annotated[int | None, arg(metavar="N")] = None,
+    components: Annotated[tuple[int, ...], arg(metavar="K")] = (),
+    variant: Literal["llvm", "cuda"] = "llvm",
+    local: bool = False,
+    workers: Annotated[int, arg(metavar="N")] = 1,
+    folder: Annotated[Path | None, arg(metavar="DIR")] = None,
+    db: Database = None,
+) -> int:
+    """Register a dataset, build the next model from it, measure it on people held out, and again. It can be resumed.
+
+    Args:
+        dataset: A folder of subject folders, each of capture folders.
+        model: The first head model, a GNM NPZ file with its landmark schemes beside it.
+        out: The folder to write; one that this command wrote before is gone on with.
+        iterations: At most so many rounds; it stops earlier when another one is not worth it.
+        recipe: As for register.
+        held_out: A share of the subjects, such as 0.2, or a file with a subject's folder name a line. Without it, those
+            whose neutral has the tag held_out, or else a fifth.
+        seed: Seed of everything random.
+        views: Use only this many views of each capture.
+        components: Numbers of identity components to measure models with; the largest decides.
+        variant: As for batch.
+        local: Start a coordinator and workers on this machine, wait, and end them; otherwise a farm's do it.
+        workers: As for batch.
+        folder: As for batch.
+        db: The queue's database, as for worker.
+    """
+    from coregister.decide import Rule
+    from registration.progress import shown
+    from workflows.coregistration import PAGE, planned
+    from workflows.engine.durable import migrate
+    from workflows.farm_coregistration import coregister, put_coregistration
+    from workflows.farm_local import gpus_here
+
+    plan = planned(
+        dataset,
+        model_path=model,
+        out=out,
+        recipe=recipe,
+        held_out=_share_or_file(held_out),
+        seed=seed,
+        views=views,
+        components=components or None,
+        rule=Rule(rounds=iterations),
+    )
+    farm = folder or (_farm_beside(str(out)) if local else Path("."))
+    url = _url(farm, db)
+    if not local:
+        print(f"{put_coregistration(url, plan, variant=variant)} is in the queue; see gnmreg status")
+        return 0
+    migrate(url)
+    gpus = gpus_here(None) if variant == "cuda" else ()
+    with shown() as progress:
+        told = coregister(plan, url=url, folder=farm, workers=workers, gpus=gpus, progress=progress)
+    for name, figures in told["generalization_mm"].items():
+        print(f"{name}, {told['at']} components: generalization {figures[str(told['at'])]:.3f} mm")
+    print(f"{told.get('stopped') or told['verdict']['reason']}\n{out / PAGE}")
+    return 1 if "stopped" in told else 0
 
 
 def status(folder: Folder = Path("."), db: Database = None, run: RunName = None, watch: bool = False) -> int:
@@ -268,6 +336,7 @@ def cancel(
 
 COMMANDS: Mapping[str, Callable[..., int] | tuple[str, Mapping[str, Callable[..., int]]]] = {
     "batch": batch,
+    "coregister": coregister,
     "worker": worker,
     "coordinator": coordinator,
     "status": status,
@@ -278,13 +347,6 @@ COMMANDS: Mapping[str, Callable[..., int] | tuple[str, Mapping[str, Callable[...
     "migrate": migrate,
     "store": ("Look after published results.", {"verify": store_cli.verify, "retire": store_cli.retire}),
 }
-
-
-def put_coregistration(plan: "Plan", folder: Path, db: str | None) -> str:
-    """Put a coregistration into the queue and say so."""
-    from workflows.farm_coregistration import put_coregistration
-
-    return f"{put_coregistration(_url(folder, db), plan)} is in the queue; see gnmreg status"
 
 
 def _lines(figures: "Figures") -> list[str]:
@@ -343,6 +405,13 @@ def _url(folder: Path, db: str | None) -> str:
     from workflows.engine.database import ENVIRONMENT, checked_url, default_url
 
     return checked_url(db or os.environ.get(ENVIRONMENT) or default_url(folder))
+
+
+def _share_or_file(text: str | None) -> float | Path | None:
+    try:
+        return None if text is None else float(text)
+    except ValueError:
+        return Path(str(text))
 
 
 def _farm_beside(out: str) -> Path:

@@ -1,6 +1,5 @@
 """A farm on one machine: a coordinator and workers as processes of this command, which ends them."""
 
-import ctypes
 import os
 import signal
 import subprocess
@@ -13,13 +12,13 @@ from pathlib import Path
 
 from registration.errors import InputError
 from registration.progress import Progress
+from workflows.children import cores_each, end_with
 from workflows.engine.database import ENVIRONMENT
 from workflows.engine.reads import CANCELLED, DONE, FAILED, RUNNING, WAITING, Reader, ended
 
 LOOK_S = 1.0
 AGAIN_S = 2.0  # after which a process that died is started again
 REFUSED = 2  # the exit code of a command that was given something unusable
-_PR_SET_PDEATHSIG = 1
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -34,14 +33,26 @@ class LocalFarm:
     environment: Mapping[str, str] = field(default_factory=dict)
 
 
-def run_until_done(farm: LocalFarm, run: str, progress: Progress) -> dict[str, int]:
-    """Start the farm, wait until a run's driver has ended, end the farm. Returns state -> jobs of the run.
+@dataclass(frozen=True, kw_only=True)
+class Ended:
+    """What became of a run."""
+
+    counts: Mapping[str, int]  # state -> jobs
+    reason: str = ""  # why its driver failed, if it did
+
+
+def run_until_done(farm: LocalFarm, run: str, progress: Progress) -> Ended:
+    """Start the farm, wait until a run's driver has ended, end the farm.
 
     Whatever ends this function, Ctrl-C and kill -9 among it, ends the processes. What is left is done by the next call.
 
     Raises:
-        InputError: a process refused to start.
+        InputError: there is to be no worker, or a process refused to start.
     """
+    if not farm.gpus and farm.workers < 1:
+        raise InputError(
+            "There is no worker", where="--workers", expected="from 1", got=farm.workers, fix="ask for one or more"
+        )
     processes = _Processes(farm)
     reader = Reader(farm.url)
     try:
@@ -51,9 +62,8 @@ def run_until_done(farm: LocalFarm, run: str, progress: Progress) -> dict[str, i
             counts = reader.counts(run, kind="job")
             progress.at(ended(counts), max(sum(counts.values()), 1), _told(counts))
             if row is not None and row.state in (DONE, FAILED, CANCELLED):
-                if row.failure:
-                    progress.note(f"{run}: {row.failure['status']}: {row.failure['reason']}")
-                return counts
+                failure = row.failure
+                return Ended(counts=counts, reason=f"{failure['status']}: {failure['reason']}" if failure else "")
             time.sleep(LOOK_S)
     finally:
         processes.end()
@@ -110,21 +120,15 @@ class _Processes:
     def _started(self, number: int) -> subprocess.Popen[bytes]:
         parent = os.getpid()
         environment = {**os.environ, **self._farm.environment, ENVIRONMENT: self._farm.url}
-        environment.setdefault("OMP_NUM_THREADS", str(max(1, (os.cpu_count() or 1) // max(1, len(self._commands) - 1))))
+        environment.setdefault("OMP_NUM_THREADS", cores_each(len(self._commands) - 1))
         return subprocess.Popen(
             [sys.executable, "-m", "workflows.cli", *self._commands[number]],
             env=environment,
             stdin=subprocess.DEVNULL,
             stdout=sys.stderr.fileno(),
             start_new_session=True,  # Ctrl-C is for us; we end them
-            preexec_fn=lambda: _end_with(parent),
+            preexec_fn=lambda: end_with(parent, signal.SIGTERM),
         )
-
-
-def _end_with(parent: int) -> None:
-    ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)
-    if os.getppid() != parent:
-        os._exit(1)
 
 
 def gpus_here(asked: Sequence[int] | None) -> tuple[int, ...]:

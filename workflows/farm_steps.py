@@ -194,7 +194,6 @@ def _plan(told: Mapping[str, Any]) -> Plan:
         recipe=told["recipe"],
         views=told["views"],
         seed=told["seed"],
-        jobs=told["jobs"],
         components=tuple(told["components"]),
         samples=told["samples"],
         rule=Rule(**{name: value for name, value in told["rule"].items() if name != "type"}),

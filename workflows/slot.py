@@ -12,7 +12,6 @@ import ctypes
 import importlib
 import inspect
 import json
-import multiprocessing
 import os
 import signal
 import sys
@@ -28,11 +27,11 @@ from typing import Any
 from pebble import ProcessExpired, ProcessPool
 
 from registration.errors import InputError
+from workflows.children import warm_pool
 from workflows.jobs import MAX_BYTES, Unusable, redacted
 
 Outcome = dict[str, Any]
 RETRIED = ("failed", "died")  # bad input stays bad, and what ran out of time once would again
-_PR_SET_PDEATHSIG = 1
 
 
 class Slot:
@@ -84,22 +83,13 @@ class Slot:
 
     def _scheduled(self, function: Callable[..., Any], arguments: tuple[Any, ...], hard_s: float | None) -> Future[Any]:
         if self._pool is None:
-            self._pool = self._fresh()
+            self._pool = warm_pool(modules=self._modules)
         try:
             return self._pool.schedule(function, args=arguments, timeout=hard_s)
         except RuntimeError:  # the pool gives up when a child dies between jobs
             self._pool.stop()
-            self._pool = self._fresh()
+            self._pool = warm_pool(modules=self._modules)
             return self._pool.schedule(function, args=arguments, timeout=hard_s)
-
-    def _fresh(self) -> ProcessPool:
-        return ProcessPool(
-            max_workers=1,
-            max_tasks=0,
-            initializer=_born,
-            initargs=(os.getpid(), self._modules),
-            context=multiprocessing.get_context("spawn"),
-        )
 
 
 class JsonlProgress:
@@ -129,17 +119,6 @@ def function_of(dotted: str) -> Callable[..., Any]:
     module, _, name = dotted.partition(":")
     function: Callable[..., Any] = getattr(importlib.import_module(module), name)
     return function
-
-
-def _born(parent: int, modules: tuple[str, ...]) -> None:
-    """In the child, first of all: die with the parent, whatever kills it."""
-    ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
-    if os.getppid() != parent:  # it died before the line above
-        os._exit(1)
-    for module in modules:
-        importlib.import_module(module)
-    # Whatever libraries put there since: die at once, without a word, even while the interpreter's lock is held.
-    signal.signal(signal.SIGTERM, signal.SIG_DFL)
 
 
 def _call(dotted: str, arguments: dict[str, Any], log: str) -> Outcome:

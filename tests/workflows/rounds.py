@@ -2,7 +2,7 @@
 
 import json
 import shutil
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -11,16 +11,13 @@ from scipy.spatial.transform import Rotation
 from registration.artifacts import find_same, save_registration
 from registration.capture.native import read
 from registration.capture.scan import read_truth
-from registration.errors import InputError
 from registration.hashes import hash_capture, input_hash
 from registration.model import gnm_npz
 from registration.model.gnm_npz import GNMData
-from registration.progress import Named, Progress
 from registration.types import Registration
 from tests.capture import small
 from tests.register import synthetic
 from tests.report.test_page import a_registration
-from workflows.children import Lost
 
 MODEL = synthetic.MODEL
 ACTS = {"smile": 3, "jaw": 4}  # -> the component of the tiny model that it moves
@@ -101,14 +98,3 @@ class Finds:
         save_registration(result, out, "<html></html>")
         self.made.append(out)
         return result
-
-
-def beside(
-    function: Callable, calls: Mapping[str, Mapping], *, jobs: int, tries: int, progress: Progress
-) -> Iterator[tuple[str, object]]:
-    """Stands in for `in_children`: in this process, where `Finds` can be reached."""
-    for name, call in calls.items():
-        try:
-            yield name, function(**call, progress=Named(progress, name))
-        except InputError as error:
-            yield name, Lost(reason=error.line)

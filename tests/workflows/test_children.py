@@ -1,74 +1,62 @@
-"""Calls in other processes: results, failures, deaths, and what is left when the caller goes."""
+"""Processes beside this one: their share of the cores, and what is left when the caller goes."""
 
 import os
+import signal
 import subprocess
 import sys
 import time
-from pathlib import Path
 
-from tests.workflows import acts
-from tests.workflows.conftest import Notes
-from workflows.children import Lost, in_children
+import pytest
+from pebble import ProcessExpired
 
-
-def calls(tmp_path: Path, **acts: str) -> dict[str, dict]:
-    return {
-        name: {"what": what, "value": k, "place": str(tmp_path / name)} for k, (name, what) in enumerate(acts.items())
-    }
+from tests.workflows.farm.harness import ROOT, alive
+from workflows.children import ending_with_us, share_of_cores
 
 
-def test_one_failure_or_death_does_not_stop_the_others(tmp_path):
-    asked = calls(tmp_path, anna="work", ben="refuse", cleo="raise", dan="die", eve="die once", finn="work")
-    progress = Notes()
-    found = dict(in_children(acts.act, asked, jobs=2, progress=progress))
-    assert list(found) != [] and {*found} == {*asked}
-    assert [found[name][1] for name in ("anna", "eve", "finn")] == [0, 8, 10]
-    assert found["ben"] == Lost(reason="The lens is dirty: cam3; expected a clean one, got dust; wipe it")
-    assert found["cleo"] == Lost(reason="RuntimeError: out of luck")
-    assert found["dan"] == Lost(reason="the process ended by itself, SIGKILL")
-    assert os.getpid() not in {found[name][0] for name in ("anna", "eve", "finn")}
-    assert "anna: asked to work" in progress.notes and "anna: acting" in progress.steps
-    assert progress.notes.count("dan: asked to die") == 2
-    assert any("Traceback" in note for note in progress.notes)
-
-
-def test_a_child_is_warm_and_cores_are_split(tmp_path, monkeypatch):
-    found = dict(in_children(acts.act, calls(tmp_path, a="work", b="work", c="work"), jobs=1))
-    assert len({pid for pid, _ in found.values()}) == 1
+def test_processes_are_warm_and_share_the_cores(monkeypatch):
     monkeypatch.delenv("OMP_NUM_THREADS", raising=False)
     monkeypatch.setattr(os, "cpu_count", lambda: 8)
-    assert dict(in_children(acts.threads, {"a": {}}, jobs=4)) == {"a": "2"}
-    assert dict(in_children(acts.threads, {"a": {}}, jobs=1)) == {"a": None}
+    for jobs, threads in ((4, "2"), (1, None)):
+        with share_of_cores(jobs), ending_with_us(jobs) as pool:
+            assert pool.schedule(os.getenv, ("OMP_NUM_THREADS",)).result() == threads
+    assert "OMP_NUM_THREADS" not in os.environ
     monkeypatch.setenv("OMP_NUM_THREADS", "3")
-    assert dict(in_children(acts.threads, {"a": {}}, jobs=4)) == {"a": "3"}
+    with share_of_cores(4), ending_with_us(1) as pool:
+        assert pool.schedule(os.getenv, ("OMP_NUM_THREADS",)).result() == "3"
+        assert len({pool.schedule(os.getpid).result() for _ in range(3)}) == 1
+
+
+def test_one_death_does_not_stop_the_others():
+    with ending_with_us(2) as pool:
+        dead, well = pool.schedule(signal.raise_signal, (signal.SIGKILL,)), pool.schedule(os.getpid)
+        with pytest.raises(ProcessExpired):
+            dead.result()
+        assert well.result() != os.getpid()
 
 
 SLEEPER = """
-import os, sys, time
-from workflows.children import in_children
-def sleep(progress):
-    print(os.getpid(), flush=True)
-    time.sleep(600)
+import os, time
+from workflows.children import ending_with_us
 if __name__ == "__main__":
-    list(in_children(sleep, {"a": {}}))
+    with ending_with_us(1) as pool:
+        print(pool.schedule(os.getpid).result(), flush=True)
+        pool.schedule(time.sleep, (600,)).result()
 """
 
 
-def test_children_end_with_a_parent_that_is_killed(tmp_path):
+@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGINT])
+def test_they_end_with_a_parent_that_is_killed_or_interrupted(tmp_path, number):
     (tmp_path / "sleeper.py").write_text(SLEEPER)
-    root = Path(__file__).parents[2]
-    parent = subprocess.Popen(
-        [sys.executable, str(tmp_path / "sleeper.py")],
-        stdout=subprocess.PIPE,
-        text=True,
-        env={**os.environ, "PYTHONPATH": str(root)},
-    )
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    command = [sys.executable, str(tmp_path / "sleeper.py")]
+    parent = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True, env=environment)
     assert parent.stdout is not None
     child = int(parent.stdout.readline())
-    parent.kill()
-    parent.wait()
+    time.sleep(0.5)
+    parent.send_signal(number)
+    parent.wait(timeout=30)
     for _ in range(100):
-        if not Path(f"/proc/{child}").exists() or "Z" in Path(f"/proc/{child}/stat").read_text().split()[2]:
+        if not alive(child):
             return
         time.sleep(0.1)
     raise AssertionError("the child is still there")

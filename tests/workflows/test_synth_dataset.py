@@ -13,10 +13,9 @@ from coregister import subjects
 from coregister.synth import Studio
 from registration.errors import InputError
 from registration.hashes import hash_file
-from tests.workflows.rounds import beside
 from workflows.cli import main
 from workflows.dataset import read_dataset, split
-from workflows.synth_dataset import Population, synth_dataset
+from workflows.synth_dataset import Population, photograph, side_by_side, synth_dataset
 
 ACTS = ("smile", "jaw_open")
 
@@ -46,10 +45,10 @@ def photographs(monkeypatch) -> Photographs:
     found = Photographs()
     monkeypatch.setattr(subjects, "capture", found)
 
-    def here(function, calls, *, jobs, progress) -> Iterator:
-        return beside(function, calls, jobs=jobs, tries=1, progress=progress)
+    def here(calls, jobs) -> Iterator[tuple[str, str]]:
+        yield from ((name, photograph(**call)) for name, call in calls.items())
 
-    monkeypatch.setattr(workflows.synth_dataset, "in_children", here)
+    monkeypatch.setattr(workflows.synth_dataset, "side_by_side", here)
     return found
 
 
@@ -133,6 +132,16 @@ def test_other_folders_are_refused(photographs, tmp_path):
     shutil.copy(tmp_path / "a" / "dataset.json", tmp_path / "mine" / "notes.json")
     with pytest.raises(InputError, match="cannot be used"):
         synth_dataset(tmp_path / "mine", Population(subjects=2))
+
+
+def test_one_trouble_in_another_process_does_not_stop_the_others(tmp_path):
+    bad = Studio(cameras=0)
+    calls = {
+        "ann": {"root": tmp_path / "ann", "seed": 0, "expression": "neutral", "tags": {}, "studio": bad},
+        "bob": {"place": tmp_path / "bob"},
+    }
+    found = dict(side_by_side(calls, jobs=2))
+    assert "number of cameras" in found["ann"] and found["bob"].startswith("TypeError")
 
 
 @pytest.mark.slow

@@ -1,60 +1,44 @@
-"""The loop as a flow of jobs makes what the plain loop makes. Registrations are stand-ins, the other steps are real."""
+"""A coregistration in the queue: put in once, and forgotten when it is put in anew."""
 
-import asyncio
-import json
 from pathlib import Path
 
 import pytest
 
-import workflows.farm_steps
 from registration.errors import InputError
-from tests.workflows.farm.test_flows import Inline
-from tests.workflows.rounds import MODEL, Finds
-from tests.workflows.test_coregistration import TWICE, dataset, finds, go, told  # noqa: F401
+from registration.progress import Silent
+from tests.workflows.rounds import MODEL, write_people
 from workflows.coregistration import planned
+from workflows.engine.control import Queue
 from workflows.engine.database import default_url
 from workflows.engine.durable import migrate
 from workflows.engine.reads import Reader
 from workflows.farm_coregistration import PLAN, put_coregistration
-from workflows.flows import coregister
-from workflows.jobs import STEPS, Job, checked, resolved_roots
-from workflows.slot import function_of
+from workflows.farm_local import LocalFarm, run_until_done
+from workflows.jobs import Job
 
 
-def test_the_flow_makes_the_same_models(
-    dataset: Path,  # noqa: F811
-    finds: Finds,  # noqa: F811
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    monkeypatch.setattr(workflows.farm_steps, "register", finds)
-    go(dataset, tmp_path / "plain")
-    url, out = default_url(tmp_path), tmp_path / "farm"
-    plan = planned(dataset, model_path=MODEL, out=out, rule=TWICE, components=(2,), samples=2)
+def test_a_run_that_goes_on_stays_and_one_that_ended_is_forgotten(capture: Path, tmp_path: Path) -> None:
+    dataset = write_people(capture, tmp_path / "dataset", 5)
+    url, out = default_url(tmp_path), tmp_path / "june"
+    plan = planned(dataset, model_path=MODEL, out=out, components=(2,))
     with pytest.raises(InputError, match="There is no queue"):
         put_coregistration(url, plan)
+    assert not out.exists()
     migrate(url)
-    assert put_coregistration(url, plan) == "farm"
-    row = Reader(url).rows(["farm"])["farm"]
-    assert (row.state, row.spec) == (
-        "waiting",
-        {"flow": "coregister", "arguments": {"plan": str(out / PLAN), "variant": "llvm"}},
-    )
-    roots = resolved_roots((tmp_path, MODEL.parent))
+    assert put_coregistration(url, plan) == "june"
+    queue, reader = Queue(url), Reader(url)
+    row = reader.rows(["june"])["june"]
+    assert row.state == "waiting"
+    assert row.spec == {"flow": "coregister", "arguments": {"plan": str(out / PLAN), "variant": "llvm"}}
+    queue.put([Job(id="june/it00/s00000/neutral", step="register")])
+    with pytest.raises(InputError, match="have not ended"):
+        put_coregistration(url, plan)
+    queue.cancel("june")
+    put_coregistration(url, plan)
+    assert reader.rows(["june"])["june"].state == "waiting" and not reader.counts("june", kind="job")
 
-    def step(job: Job) -> object:
-        taken, arguments = checked(json.loads(json.dumps(job.spec())), STEPS, roots)
-        return json.loads(json.dumps(function_of(taken.function)(**arguments)))
 
-    scope = Inline("farm", step, [])
-    result = asyncio.run(coregister(scope, **row.spec["arguments"]))  # type: ignore[arg-type]
-    plain, farmed = told(tmp_path / "plain"), told(out)
-    assert result["rounds"] == 2 and result["reason"] == farmed["verdict"]["reason"]
-    for name in ("generalization_mm", "sources", "verdict", "at"):
-        assert farmed[name] == plain[name]
-    for one, other in zip(farmed["rounds"], plain["rounds"], strict=True):
-        assert one["build"]["content_id"] == other["build"]["content_id"]
-        assert one["register"] == other["register"] and one["decide"] == other["decide"]
-    again = Inline("farm", step, [])
-    asyncio.run(coregister(again, **row.spec["arguments"]))  # type: ignore[arg-type]
-    assert [job.id for job in again.log] == [job.id for job in scope.log]
+def test_without_a_worker_nothing_starts(tmp_path: Path) -> None:
+    farm = LocalFarm(url=default_url(tmp_path), folder=tmp_path, roots=(), workers=0)
+    with pytest.raises(InputError, match="no worker"):
+        run_until_done(farm, "june", Silent())

@@ -1,4 +1,4 @@
-"""Flows without a queue: a scope that does jobs at once, by what a table says of them."""
+"""The order of jobs, which are done at once by what a table says of them."""
 
 import asyncio
 import json
@@ -8,43 +8,12 @@ from typing import Any
 
 import pytest
 
+from tests.workflows.farm.inline import Inline
 from workflows.engine.rows import JobFailed
-from workflows.flows import FLOWS, coregister, subject
-from workflows.jobs import STEPS, FlowJob, Job, check_id
+from workflows.flows import coregister, subject
+from workflows.jobs import Job
 
 Told = dict[str, Any] | Exception
-
-
-class Inline:
-    """Stands in for a `Scope`; `step` says what a job's result is, or raises."""
-
-    def __init__(self, identity: str, step: Callable[[Job], Any], log: list[Job]) -> None:
-        self.id, self._step, self.log = identity, step, log
-        self._reasons: dict[str, str] = {}
-
-    async def do(self, jobs: Sequence[Job | FlowJob]) -> dict[str, Any]:
-        done = {}
-        for job in sorted(jobs, key=lambda one: one.priority):
-            try:
-                if isinstance(job, FlowJob):
-                    below = Inline(check_id(job.id), self._step, self.log)
-                    done[job.id] = await FLOWS[job.flow](below, **json.loads(json.dumps(job.arguments)))
-                else:
-                    assert job.step in STEPS and json.dumps(job.spec())
-                    self.log.append(job)
-                    done[check_id(job.id)] = self._step(job)
-            except JobFailed as error:
-                self._reasons[job.id] = str(error)
-        return done
-
-    async def failures(self, jobs: Sequence[Job]) -> dict[str, str]:
-        return {job.id: self._reasons[job.id] for job in jobs if job.id in self._reasons}
-
-    async def read(self, file: str) -> Any:
-        return json.loads(Path(file).read_text())
-
-    def park(self, reason: str) -> JobFailed:
-        return JobFailed({"status": "parked", "reason": reason})
 
 
 def failed(reason: str) -> JobFailed:

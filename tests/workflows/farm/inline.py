@@ -1,0 +1,61 @@
+"""Flows without a queue: a scope that does jobs at once, in this process."""
+
+import json
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+from registration.errors import InputError
+from workflows.engine.rows import JobFailed
+from workflows.flows import FLOWS
+from workflows.jobs import STEPS, FlowJob, Job, Unusable, check_id, checked, resolved_roots
+from workflows.slot import function_of
+
+
+class Inline:
+    """Stands in for a `Scope`; `step` says what a job's result is, or raises."""
+
+    def __init__(self, identity: str, step: Callable[[Job], Any], log: list[Job]) -> None:
+        self.id, self._step, self.log = identity, step, log
+        self._reasons: dict[str, str] = {}
+
+    async def do(self, jobs: Sequence[Job | FlowJob]) -> dict[str, Any]:
+        done = {}
+        for job in sorted(jobs, key=lambda one: one.priority):
+            try:
+                if isinstance(job, FlowJob):
+                    below = Inline(check_id(job.id), self._step, self.log)
+                    done[job.id] = await FLOWS[job.flow](below, **json.loads(json.dumps(job.arguments)))
+                else:
+                    assert job.step in STEPS and json.dumps(job.spec())
+                    self.log.append(job)
+                    done[check_id(job.id)] = self._step(job)
+            except JobFailed as error:
+                self._reasons[job.id] = str(error)
+        return done
+
+    async def failures(self, jobs: Sequence[Job]) -> dict[str, str]:
+        return {job.id: self._reasons[job.id] for job in jobs if job.id in self._reasons}
+
+    async def read(self, file: str) -> Any:
+        return json.loads(Path(file).read_text())
+
+    def park(self, reason: str) -> JobFailed:
+        return JobFailed({"status": "parked", "reason": reason})
+
+
+def really(roots: Sequence[Path]) -> Callable[[Job], Any]:
+    """Jobs as workers do them, with all that goes through a queue as JSON: for `Inline`."""
+
+    def step(job: Job) -> Any:
+        taken, arguments = checked(json.loads(json.dumps(job.spec())), STEPS, resolved_roots(roots))
+        try:
+            return json.loads(json.dumps(function_of(taken.function)(**arguments)))
+        except InputError as error:
+            raise JobFailed({"status": "bad input", "reason": error.line}) from None
+        except Unusable as error:
+            raise JobFailed({"status": "unusable", "reason": str(error)}) from None
+        except Exception as error:
+            raise JobFailed({"status": "failed", "reason": f"{type(error).__name__}: {error}"}) from None
+
+    return step
