@@ -1,5 +1,6 @@
 # make setup   makes .venv with exactly the versions of constraints.txt, and finds or installs what the system must have
 # make demo    sets up, makes a head model and a capture from nothing, and registers it: about five minutes
+# make demo-batch   a population of five, and two rounds of coregistration over it with two workers: half an hour
 # make check   sets up, then style, types and import directions
 # make test    sets up, checks and runs the tests
 # make test-durability   kills workers, drivers and a PostgreSQL server under load: minutes, not part of make test
@@ -12,6 +13,7 @@ SHELL := /bin/bash
 
 BIN := .venv/bin
 DEMO := build/demo
+BATCH := build/demo_batch
 DURABILITY := build/durability.txt
 PYTHONS := $(or $(PYTHON),python3.13 python3.12 python3.11 python3)
 INSTALLED := .venv/installed-$(shell cat pyproject.toml constraints.txt | sha256sum | cut -c1-16)
@@ -22,7 +24,7 @@ PIP := $(BIN)/python -m pip --disable-pip-version-check install --constraint con
 packages = { [ "$$(id -u)" = 0 ] && command -v apt-get >/dev/null && apt-get update -q \
 	&& DEBIAN_FRONTEND=noninteractive apt-get install -y -q --no-install-recommends $(1); }
 
-.PHONY: setup demo check test test-durability
+.PHONY: setup demo demo-batch check test test-durability
 
 setup: $(INSTALLED)
 	@$(BIN)/python -m registration.render.llvm --install
@@ -36,6 +38,16 @@ demo: setup
 	$(BIN)/gnmreg evaluate $(DEMO)/registration --capture $(DEMO)/capture
 	{ set +x; } 2>/dev/null
 	echo "Look at $(DEMO)/registration/report.html"
+
+demo-batch: setup
+	@rm -rf $(BATCH)
+	set -x
+	$(BIN)/gnmreg model bootstrap --out $(BATCH)/first/gnm_head_first.npz
+	$(BIN)/gnmreg dataset synth $(BATCH)/dataset --subjects 5 --held-out 2 --expressions smile,jaw_open,brows_up --views 8 --size 256 256 --jobs 2
+	$(BIN)/gnmreg coregister $(BATCH)/dataset --local --workers 2 --recipe draft --iterations 2 --all-iterations --model $(BATCH)/first/gnm_head_first.npz --components 5 10 --out $(BATCH)/rounds
+	$(BIN)/gnmreg status --folder $(BATCH)/rounds.farm
+	{ set +x; } 2>/dev/null
+	echo "$$SECONDS seconds. Look at $(BATCH)/rounds/index.html and $(BATCH)/rounds/it01/model/index.html"
 
 check: setup
 	$(BIN)/ruff check .

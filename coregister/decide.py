@@ -23,6 +23,7 @@ class Rule:
     drift: float = 1.5  # a round's drift over the one before, from which on it is no longer settling,
     drift_mm: float = 0.1  # if it is more than this
     failures: float = 0.2  # share of the registrations
+    early: bool = True  # whether want of gain, or drift that grew, ends it before all rounds are done
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -44,13 +45,13 @@ def decide(first_mm: float, rounds: Sequence[Round], rule: Rule | None = None) -
     share = last.failed / max(last.failed + last.registered, 1)
     if share > rule.failures:
         return Verdict(go_on=False, reason=f"too many failures: {100 * share:.0f} % of the registrations")
-    if len(rounds) > 1:
+    if rule.early and len(rounds) > 1:
         before = rounds[-2].drift_mm
         if last.drift_mm > max(rule.drift * before, rule.drift_mm):
             return Verdict(go_on=False, reason=f"drift grew: {last.drift_mm:.2f} mm after {before:.2f} mm")
     before = rounds[-2].generalization_mm if len(rounds) > 1 else first_mm
     gain = 1 - last.generalization_mm / before if before > 0 else 0.0
-    if not gain >= rule.gain:  # nor NaN
+    if rule.early and not gain >= rule.gain:  # nor NaN
         return Verdict(go_on=False, reason=f"no gain: {last.generalization_mm:.3f} mm after {before:.3f} mm")
     if len(rounds) >= rule.rounds:
         return Verdict(go_on=False, reason=f"all {rule.rounds} rounds done")

@@ -4,11 +4,13 @@ import ctypes
 import importlib
 import os
 import signal
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Mapping
+from concurrent.futures import Future, as_completed
 from contextlib import contextmanager
 from multiprocessing import get_context
+from typing import Any
 
-from pebble import ProcessPool
+from pebble import ProcessExpired, ProcessPool
 
 _PR_SET_PDEATHSIG = 1
 _THREADS = "OMP_NUM_THREADS"  # libraries read it as they are loaded; the renderer does too
@@ -70,3 +72,21 @@ def share_of_cores(jobs: int) -> Iterator[None]:
         yield
     finally:
         del os.environ[_THREADS]
+
+
+def side_by_side(
+    function: Callable[..., str], calls: Mapping[str, Mapping[str, Any]], jobs: int
+) -> Iterator[tuple[str, str]]:
+    """Call a function that returns its trouble, "" for none, with each of some named sets of keywords.
+
+    Yields (name, trouble) as they end. A death of one process is the trouble of one call. The cores are shared.
+    """
+    if not calls:
+        return
+    with share_of_cores(jobs), ending_with_us(jobs, (function.__module__,)) as pool:
+        names: dict[Future[str], str] = {
+            pool.schedule(function, kwargs=dict(keywords)): name for name, keywords in calls.items()
+        }
+        for future in as_completed(names):
+            died = isinstance(future.exception(), ProcessExpired)
+            yield names[future], "its process died" if died else future.result()

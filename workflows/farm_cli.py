@@ -159,6 +159,7 @@ def coregister(
     model: Annotated[Path, arg(metavar="NPZ")],
     out: Annotated[Path, arg(metavar="DIR")],
     iterations: Annotated[int, arg(metavar="K")] = 3,
+    all_iterations: bool = False,
     recipe: Literal["preview", "draft", "studio", "in_model"] = "draft",
     held_out: Annotated[str | None, arg(metavar="SHARE|FILE")] = None,
     seed: Annotated[int, arg(metavar="S")] = 0,
@@ -177,6 +178,7 @@ def coregister(
         model: The first head model, a GNM NPZ file with its landmark schemes beside it.
         out: The folder to write; one that this command wrote before is gone on with.
         iterations: At most so many rounds; it stops earlier when another one is not worth it.
+        all_iterations: Do not stop earlier, unless too many captures fail.
         recipe: As for register.
         held_out: A share of the subjects, such as 0.2, or a file with a subject's folder name a line. Without it, those
             whose neutral has the tag held_out, or else a fifth.
@@ -205,7 +207,7 @@ def coregister(
         seed=seed,
         views=views,
         components=components or None,
-        rule=Rule(rounds=iterations),
+        rule=Rule(rounds=iterations, early=not all_iterations),
     )
     farm = folder or (_farm_beside(str(out)) if local else Path("."))
     url = _url(farm, db)

@@ -1,13 +1,10 @@
 """`gnmreg dataset synth`: a population of synthetic subjects as a dataset; one seed is one population."""
 
 import json
-from collections.abc import Iterator, Mapping
-from concurrent.futures import as_completed
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
-
-from pebble import ProcessExpired
 
 from coregister import expressions, subjects
 from coregister.synth import Studio, check
@@ -15,7 +12,7 @@ from registration.artifacts import swap_in
 from registration.errors import InputError
 from registration.hashes import plain, versions
 from registration.progress import Progress, Silent
-from workflows.children import ending_with_us, share_of_cores
+from workflows.children import side_by_side
 from workflows.dataset import HELD_OUT, KIND, MANIFEST, SCHEMA
 from workflows.subject_folder import NEUTRAL
 
@@ -73,7 +70,7 @@ def synth_dataset(
     if calls:
         _save(out, told, complete=False)
     lost = {}
-    for done, (name, trouble) in enumerate(side_by_side(calls, jobs), 1):
+    for done, (name, trouble) in enumerate(side_by_side(photograph, calls, jobs), 1):
         progress.at(done, len(calls), name)
         if trouble:
             lost[name] = trouble
@@ -87,20 +84,6 @@ def synth_dataset(
             fix="run the same command again: it makes what is missing",
         )
     return _save(out, told, complete=True)
-
-
-def side_by_side(calls: Mapping[str, Mapping[str, Any]], jobs: int) -> Iterator[tuple[str, str]]:
-    """Photographs in `jobs` processes, which end with this one; yields each name and its trouble, "" if there was none.
-
-    The machine's cores are split among the processes.
-    """
-    if not calls:
-        return
-    with share_of_cores(jobs), ending_with_us(jobs, (__name__,)) as pool:
-        names = {pool.schedule(photograph, kwargs=dict(settings)): name for name, settings in calls.items()}
-        for future in as_completed(names):
-            died = isinstance(future.exception(), ProcessExpired)
-            yield names[future], "its process died" if died else future.result()
 
 
 def photograph(**settings: Any) -> str:

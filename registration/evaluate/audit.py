@@ -8,7 +8,6 @@ is the excess over the template's depth, vertex by vertex and pair by pair.
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -80,8 +79,8 @@ def audit(vertices: Float[np.ndarray, "V 3"], data: GNMData, scale: float = 1.0)
     """Find what of a posed mesh of this model lies inside what it should not.
 
     `vertices`: metres, any frame, model order; `scale`: the registration's, for the template is compared at the same
-    size. Tested are the outer skin and the tongue; eye sockets, gums and the mouth's lining are not. The first audit
-    with a model object audits its template too.
+    size. Tested are the outer skin and the tongue; eye sockets, gums and the mouth's lining are not. A process'
+    first audit with a model audits its template too.
 
     Raises:
         InputError: the vertices are not this model's, or not finite.
@@ -126,11 +125,17 @@ def audit_folder(registration_dir: Path, model: Path) -> Audit:
     return result
 
 
-@lru_cache(maxsize=1)
+_audited: dict[str, tuple["_Parts", Mapping[str, Float[np.ndarray, "V"]]]] = {}  # the last model alone, by content
+
+
 def _template(data: GNMData) -> tuple["_Parts", Mapping[str, Float[np.ndarray, "V"]]]:
-    """A model's parts, and the depths in its template by pair."""
-    parts = _Parts(data)
-    return parts, parts.depths(parts.rest)
+    """A model's parts, and the depths in its template by pair: the same for all captures that a process registers."""
+    content = gnm_npz.content_hash(data)
+    if content not in _audited:
+        parts = _Parts(data)
+        _audited.clear()
+        _audited[content] = parts, parts.depths(parts.rest)
+    return _audited[content]
 
 
 class _Parts:

@@ -35,7 +35,8 @@ def activate(variant: Variant = "llvm", *, deterministic: bool = False) -> torch
     import mitsuba as mi
 
     mi.set_variant(f"{variant}_ad_rgb")
-    torch.use_deterministic_algorithms(True, warn_only=variant == "cuda")
+    # What use_deterministic_algorithms does, but for seconds of importing its compiler, which is not used here.
+    torch.set_deterministic_debug_mode("warn" if variant == "cuda" else "error")
     torch.utils.deterministic.fill_uninitialized_memory = False  # type: ignore[attr-defined]
     if deterministic:
         torch.set_num_threads(1)

@@ -35,6 +35,14 @@ def test_what_is_wrong_comes_before_what_is_finished():
     assert "gain" in decide(1.0, bad, Rule(failures=0.95, drift=10)).reason
 
 
+def test_all_rounds_are_done_if_asked_for_unless_too_many_fail():
+    rule = Rule(rounds=2, early=False)
+    worse = [_round(1.2, drift=1), _round(1.3, drift=5)]
+    assert decide(1.0, worse[:1], rule).go_on
+    assert "all 2 rounds done" in decide(1.0, worse, rule).reason
+    assert "failures" in decide(1.0, [_round(1.2, registered=1, failed=9)], rule).reason
+
+
 def test_there_is_nothing_to_decide_before_the_first_round():
     with pytest.raises(ValueError):
         decide(1.0, [])

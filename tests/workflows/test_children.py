@@ -7,10 +7,9 @@ import sys
 import time
 
 import pytest
-from pebble import ProcessExpired
 
 from tests.workflows.farm.harness import ROOT, alive
-from workflows.children import ending_with_us, share_of_cores
+from workflows.children import ending_with_us, share_of_cores, side_by_side
 
 
 def test_processes_are_warm_and_share_the_cores(monkeypatch):
@@ -27,11 +26,9 @@ def test_processes_are_warm_and_share_the_cores(monkeypatch):
 
 
 def test_one_death_does_not_stop_the_others():
-    with ending_with_us(2) as pool:
-        dead, well = pool.schedule(signal.raise_signal, (signal.SIGKILL,)), pool.schedule(os.getpid)
-        with pytest.raises(ProcessExpired):
-            dead.result()
-        assert well.result() != os.getpid()
+    calls = {"ann": {"key": "NO_SUCH", "default": ""}, "bob": {"key": "NO_SUCH", "default": "tired"}}
+    assert dict(side_by_side(os.getenv, calls, jobs=2)) == {"ann": "", "bob": "tired"}
+    assert dict(side_by_side(os._exit, {"cleo": {"status": 3}}, jobs=1)) == {"cleo": "its process died"}
 
 
 SLEEPER = """

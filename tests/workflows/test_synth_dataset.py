@@ -13,9 +13,10 @@ from coregister import subjects
 from coregister.synth import Studio
 from registration.errors import InputError
 from registration.hashes import hash_file
+from workflows.children import side_by_side
 from workflows.cli import main
 from workflows.dataset import read_dataset, split
-from workflows.synth_dataset import Population, photograph, side_by_side, synth_dataset
+from workflows.synth_dataset import Population, photograph, synth_dataset
 
 ACTS = ("smile", "jaw_open")
 
@@ -45,8 +46,8 @@ def photographs(monkeypatch) -> Photographs:
     found = Photographs()
     monkeypatch.setattr(subjects, "capture", found)
 
-    def here(calls, jobs) -> Iterator[tuple[str, str]]:
-        yield from ((name, photograph(**call)) for name, call in calls.items())
+    def here(function, calls, jobs) -> Iterator[tuple[str, str]]:
+        yield from ((name, function(**call)) for name, call in calls.items())
 
     monkeypatch.setattr(workflows.synth_dataset, "side_by_side", here)
     return found
@@ -140,7 +141,7 @@ def test_one_trouble_in_another_process_does_not_stop_the_others(tmp_path):
         "ann": {"root": tmp_path / "ann", "seed": 0, "expression": "neutral", "tags": {}, "studio": bad},
         "bob": {"place": tmp_path / "bob"},
     }
-    found = dict(side_by_side(calls, jobs=2))
+    found = dict(side_by_side(photograph, calls, jobs=2))
     assert "number of cameras" in found["ann"] and found["bob"].startswith("TypeError")
 
 
