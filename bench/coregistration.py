@@ -3,9 +3,10 @@
     python bench/coregistration.py [--out DIR] [--training 40] [--held-out 10] [--rounds 2] [--jobs 2]
 
 A synthetic population of any adult age and build, neutrals only, 8 views of 256 x 256 (`gnmreg dataset synth`), goes
-through the loop of `gnmreg coregister`. Held-out people are measured on their true meshes: mean vertex distance on the
-head's skin, in mm, with the same number of identity components for every model (coregister/generalization.py).
-Specificity: of 100 random heads. `gain`: by which share of model 0's error the last model is nearer, with 20
+through the loop of `gnmreg coregister`. Held-out people are measured on their true meshes: mean distance between the
+same vertices, in mm, with the same number of identity components for every model (coregister/generalization.py), once
+with the head's vertices alike, as `gnmreg model evaluate` does, and once over the whole outer skin by area, as scans
+see it. Specificity: of 100 random heads. `gain`: by which share of model 0's error the last model is nearer, with 20
 components. `negative_control`: the same gain of a model that is built from random heads of model 0 itself, as many as
 there are subjects: what a build alone does. Run again with the same --out it goes on where it was interrupted.
 """
@@ -23,7 +24,7 @@ if not __package__:  # run as a file: the packages lie beside `bench`
 from coregister import bootstrap  # noqa: E402
 from coregister.build import build  # noqa: E402
 from coregister.decide import Rule  # noqa: E402
-from coregister.generalization import fit, identity_part  # noqa: E402
+from coregister.generalization import LinearPart, fit, identity_part, surface_part  # noqa: E402
 from coregister.samples import NEUTRAL, Mesh, Subject  # noqa: E402
 from coregister.synth import Studio  # noqa: E402
 from registration.model import gnm_npz  # noqa: E402
@@ -41,6 +42,8 @@ from workflows.synth_dataset import Population, synth_dataset  # noqa: E402
 COMPONENTS = (10, 20, 40)
 AT = "20"  # what counts
 SAMPLES = 100
+CONTROL = "control"
+MEASURES = {"head's skin, vertices alike": identity_part, "whole outer skin, by area": surface_part}
 STUDIO = Studio(cameras=8, size_px=(256, 256), texture_size=512, quality=Quality(pixel_samples=2, light_rays=32))
 
 
@@ -56,12 +59,11 @@ def own_samples(data: GNMData, count: int, seed: int) -> list[Subject]:
     return subjects
 
 
-def generalization_mm(data: GNMData, people: Path) -> dict[str, float]:
+def generalization_mm(data: GNMData, people: Path, part: LinearPart) -> dict[str, float]:
     """Number of components -> mean over the people."""
-    part = identity_part(data)
     counts = [k for k in COMPONENTS if k <= len(part.basis)]
     found = [fit(part, one.neutral[part.rows], counts) for one in read_held_out(people).subjects]
-    means = np.array([[one.distance_mm.mean() for one in fits] for fits in found]).mean(0)
+    means = np.array([[part.mean(one.distance_mm) for one in fits] for fits in found]).mean(0)
     return dict(zip(map(str, counts), means.tolist(), strict=True))
 
 
@@ -100,24 +102,27 @@ def main() -> None:
         sys.exit(told["stopped"])
     print(f"captures {count} seconds {captured - begun:.0f}; rounds {time.perf_counter() - captured:.0f}")
     held_out = options.out / "rounds" / "held_out" / steps.PEOPLE
-    figures = {name: generalization_mm(gnm_npz.read(Path(file)), held_out) for name, file in told["models"].items()}
-    data = gnm_npz.read(first)
-    control = build(own_samples(data, options.training, options.seed), data, steps.builder()).data
-    figures["control"] = generalization_mm(control, held_out)
-    print("model      " + "".join(f"{k:>9} mm" for k in COMPONENTS) + "   specificity")
-    for name, row in figures.items():
-        cells = "".join(f"{row[str(k)]:12.3f}" if str(k) in row else f"{'–':>12}" for k in COMPONENTS)
-        random = told["specificity_mm"].get(name, {}).get(AT)
-        print(f"{name:11}{cells}" + (f"{random:14.3f}" if random is not None else ""))
+    models = {name: gnm_npz.read(Path(file)) for name, file in told["models"].items()}
+    control = own_samples(models[FIRST], options.training, options.seed)
+    models[CONTROL] = build(control, models[FIRST], steps.builder()).data
+    figures = {}
+    for measure, part_of in MEASURES.items():
+        print(f"{measure:36}" + "".join(f"{k:>9} mm" for k in COMPONENTS))
+        for name, data in models.items():
+            row = figures[measure, name] = generalization_mm(data, held_out, part_of(data))
+            print(f"{name:36}" + "".join(f"{row[str(k)]:12.3f}" if str(k) in row else f"{'–':>12}" for k in COMPONENTS))
     for one in told["rounds"]:
         print(f"{one['name']} {one['decide']} rejected {[r['name'] for r in one['build']['rejected']]}")
     names = list(told["models"])
     for number, name in enumerate(names):
         print(f"specificity {number} {told['specificity_mm'][name].get(AT, float('nan')):.3f}")
-    print(f"negative_control {1 - figures['control'].get(AT, np.nan) / figures[FIRST][AT]:.3f}")
-    for number, name in enumerate(names):
-        print(f"generalization_mm {number} {figures[name].get(AT, float('nan')):.3f}")
-    print(f"gain {1 - figures[names[-1]].get(AT, np.nan) / figures[FIRST][AT]:.3f}")
+    for measure in MEASURES:  # the last lines are of the last one
+        before, after = figures[measure, FIRST][AT], figures[measure, names[-1]].get(AT, np.nan)
+        print(f"{measure}:")
+        print(f"negative_control {1 - figures[measure, CONTROL].get(AT, np.nan) / before:.3f}")
+        for number, name in enumerate(names):
+            print(f"generalization_mm {number} {figures[measure, name].get(AT, float('nan')):.3f}")
+        print(f"gain {1 - after / before:.3f}")
 
 
 if __name__ == "__main__":

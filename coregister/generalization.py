@@ -6,7 +6,7 @@ the mesh, so every projection solves normal equations. The paper runs Adam for 5
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -15,6 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from registration.frames import MM_PER_M, transform_points
 from registration.geometry.rigid import align, motion_fields
+from registration.geometry.topology import vertex_areas
 from registration.model import regions
 from registration.model.gnm_npz import GNMData
 
@@ -32,11 +33,21 @@ class LinearPart:
     rest: Float[np.ndarray, "P 3"]
     basis: Float[np.ndarray, "K P 3"]
     triangles: Int[np.ndarray, "F 3"]  # between the part's own vertices
+    weights: Float[np.ndarray, "P"] | None = None  # of squared distances in a fit, mean 1; None: all alike
+
+    @cached_property
+    def root(self) -> Float[np.ndarray, "P 1"]:
+        """What distances are multiplied by before they are squared."""
+        return np.ones((len(self.rows), 1)) if self.weights is None else np.sqrt(self.weights)[:, None]
 
     @cached_property
     def gram(self) -> Float[np.ndarray, "K K"]:
-        flat = self.basis.reshape(len(self.basis), -1)
+        flat = (self.basis * self.root).reshape(len(self.basis), -1)
         return flat @ flat.T
+
+    def mean(self, values: Float[np.ndarray, "P"]) -> float:
+        """Mean over the vertices, as they weigh."""
+        return float(np.average(values, weights=self.weights))
 
     def shape(self, coefficients: Float[np.ndarray, "K"]) -> Float[np.ndarray, "P 3"]:
         used = len(coefficients)
@@ -59,6 +70,13 @@ def identity_part(data: GNMData, rows: Bool[np.ndarray, "V"] | None = None) -> L
     Components of eyeballs or teeth alone are not among them.
     """
     return _part(data, regions.head_skin(data) if rows is None else rows, data.vertex_identity_basis)
+
+
+def surface_part(data: GNMData) -> LinearPart:
+    """The same components on the whole outer skin, neck and all, where vertices weigh as the area they stand for."""
+    part = identity_part(data, regions.exterior(data))
+    area = vertex_areas(data.template_vertex_positions, data.triangles)[part.rows]
+    return replace(part, weights=area / area.mean())
 
 
 def whole_part(data: GNMData) -> LinearPart:
@@ -93,7 +111,7 @@ def fit(part: LinearPart, target: Float[np.ndarray, "P 3"], components: Sequence
     Where the part does not determine a coefficient, it is the least that there is.
     """
     target = np.asarray(target, np.float64)
-    pose = align(target[None], part.rest, np.ones((1, len(target))))[0]
+    pose = align(target[None], part.rest, part.root.T**2)[0]
     coefficients = np.zeros(0)
     found = []
     for count in components:
@@ -110,11 +128,11 @@ def _nearest(
     pose: Float[np.ndarray, "4 4"],
 ) -> Fit:
     count, settled = len(coefficients), False
-    flat = part.basis[:count].reshape(count, -1)
+    flat = (part.basis[:count] * part.root).reshape(count, -1)
     shape, placed = part.shape(coefficients), transform_points(pose, target)
     for _ in range(_MOST_STEPS):
-        away = (placed - shape).ravel()
-        fields = motion_fields(placed).reshape(6, -1)
+        away = ((placed - shape) * part.root).ravel()
+        fields = (motion_fields(placed) * part.root).reshape(6, -1)
         mixed = -flat @ fields.T
         matrix = np.block([[part.gram[:count, :count], mixed], [mixed.T, fields @ fields.T]])
         step = solve(matrix, np.concatenate([flat @ away, -fields @ away])[:, None])[:, 0]
