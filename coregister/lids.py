@@ -2,12 +2,13 @@
 (paper, Head Identity; algorithms, section 7)."""
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from jaxtyping import Float, Int
 
 from registration.frames import MM_PER_M
-from registration.geometry.closest_point import barycentric_points, closest_points
+from registration.geometry.closest_point import Searched, barycentric_points
 from registration.geometry.fill import continued
 from registration.model import regions
 from registration.model.gnm_npz import GNMData
@@ -29,12 +30,16 @@ class Socket:
     rim: Int[np.ndarray, "R"]
     gap: Float[np.ndarray, "R"]  # signed distance of the rim from the shell at rest, metres, positive outside
 
+    @cached_property
+    def _searched(self) -> Searched:
+        return Searched(self.shell, self.triangles)
+
     def gaps(
         self, rim: Float[np.ndarray, "R 3"], shift: Float[np.ndarray, "3"]
     ) -> tuple[Float[np.ndarray, "R"], Float[np.ndarray, "R 3"]]:
         """Signed distances of rims from the shell moved by `shift`, and the unit directions in which they grow."""
         points = np.asarray(rim, np.float64) - shift
-        distance, face, barycentric = closest_points(points, self.shell, self.triangles)
+        distance, face, barycentric = self._searched.closest(points)
         a, b, c = (self.shell[self.triangles[face, k]] for k in range(3))
         normal = np.cross(b - a, c - a)
         normal /= np.linalg.norm(normal, axis=1, keepdims=True)

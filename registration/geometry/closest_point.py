@@ -11,6 +11,7 @@ from jaxtyping import Float, Int
 from scipy.spatial import cKDTree
 
 _BATCH = 1 << 18  # point-triangle pairs examined together: about 100 MB of temporaries
+_FEW = 2000  # points for which starting threads takes longer than the search
 _FIRST = 8  # candidates of a point in the first round; each further round has four times as many
 
 
@@ -25,20 +26,39 @@ def closest_points(
     Raises:
         ValueError: there are no triangles, or a coordinate is not finite.
     """
-    points, corners = np.asarray(points, np.float64), np.asarray(vertices, np.float64)[triangles]
-    if not len(triangles):
-        raise ValueError("a mesh without triangles has no closest point")
-    if not (np.isfinite(points).all() and np.isfinite(corners).all()):
+    return Searched(vertices, triangles).closest(points)
+
+
+class Searched:
+    """A mesh made ready to be searched again and again."""
+
+    def __init__(self, vertices: Float[np.ndarray, "V 3"], triangles: Int[np.ndarray, "F 3"]):
+        """Raises ValueError as `closest_points`."""
+        if not len(triangles):
+            raise ValueError("a mesh without triangles has no closest point")
+        self._corners = np.asarray(vertices, np.float64)[triangles]
+        _require_finite(self._corners)
+        centroids = self._corners.mean(1)
+        radii = np.linalg.norm(self._corners - centroids[:, None], axis=-1).max(1)
+        self._classes = [_SizeClass(members, centroids, radii) for members in _by_size(radii)]
+
+    def closest(
+        self, points: Float[np.ndarray, "P 3"]
+    ) -> tuple[Float[np.ndarray, "P"], Int[np.ndarray, "P"], Float[np.ndarray, "P 3"]]:
+        """As `closest_points`."""
+        points = np.asarray(points, np.float64)
+        _require_finite(points)
+        best = _Best(len(points))
+        for size_class in self._classes:  # a good bound from every class first, so that no class is searched in vain
+            size_class.search(points, np.arange(len(points)), self._corners, best, count=1)
+        for size_class in self._classes:
+            size_class.search_all(points, self._corners, best)
+        return best.distance, best.face, best.barycentric
+
+
+def _require_finite(coordinates: np.ndarray) -> None:
+    if not np.isfinite(coordinates).all():
         raise ValueError("points and vertices must be finite")
-    centroids = corners.mean(1)
-    radii = np.linalg.norm(corners - centroids[:, None], axis=-1).max(1)
-    best = _Best(len(points))
-    classes = [_SizeClass(members, centroids, radii) for members in _by_size(radii)]
-    for size_class in classes:  # a good bound from every class first, so that no class is searched in vain
-        size_class.search(points, np.arange(len(points)), corners, best, count=1)
-    for size_class in classes:
-        size_class.search_all(points, corners, best)
-    return best.distance, best.face, best.barycentric
 
 
 def barycentric_points(
@@ -95,7 +115,8 @@ class _SizeClass:
         size = max(1, _BATCH // count)
         for start in range(0, len(rows), size):
             part = rows[start : start + size]
-            away, index = self.tree.query(points[part], k=range(1, count + 1), workers=-1)
+            workers = -1 if len(part) > _FEW else 1
+            away, index = self.tree.query(points[part], k=range(1, count + 1), workers=workers)
             reached[start : start + size] = away[:, -1]
             hopeful = away - self.radii[index] < best.distance[part, None]
             row, column = np.nonzero(hopeful)

@@ -19,7 +19,7 @@ from workflows.jobs import FlowJob, Job
 
 log = logging.getLogger("gnmreg")
 
-LOOK_S = 1.0  # between two looks at the counts
+LOOK_S, SELDOM_S = 1.0, 5.0  # between two looks at the counts: at first, and when it takes long
 AGAIN_S = 2.0  # after which a database that did not answer is asked again
 
 T = TypeVar("T")
@@ -93,13 +93,14 @@ async def _counted_below(url: str, part: str) -> dict[str, int]:
 async def _polled(
     url: str, count: Callable[[Reader], dict[str, int]], over: Callable[[dict[str, int]], bool]
 ) -> dict[str, int]:
-    reader = Reader(url, known=True)
+    reader, pause = Reader(url, known=True), LOOK_S
     try:
         while True:
             counts = await _patiently(partial(count, reader))
             if over(counts):
                 return counts
-            await asyncio.sleep(LOOK_S * random.uniform(0.8, 1.2))
+            await asyncio.sleep(pause * random.uniform(0.8, 1.2))
+            pause = min(1.2 * pause, SELDOM_S)
     finally:
         reader.close()
 
