@@ -21,7 +21,7 @@ sys.path[:] = [str(Path(__file__).resolve().parents[1]), *(p for p in sys.path i
 
 from tests.workflows.farm.postgres import server  # noqa: E402
 from workflows.engine.control import Queue  # noqa: E402
-from workflows.engine.database import checked_url, default_url, engine, is_sqlite  # noqa: E402
+from workflows.engine.database import checked_url, default_url, engine, is_sqlite, sqlite_file  # noqa: E402
 from workflows.engine.durable import migrate  # noqa: E402
 from workflows.engine.reads import Reader, ended  # noqa: E402
 from workflows.jobs import DRIVER, FlowJob, Job  # noqa: E402
@@ -78,7 +78,6 @@ def _measure(url: str, folder: Path, captures: int, seconds: float) -> None:
         process.kill()
         process.wait()
     queue.close()
-    reader.close()
 
 
 def _started(kind: str, url: str, folder: Path, name: str) -> "subprocess.Popen[bytes]":
@@ -102,7 +101,7 @@ def _command(url: str, folder: Path) -> float:
 
 def _size_mb(url: str) -> float:
     if is_sqlite(url):
-        file = Path(str(sa.make_url(checked_url(url)).database))
+        file = sqlite_file(checked_url(url))
         with engine(url).connect() as connection:
             connection.exec_driver_sql("PRAGMA wal_checkpoint(TRUNCATE)")  # else the log would be counted too
         return sum(path.stat().st_size for path in file.parent.glob(f"{file.name}*") if path.is_file()) / MB

@@ -370,21 +370,13 @@ def _lines(figures: "Figures") -> list[str]:
 def _figures(url: str, run: str | None) -> "Figures":
     from workflows.engine.reads import Reader
 
-    reader = Reader(url)
-    try:
-        return reader.figures(run)
-    finally:
-        reader.close()
+    return Reader(url).figures(run)
 
 
 def _row(folder: Path, db: str | None, job: str) -> "Row":
     from workflows.engine.reads import Reader
 
-    reader = Reader(_url(folder, db))
-    try:
-        row = reader.rows([job]).get(job)
-    finally:
-        reader.close()
+    row = Reader(_url(folder, db)).rows([job]).get(job)
     if row is None:
         raise InputError(
             "There is no such job", where="JOB", expected="an id that the queue knows", got=job, fix="see gnmreg status"

@@ -67,7 +67,6 @@ def run_until_done(farm: LocalFarm, run: str, progress: Progress) -> Ended:
             time.sleep(LOOK_S)
     finally:
         processes.end()
-        reader.close()
 
 
 def _told(counts: Mapping[str, int]) -> str:

@@ -1,20 +1,28 @@
-"""The queue's database: a SQLite file in WAL mode on one machine, or PostgreSQL for many. Only the URL differs."""
+"""The queue's database: a SQLite file in WAL mode on one machine, or PostgreSQL for many. Only the URL differs.
 
+Questions go straight to the drivers: `gnmreg status` shall not wait for SQLAlchemy, which only what writes imports.
+"""
+
+import re
 import sqlite3
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import closing, contextmanager
 from pathlib import Path
-from typing import Any
-
-import sqlalchemy as sa
+from typing import TYPE_CHECKING, Any
+from urllib.parse import urlsplit
 
 from registration.errors import InputError
+
+if TYPE_CHECKING:
+    import sqlalchemy as sa
 
 FILE = "queue.sqlite"
 SCHEMA = "dbos"  # on PostgreSQL
 ENVIRONMENT = "GNMREG_DB"  # where a URL with a password belongs: command lines can be read by everyone
 _NETWORK = ("nfs", "nfs4", "cifs", "smb3", "smbfs", "9p", "lustre", "ceph", "glusterfs", "fuse.sshfs", "beegfs", "gpfs")
-_BUSY_S = 30.0
+_BUSY_S, _CONNECT_S = 30.0, 30
+_READ_ONLY = "-c default_transaction_read_only=on"
+Ask = Callable[[str, Mapping[str, Any]], list[Any]]  # SQL with :names, their values (lists after IN) -> rows
 
 
 def default_url(folder: Path) -> str:
@@ -33,32 +41,42 @@ def checked_url(url: str) -> str:
         InputError: neither sqlite:///FILE nor postgresql://..., a SQLite file on a network disk, or no database's name.
     """
     try:
-        parsed = sa.make_url(url)
-    except (sa.exc.ArgumentError, ValueError):
+        parts = urlsplit(url)
+        kind, database = parts.scheme.partition("+")[0], parts.path[1:]
+    except ValueError:
         raise _refused(url, got="no URL") from None
-    name = parsed.get_backend_name()
-    if name not in ("sqlite", "postgresql") or not parsed.database or parsed.database == ":memory:":
+    if kind not in ("sqlite", "postgresql") or not database or database == ":memory:":
         raise _refused(url, got=redacted_url(url))
-    if name == "sqlite":
-        file = Path(parsed.database).resolve()
-        if (kind := _filesystem(file)) in _NETWORK:
-            raise InputError(
-                "SQLite cannot be used on a network disk",
-                where=file,
-                expected="a local disk: its locks do not hold across machines",
-                got=kind,
-                fix="put the queue on a local disk with --db, or use PostgreSQL",
-            )
-        return f"sqlite:///{file}"
-    return parsed.set(drivername="postgresql+psycopg").render_as_string(hide_password=False)
+    if kind == "postgresql":
+        return parts._replace(scheme="postgresql+psycopg").geturl()
+    file = Path(database).resolve()
+    if (system := _filesystem(file)) in _NETWORK:
+        raise InputError(
+            "SQLite cannot be used on a network disk",
+            where=file,
+            expected="a local disk: its locks do not hold across machines",
+            got=system,
+            fix="put the queue on a local disk with --db, or use PostgreSQL",
+        )
+    return f"sqlite:///{file}"
 
 
 def redacted_url(url: str) -> str:
     """The URL without its password."""
     try:
-        return sa.make_url(url).render_as_string(hide_password=True)
-    except (sa.exc.ArgumentError, ValueError):
+        parts = urlsplit(url)
+    except ValueError:
         return "(no URL)"
+    if not parts.scheme:
+        return "(no URL)"
+    name, at, host = parts.netloc.rpartition("@")
+    user, colon, _ = name.partition(":")
+    return parts._replace(netloc=f"{user}{colon and ':***'}{at}{host}").geturl()
+
+
+def sqlite_file(url: str) -> Path:
+    """The file of a URL that `checked_url` returned."""
+    return Path(url.removeprefix("sqlite:///"))
 
 
 def prepare(url: str) -> None:
@@ -67,9 +85,11 @@ def prepare(url: str) -> None:
     Raises:
         InputError: the database cannot be reached or made.
     """
+    import sqlalchemy as sa
+
     try:
         if is_sqlite(url):
-            file = Path(str(sa.make_url(url).database))
+            file = sqlite_file(url)
             file.parent.mkdir(parents=True, exist_ok=True)
             with sqlite3.connect(file, timeout=_BUSY_S) as connection:
                 mode = connection.execute("PRAGMA journal_mode=WAL").fetchone()[0]
@@ -92,17 +112,14 @@ def prepare(url: str) -> None:
 def require_queue(url: str) -> None:
     """Make sure that there is a queue at the URL. Raises InputError if there is none, or it cannot be reached."""
     got = ""
-    if is_sqlite(url) and not Path(str(sa.make_url(url).database)).is_file():
+    if is_sqlite(url) and not sqlite_file(url).is_file():
         got = "no such file"  # connecting would make it
     else:
-        made = engine(url, read_only=True)
         try:
-            with made.connect() as connection:
-                connection.execute(sa.text(f"SELECT 1 FROM {table(url, 'workflow_status')} LIMIT 1"))
-        except sa.exc.SQLAlchemyError as error:
-            got, *_ = str(getattr(error, "orig", error)).splitlines() or ["nothing"]
-        finally:
-            made.dispose()
+            with reading(url) as ask:
+                ask(f"SELECT 1 FROM {table(url, 'workflow_status')} LIMIT 1", {})
+        except driver_errors(url) as error:
+            got, *_ = str(error).splitlines() or ["nothing"]
     if got:
         raise InputError(
             "There is no queue",
@@ -113,33 +130,61 @@ def require_queue(url: str) -> None:
         )
 
 
-def engine(url: str, *, read_only: bool = False) -> sa.Engine:
-    """Our own connections, one at a time; with `read_only` the database itself refuses to write."""
+def engine(url: str) -> "sa.Engine":
+    """Our own connections that write, one at a time."""
+    import sqlalchemy as sa
+
     if not is_sqlite(url):
-        options = "-c default_transaction_read_only=on" if read_only else ""
-        arguments = {"connect_timeout": 30, "options": options}
-        return sa.create_engine(url, poolclass=sa.pool.NullPool, connect_args=arguments)
+        return sa.create_engine(url, poolclass=sa.pool.NullPool, connect_args={"connect_timeout": _CONNECT_S})
     made = sa.create_engine(url, poolclass=sa.pool.NullPool, connect_args={"timeout": _BUSY_S})
 
     @sa.event.listens_for(made, "connect")
     def _set(connection: Any, _record: object) -> None:
         connection.isolation_level = "IMMEDIATE"  # a reader that becomes a writer may find the file busy for good
         connection.execute("PRAGMA foreign_keys=ON")
-        if read_only:
-            connection.execute("PRAGMA query_only=ON")
 
     return made
 
 
 @contextmanager
-def reading(url: str) -> Iterator[sa.Connection]:
-    """A connection that can only read."""
-    made = engine(url, read_only=True)
-    try:
-        with made.connect() as connection:
-            yield connection
-    finally:
-        made.dispose()
+def reading(url: str) -> Iterator[Ask]:
+    """A connection that the database itself keeps from writing. Raises `driver_errors`."""
+    if is_sqlite(url):
+        with closing(sqlite3.connect(sqlite_file(url), timeout=_BUSY_S)) as file:
+            file.execute("PRAGMA query_only=ON")
+            yield lambda query, values: file.execute(*_bound(query, values)).fetchall()
+    else:
+        import psycopg
+
+        plain = url.replace("+psycopg", "", 1)
+        with closing(psycopg.connect(plain, connect_timeout=_CONNECT_S, options=_READ_ONLY)) as server:
+            yield lambda query, values: server.execute(*_for_psycopg(*_bound(query, values))).fetchall()
+
+
+def driver_errors(url: str) -> type[Exception]:
+    """What `reading` and its questions raise: the database cannot be reached, or does not answer."""
+    if is_sqlite(url):
+        return sqlite3.Error
+    import psycopg
+
+    return psycopg.Error
+
+
+def _bound(query: str, values: Mapping[str, Any]) -> tuple[str, dict[str, Any]]:
+    """A name for each element of a list."""
+    bound: dict[str, Any] = {}
+    for name, value in values.items():
+        if not isinstance(value, Sequence) or isinstance(value, str):
+            bound[name] = value
+            continue
+        bound |= {f"{name}_{number}": one for number, one in enumerate(value)}
+        names = ", ".join(f":{name}_{number}" for number in range(len(value)))
+        query = query.replace(f":{name}", f"({names})")
+    return query, bound
+
+
+def _for_psycopg(query: str, values: dict[str, Any]) -> tuple[Any, dict[str, Any]]:
+    return re.sub(r"(?<!:):(\w+)", r"%(\1)s", query.replace("%", "%%")), values
 
 
 def table(url: str, name: str) -> str:

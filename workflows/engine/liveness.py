@@ -13,13 +13,12 @@ import time
 import zlib
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
-from pathlib import Path
 from typing import IO, Protocol
 
 import sqlalchemy as sa
 
 from registration.errors import InputError
-from workflows.engine.database import engine, is_sqlite, table
+from workflows.engine.database import engine, is_sqlite, reading, sqlite_file, table
 
 log = logging.getLogger("gnmreg")
 
@@ -58,7 +57,7 @@ class FileLocks:
     """flock on files beside the SQLite database."""
 
     def __init__(self, url: str) -> None:
-        database = Path(str(sa.make_url(url).database))
+        database = sqlite_file(url)
         self._folder = database.with_name(f"{database.name}.locks")
         self._held: IO[str] | None = None
 
@@ -163,7 +162,6 @@ class Liveness:
         self._url = url
         self._patience = patience or (SQLITE_PATIENCE if is_sqlite(url) else Patience())
         self._locks: Locks = FileLocks(url) if is_sqlite(url) else PostgresLocks(url)
-        self._engine = engine(url, read_only=True)
         self._free_since: dict[str, float] = {}
         self._me = ""
 
@@ -214,12 +212,12 @@ class Liveness:
 
     def _working(self, version: str) -> list[str]:
         """Executor ids of which jobs are under way."""
-        query = sa.text(
+        query = (
             f"SELECT DISTINCT executor_id FROM {table(self._url, 'workflow_status')} "
             "WHERE status = 'PENDING' AND application_version = :version AND executor_id IS NOT NULL"
         )
-        with self._engine.connect() as connection:
-            return [row[0] for row in connection.execute(query, {"version": version})]
+        with reading(self._url) as ask:
+            return [row[0] for row in ask(query, {"version": version})]
 
 
 def _key(name: str) -> int:

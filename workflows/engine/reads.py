@@ -6,9 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
-import sqlalchemy as sa
-
-from workflows.engine.database import BELOW, below, checked_url, engine, require_queue, table
+from workflows.engine.database import BELOW, below, checked_url, reading, require_queue, table
 from workflows.jobs import check_id
 
 DAY_S = 24 * 3600.0
@@ -61,13 +59,9 @@ class Reader:
         self.url = checked_url(url)
         if not known:
             require_queue(self.url)
-        self._engine = engine(self.url, read_only=True)
         self._status, self._output, self._input = (
             table(self.url, name) for name in ("workflow_status", "workflow_output", "workflow_input")
         )
-
-    def close(self) -> None:
-        self._engine.dispose()
 
     def counts(self, run: str, *, kind: str | None = None) -> dict[str, int]:
         """State -> number of jobs and flows below a run, itself aside."""
@@ -81,22 +75,19 @@ class Reader:
     def counts_of(self, ids: Sequence[str]) -> dict[str, int]:
         """State -> how many of these are in it; ids that are not there are counted nowhere."""
         total: dict[str, int] = {}
-        query = sa.text(f"SELECT status, count(*) FROM {self._status} WHERE workflow_uuid IN :ids GROUP BY status")
-        query = query.bindparams(sa.bindparam("ids", expanding=True))
-        with self._engine.connect() as connection:
+        query = f"SELECT status, count(*) FROM {self._status} WHERE workflow_uuid IN :ids GROUP BY status"
+        with reading(self.url) as ask:
             for start in range(0, len(ids), 1000):
-                found = _by_state(connection.execute(query, {"ids": list(ids[start : start + 1000])}).all())
+                found = _by_state(ask(query, {"ids": list(ids[start : start + 1000])}))
                 total = {state: total.get(state, 0) + found.get(state, 0) for state in {*total, *found}}
         return total
 
     def rows(self, ids: Sequence[str]) -> dict[str, Row]:
         """The jobs and flows of these ids."""
-        query = sa.text(self._select("w.workflow_uuid IN :ids")).bindparams(sa.bindparam("ids", expanding=True))
-        found: dict[str, Row] = {}
-        with self._engine.connect() as connection:
+        query, found = self._select("w.workflow_uuid IN :ids"), dict[str, Row]()
+        with reading(self.url) as ask:
             for start in range(0, len(ids), 1000):
-                for row in connection.execute(query, {"ids": list(ids[start : start + 1000])}):
-                    found[row[0]] = _row(row)
+                found |= {row[0]: _row(row) for row in ask(query, {"ids": list(ids[start : start + 1000])})}
         return found
 
     def failed(self, run: str, limit: int = 1000) -> list[Row]:
@@ -171,8 +162,8 @@ class Reader:
         )
 
     def _rows(self, query: str, parameters: dict[str, Any]) -> Sequence[Any]:
-        with self._engine.connect() as connection:
-            return connection.execute(sa.text(query), parameters).all()
+        with reading(self.url) as ask:
+            return ask(query, parameters)
 
 
 def ended(counts: dict[str, int]) -> int:

@@ -4,11 +4,13 @@ import asyncio
 import json
 import logging
 import random
+import sqlite3
 from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 
+import psycopg
 import sqlalchemy as sa
 from dbos import DBOS
 
@@ -23,7 +25,7 @@ LOOK_S, SELDOM_S = 1.0, 5.0  # between two looks at the counts: at first, and wh
 AGAIN_S = 2.0  # after which a database that did not answer is asked again
 
 T = TypeVar("T")
-Opened = TypeVar("Opened", Queue, Reader)
+_UNREACHABLE = (sqlite3.OperationalError, psycopg.OperationalError, psycopg.InterfaceError)
 
 
 class Scope:
@@ -78,7 +80,14 @@ class Scope:
 
 
 async def _put(url: str, jobs: list[Job | FlowJob]) -> int:
-    return await _patiently(lambda: _with(Queue(url, known=True), lambda queue: queue.put(jobs)))
+    def put() -> int:
+        queue = Queue(url, known=True)
+        try:
+            return queue.put(jobs)
+        finally:
+            queue.close()
+
+    return await _patiently(put)
 
 
 async def _counted(url: str, ids: list[str]) -> dict[str, int]:
@@ -94,15 +103,12 @@ async def _polled(
     url: str, count: Callable[[Reader], dict[str, int]], over: Callable[[dict[str, int]], bool]
 ) -> dict[str, int]:
     reader, pause = Reader(url, known=True), LOOK_S
-    try:
-        while True:
-            counts = await _patiently(partial(count, reader))
-            if over(counts):
-                return counts
-            await asyncio.sleep(pause * random.uniform(0.8, 1.2))
-            pause = min(1.2 * pause, SELDOM_S)
-    finally:
-        reader.close()
+    while True:
+        counts = await _patiently(partial(count, reader))
+        if over(counts):
+            return counts
+        await asyncio.sleep(pause * random.uniform(0.8, 1.2))
+        pause = min(1.2 * pause, SELDOM_S)
 
 
 async def _results(url: str, ids: list[str]) -> dict[str, Any]:
@@ -124,7 +130,7 @@ async def _read(file: str) -> Any:
 
 
 async def _rows(url: str, ids: list[str]) -> dict[str, Row]:
-    return await _patiently(lambda: _with(Reader(url, known=True), lambda reader: reader.rows(ids)))
+    return await _patiently(lambda: Reader(url, known=True).rows(ids))
 
 
 async def _patiently(ask: Callable[[], T]) -> T:
@@ -132,17 +138,10 @@ async def _patiently(ask: Callable[[], T]) -> T:
     while True:
         try:
             return await asyncio.to_thread(ask)
-        except (sa.exc.OperationalError, sa.exc.InterfaceError) as error:
-            first, *_ = str(error.orig).splitlines() or [""]
+        except (sa.exc.OperationalError, sa.exc.InterfaceError, *_UNREACHABLE) as error:
+            first, *_ = str(getattr(error, "orig", error)).splitlines() or [""]
             log.warning("the queue's database does not answer, waiting: %s", first)
             await asyncio.sleep(AGAIN_S)
-
-
-def _with(opened: Opened, use: Callable[[Opened], T]) -> T:
-    try:
-        return use(opened)
-    finally:
-        opened.close()
 
 
 def _value(row: Row) -> Any:

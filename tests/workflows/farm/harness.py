@@ -93,7 +93,6 @@ class Farm:
 
     def close(self) -> None:
         self.queue.close()
-        self.reader.close()
         for process in self.processes.values():
             process.send_signal(signal.SIGCONT)
             process.kill()
