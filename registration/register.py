@@ -30,7 +30,7 @@ from registration.render import backend
 from registration.report.inputs import ReportInputs, heat_map, report_views
 from registration.report.page import write_report
 from registration.report.stages import write_stage
-from registration.stages import RECIPES, Recipe, Stage, expression_of
+from registration.stages import Recipe, Stage, expression_of, recipe_named
 from registration.start import LEAST_LANDMARKS, LEAST_OVERLAP, from_landmarks, from_masks, spread_views
 from registration.targets.classes import BACKGROUND, class_map
 from registration.targets.pyramid import build_pyramid
@@ -133,15 +133,7 @@ def _read_inputs(
     settings: Mapping[str, Any],
 ) -> Inputs:
     """Read and check everything; only landmarks are triangulated."""
-    if isinstance(wanted, str) and wanted not in RECIPES:
-        raise InputError(
-            "There is no such recipe",
-            where="recipe",
-            expected=" or ".join(RECIPES),
-            got=wanted,
-            fix="choose one of them",
-        )
-    recipe = RECIPES[wanted]() if isinstance(wanted, str) else wanted
+    recipe = recipe_named(wanted) if isinstance(wanted, str) else wanted
     capture = read(capture_path)
     validate(capture)
     if views is not None:

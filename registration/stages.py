@@ -6,6 +6,7 @@ A recipe is a function that returns its stages; the resolved values are saved wi
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
+from registration.errors import InputError
 from registration.optimize import Rate
 
 
@@ -186,3 +187,16 @@ RECIPES: dict[str, Callable[[], Recipe]] = {
     "studio": studio,
     "in_model": in_model,
 }
+
+
+def recipe_named(name: str) -> Recipe:
+    """Raises InputError for a name that no recipe has."""
+    if name not in RECIPES:
+        raise InputError(
+            "There is no such recipe",
+            where="recipe",
+            expected=" or ".join(RECIPES),
+            got=name,
+            fix="choose one of them",
+        )
+    return RECIPES[name]()

@@ -17,10 +17,10 @@ from registration.artifacts import refuse_foreign, swap_in
 from registration.errors import InputError
 from registration.hashes import plain, versions
 from registration.model import gnm_npz
+from registration.stages import recipe_named
 from workflows import steps
 from workflows.coregistration_page import write_coregistration_page
 from workflows.dataset import Split, read_dataset, split
-from workflows.local import check_recipe
 
 SCHEMA = 1
 KIND = "gnm-coregistration"
@@ -86,7 +86,7 @@ def planned(
         InputError: `read_dataset`, `split` or `check_out` refuses; no such recipe or model; more components than there
             can be. Nothing is computed or written.
     """
-    check_recipe(recipe)
+    recipe_named(recipe)
     found = read_dataset(dataset)
     plan = Plan(
         dataset=Path(dataset),

@@ -16,11 +16,11 @@ from registration.model.landmarks import schemes_beside
 from registration.progress import Progress
 from registration.register import register
 from registration.render.backend import Variant
-from registration.stages import RECIPES
+from registration.stages import recipe_named
 from workflows.coregistration import FIRST, Plan, State, decided, save
 from workflows.dataset import Split, read_dataset
 from workflows.jobs import Unusable
-from workflows.local import begin_subject, check_recipe
+from workflows.local import begin_subject
 from workflows.model_subjects import has_truths
 from workflows.places import capture_here, model_here
 from workflows.store import Store
@@ -47,7 +47,7 @@ def register_stored(
         InputError: as `register`, or an input cannot be fetched.
         Unusable: the registration's status is failed; it is published all the same, for whoever looks into it.
     """
-    check_recipe(recipe)
+    resolved = recipe_named(recipe)
     file = model_here(model)
     data = gnm_npz.read(file)
     schemes = schemes_beside(file, len(data.template_vertex_positions))
@@ -55,7 +55,7 @@ def register_stored(
     inputs["model"] = gnm_npz.content_hash(data)
     with capture_here(capture) as folder:
         inputs["capture"] = hashes.hash_capture(read(folder))
-        settings = {"recipe": hashes.plain(RECIPES[recipe]()), "views": views, "seed": seed, "variant": variant}
+        settings = {"recipe": hashes.plain(resolved), "views": views, "seed": seed, "variant": variant}
 
         def make(attempt: Path) -> dict[str, Any]:
             result = register(

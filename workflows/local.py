@@ -18,7 +18,7 @@ from registration.model.landmarks import read_scheme
 from registration.progress import Named, Progress, Silent
 from registration.register import register
 from registration.render.backend import Variant
-from registration.stages import RECIPES
+from registration.stages import recipe_named
 from registration.types import Capture, Registration
 from workflows.subject_folder import MANIFEST, Captures, Row, Subject, check_subject_out, read_captures, save_subject
 from workflows.subject_page import thumbnail, write_subject_page
@@ -98,7 +98,7 @@ def _begun(
     landmark_files: Mapping[str, Path],
 ) -> tuple[Captures, Subject]:
     """A subject's captures, and what is known before the first is registered. Everything is checked."""
-    check_recipe(recipe)
+    recipe_named(recipe)
     captures = read_captures(subject_dir, neutral)
     check_subject_out(out, captures)
     start = Subject(
@@ -250,15 +250,3 @@ def _checked_model(model_path: Path, landmark_files: Mapping[str, Path]) -> str:
     for name, file in landmark_files.items():
         read_scheme(file, len(data.template_vertex_positions), name)
     return gnm_npz.content_hash(data)
-
-
-def check_recipe(recipe: str) -> None:
-    """Raises InputError for a name that no recipe has."""
-    if recipe not in RECIPES:
-        raise InputError(
-            "There is no such recipe",
-            where="recipe",
-            expected=" or ".join(RECIPES),
-            got=recipe,
-            fix="choose one of them",
-        )

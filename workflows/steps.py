@@ -25,7 +25,7 @@ from registration.progress import Progress, Silent
 from registration.stabilize import folder as stabilized
 from registration.stabilize.components import LEAST_SAMPLES
 from registration.stabilize.meshes import SkullSkin
-from registration.stages import RECIPES
+from registration.stages import recipe_named
 from workflows import local
 from workflows.dataset import Dataset, read_dataset
 from workflows.evaluate_models import evaluate_models
@@ -67,8 +67,7 @@ def register_subject(
     inputs |= {f"capture {name}": error.line for name, error in captures.broken.items()}
     inputs |= {f"landmarks {name}": hashes.content_of(one.indices, one.weights) for name, one in schemes.items()}
     inputs |= {"subject": captures.subject, "model": gnm_npz.content_hash(data)}
-    local.check_recipe(recipe)
-    wanted = hashes.input_hash(inputs, {"recipe": hashes.plain(RECIPES[recipe]()), "views": views, "seed": seed})
+    wanted = hashes.input_hash(inputs, {"recipe": hashes.plain(recipe_named(recipe)), "views": views, "seed": seed})
     place = Path(out)
     if (known := _known(place, wanted)) is not None and _contents(place, known["contents"]) == known["contents"]:
         return known
