@@ -7,7 +7,7 @@ from typing import Any
 from urllib.parse import quote
 
 from registration.report.charts import Line, number_curves
-from registration.report.style import CSS
+from registration.report.style import document
 from workflows.model_page import table
 
 _CSS = "td, th { padding-right: 14px; } .panel + .panel { margin-top: 16px; }"
@@ -16,11 +16,8 @@ _CSS = "td, th { padding-right: 14px; } .panel + .panel { margin-top: 16px; }"
 def write_coregistration_page(told: Mapping[str, Any]) -> str:
     """From the entries of `coregistration.json`; links lead to what lies beside the page."""
     sections = (_rounds(told), _curves(told), _measured_on(told), _failures(told))
-    return (
-        '<!doctype html><html lang="en"><head><meta charset="utf-8"><title>Coregistration</title>'
-        f'<meta name="viewport" content="width=device-width, initial-scale=1"><style>{CSS}{_CSS}</style></head><body>'
-        f"{_header(told)}<main>{''.join(sections)}</main></body></html>"
-    )
+    body = f"{_header(told)}<main>{''.join(sections)}</main>"
+    return document("Coregistration", body, css=_CSS, zooms=False)
 
 
 def _header(told: Mapping[str, Any]) -> str:

@@ -13,7 +13,7 @@ from registration.report.charts import Line, number_curves
 from registration.report.heat import UNMEASURED, heat_pictures, scale_limit_mm
 from registration.report.inputs import HeatMap
 from registration.report.pictures import SCALE, data_uri
-from registration.report.style import CSS, SCRIPT
+from registration.report.style import document, sectioned
 
 _CSS = """
 td small { color: var(--soft); margin-left: 6px; } h3 { margin: 0 0 10px; font-size: 15.5px; }
@@ -52,19 +52,9 @@ def write_evaluate_page(evaluation: Evaluation, models: Mapping[str, GNMData], m
         ),
         "Provenance": ("All that is needed to make this result again.", _provenance(manifest)),
     }
-    shown = {name: part for name, part in sections.items() if part[1]}
-    links = "".join(f'<a href="#{name.split()[0].lower()}">{name}</a>' for name in shown)
-    body = "".join(
-        f'<section id="{name.split()[0].lower()}"><h2>{name}</h2><p>{text}</p>{content}</section>'
-        for name, (text, content) in shown.items()
-    )
-    return (
-        '<!doctype html><html lang="en"><head><meta charset="utf-8"><title>Evaluation of head models</title>'
-        f'<meta name="viewport" content="width=device-width, initial-scale=1"><style>{CSS}{_CSS}</style></head><body>'
-        f"{_header(evaluation, tabled)}<nav><div class=top>{links}</div></nav><main>{body}"
-        f"<footer>Figures in correspondence are of {evaluation.vertices:,} vertices: the head's skin without the neck."
-        f"</footer></main><dialog><img alt=''><p></p></dialog><script>{SCRIPT}</script></body></html>"
-    )
+    footer = f"Figures in correspondence are of {evaluation.vertices:,} vertices: the head's skin without the neck."
+    body = _header(evaluation, tabled) + sectioned(sections, footer=footer)
+    return document("Evaluation of head models", body, css=_CSS)
 
 
 def _header(evaluation: Evaluation, tabled: int) -> str:

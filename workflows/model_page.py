@@ -13,7 +13,7 @@ from registration.report.charts import Line, number_curves
 from registration.report.heat import heat_pictures, scale_limit_mm
 from registration.report.inputs import HeatMap
 from registration.report.pictures import SCALE, data_uri
-from registration.report.style import CSS, SCRIPT
+from registration.report.style import document, sectioned
 
 SIGMAS = 2.0
 IDENTITY, EXPRESSION = 4, 2  # components drawn, of the head and of each region
@@ -41,18 +41,7 @@ def write_model_page(data: GNMData, manifest: Mapping[str, Any]) -> str:
         "Who": ("Subjects by tag; expressions by category and label.", _tables(manifest)),
         "Provenance": ("All that is needed to make this model again.", _provenance(manifest)),
     }
-    shown = {name: part for name, part in sections.items() if part[1]}
-    links = "".join(f'<a href="#{_id(name)}">{name}</a>' for name in shown)
-    body = "".join(
-        f'<section id="{_id(name)}"><h2>{name}</h2><p>{text}</p>{content}</section>'
-        for name, (text, content) in shown.items()
-    )
-    return (
-        '<!doctype html><html lang="en"><head><meta charset="utf-8"><title>A head model</title>'
-        f'<meta name="viewport" content="width=device-width, initial-scale=1"><style>{CSS}{_CSS}</style></head><body>'
-        f"{_header(manifest)}<nav><div class=top>{links}</div></nav><main>{body}</main>"
-        f"<dialog><img alt=''><p></p></dialog><script>{SCRIPT}</script></body></html>"
-    )
+    return document("A head model", _header(manifest) + sectioned(sections), css=_CSS)
 
 
 def _header(manifest: Mapping[str, Any]) -> str:
@@ -173,7 +162,3 @@ def table(heads: Sequence[str], rows: Sequence[Sequence[Any]]) -> str:
         for row in rows
     )
     return f"<table><tr>{head}</tr>{body}</table>"
-
-
-def _id(name: str) -> str:
-    return name.lower().replace(" ", "-")

@@ -10,7 +10,7 @@ from registration.report.charts import loss_curves
 from registration.report.heat import UNMEASURED, heat_pictures
 from registration.report.inputs import HeatMap
 from registration.report.pictures import SCALE, data_uri
-from registration.report.style import CSS, SCRIPT
+from registration.report.style import document
 from registration.stabilize.components import Components, Head
 from registration.stabilize.dataset import StabilizedSubject
 
@@ -37,9 +37,7 @@ def write_stabilize_page(
         cards.append(_subject(subject, head, settings.still_mm))
     more = len(manifest["subjects"]) - len(cards)
     rest = f'<p class="hint">And {more} more subjects, not pictured.</p>' if more > 0 else ""
-    return (
-        '<!doctype html><html lang="en"><head><meta charset="utf-8"><title>Stabilized expressions</title>'
-        f'<meta name="viewport" content="width=device-width, initial-scale=1"><style>{CSS}</style></head><body>'
+    body = (
         '<header><div class="top"><div class="eyebrow">Stabilization</div><h1>The skull stands still</h1>'
         f'<p class="lead">Dataset <span class="mono">{escape(manifest["dataset"][:16])}</span></p>'
         f'<div class="tiles">{cells}</div></div></header><main>'
@@ -49,8 +47,8 @@ def write_stabilize_page(
         "its motion is made of. Flagged is what looks like motion of the whole head: rigid, whatever the expression, "
         "shared by nose and neck.</p>"
         f'<div class="panel">{_table(components, head)}</div><footer></footer></main>'
-        f"<dialog><img alt=''><p></p></dialog><script>{SCRIPT}</script></body></html>"
     )
+    return document("Stabilized expressions", body)
 
 
 def _subject(subject: StabilizedSubject, head: Head, still_mm: float) -> str:

@@ -12,7 +12,7 @@ from jaxtyping import Float
 from registration.frames import axis_angle_to_matrix, linear_to_srgb
 from registration.geometry.raster import rasterize
 from registration.report.pictures import PAPER, data_uri
-from registration.report.style import CSS
+from registration.report.style import document
 from registration.types import Camera, Registration
 from workflows.subject_folder import Row, Subject
 
@@ -64,17 +64,15 @@ def write_subject_page(subject: Subject, thumbnails: Mapping[str, str]) -> str:
     lead += f", {waiting} {'is' if waiting == 1 else 'are'} waiting." if waiting else "."
     rows = "".join(_row(row, thumbnails.get(row.name)) for row in subject.rows)
     name = escape(subject.subject)
-    return (
-        f'<!doctype html><html lang="en"><head><meta charset="utf-8"><title>{name} – registrations</title>'
-        f'<meta name="viewport" content="width=device-width, initial-scale=1"><style>{CSS}{_CSS}</style></head><body>'
+    body = (
         f'<header><div class="top"><div class="eyebrow">Head registrations of a subject</div><h1>{name}</h1>'
         f'<p class="lead">{lead}</p></div></header><main><div class="panel"><table><tr><th></th><th>capture</th>'
         '<th></th><th class="num">scan to mesh, mean</th><th class="num">median</th><th class="num">drift, mean</th>'
         f'<th class="num">time</th><th class="note">why</th></tr>{rows}</table></div>'
         f"<footer>Figures are of the face, in millimetres. Recipe {escape(subject.recipe)}; expressions start from "
         f'{escape(subject.neutral)}; model <span class="mono">{escape(subject.model[:16])}</span>.</footer></main>'
-        "</body></html>"
     )
+    return document(f"{name} – registrations", body, css=_CSS, zooms=False)
 
 
 def _row(row: Row, picture: str | None) -> str:

@@ -10,7 +10,7 @@ from registration.report.charts import loss_curves
 from registration.report.heat import UNMEASURED, heat_pictures, scale_limit_mm
 from registration.report.inputs import HeatMap, ReportInputs
 from registration.report.pictures import CLASS_COLOURS, SCALE, Picture, ViewPictures, data_uri, view_pictures
-from registration.report.style import CSS, SCRIPT
+from registration.report.style import document, sectioned
 from registration.types import Registration
 
 FIGURES = {
@@ -28,23 +28,17 @@ def write_report(inputs: ReportInputs) -> str:
     """The whole page. Sections without anything to show are left out."""
     views = [view_pictures(view) for view in inputs.views]
     sections = {
-        "Distances": _distances(inputs),
-        "Views": _views(views, inputs.class_names),
-        "Optimisation": _optimisation(inputs.registration),
-        "Provenance": _provenance(inputs),
+        "Distances": ("", _distances(inputs)),
+        "Views": ("", _views(views, inputs.class_names)),
+        "Optimisation": ("", _optimisation(inputs.registration)),
+        "Provenance": ("", _provenance(inputs)),
     }
-    shown = {name: body for name, body in sections.items() if body}
-    links = "".join(f'<a href="#{name.lower()}">{name}</a>' for name in shown)
-    body = "".join(f'<section id="{name.lower()}"><h2>{name}</h2>{body}</section>' for name, body in shown.items())
-    title = f"{escape(inputs.subject)} · {escape(inputs.expression)}"
-    return (
-        f'<!doctype html><html lang="en"><head><meta charset="utf-8"><title>{title} – registration</title>'
-        f'<meta name="viewport" content="width=device-width, initial-scale=1"><style>{CSS}</style></head><body>'
-        f"{_header(inputs)}<nav><div class=top>{links}</div></nav><main>{body}"
-        "<footer>Distances are unsigned; nothing is aligned or scaled before they are taken, and nothing is dropped "
-        "unless the table says so.</footer></main><dialog><img alt=''><p></p></dialog>"
-        f"<script>{SCRIPT}</script></body></html>"
+    footer = (
+        "Distances are unsigned; nothing is aligned or scaled before they are taken, and nothing is dropped unless the "
+        "table says so."
     )
+    title = f"{escape(inputs.subject)} · {escape(inputs.expression)} – registration"
+    return document(title, _header(inputs) + sectioned(sections, footer=footer))
 
 
 def headline(registration: Registration) -> str:
