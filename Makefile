@@ -2,7 +2,7 @@
 # make demo    sets up, makes a head model and a capture from nothing, and registers it: about five minutes
 # make demo-batch   a population of five, and two rounds of coregistration over it with two workers: half an hour
 # make check   sets up, then style, types and import directions
-# make test    sets up, checks and runs the tests
+# make test    sets up, checks and runs the tests, two files at a time
 # make test-durability   kills workers, drivers and a PostgreSQL server under load: minutes, not part of make test
 #
 # Needs git, make and Python 3.11 to 3.13. PYTHON=python3.12 names one; an existing .venv keeps the one it was made with.
@@ -55,7 +55,8 @@ check: setup
 	$(BIN)/lint-imports
 
 test: check
-	$(BIN)/python -m pytest
+	export OMP_NUM_THREADS=$$(( ($$(nproc) + 1) / 2 ))
+	$(BIN)/python -m pytest -n 2 --dist loadfile
 
 test-durability: setup
 	@ls /usr/lib/postgresql/*/bin/initdb >/dev/null 2>&1 || command -v initdb >/dev/null || $(call packages,postgresql) || {
