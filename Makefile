@@ -55,7 +55,7 @@ check: setup
 	$(BIN)/lint-imports
 
 test: check
-	export OMP_NUM_THREADS=$$(( ($$(nproc) + 1) / 2 ))
+	export OMP_NUM_THREADS=$$(( ($$(getconf _NPROCESSORS_ONLN) + 1) / 2 ))
 	$(BIN)/python -m pytest -n 2 --dist loadfile
 
 test-durability: setup
