@@ -16,6 +16,7 @@ from coregister.build import Build
 from coregister.build import build as build_model
 from coregister.evaluate import Settings
 from coregister.generalization import identity_part
+from coregister.identity import Identity
 from registration import hashes
 from registration.artifacts import fresh_folder, read_manifest, swap_in
 from registration.errors import InputError
@@ -40,8 +41,8 @@ Told = dict[str, Any]  # JSON values
 
 
 def builder(categories: Mapping[str, str] | None = None) -> Build:
-    """The builder's settings: here, and nowhere else."""
-    return Build(categories=categories)
+    """The builder's settings: here, and nowhere else. What they are worth: docs/model_building.md."""
+    return Build(identity=Identity(previous=None, by_area=True, share=0.999), categories=categories)
 
 
 def register_subject(

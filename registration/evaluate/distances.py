@@ -45,6 +45,14 @@ def distances_mm(points: Float[np.ndarray, "P 3"], surface: Surface) -> Float[np
     return closest_points(points, surface.vertices, surface.triangles)[0] * MM_PER_M
 
 
+def spread(surface: Surface, count: int, seed: int = 0) -> tuple[Float[np.ndarray, "N 3"], Int[np.ndarray, "N"]]:
+    """Random points of a surface, as many on every square millimetre, and the face of each."""
+    area, rng = np.linalg.norm(surface.normals(), axis=1), np.random.default_rng(seed)
+    face = rng.choice(len(area), count, p=area / area.sum())
+    weight = rng.dirichlet((1.0, 1.0, 1.0), count)
+    return barycentric_points(surface.vertices, surface.triangles, face, weight), face
+
+
 def area_uniform(scan: Surface, within: Bool[np.ndarray, "V"], mesh: Surface, seed: int = 0) -> dict[str, Any]:
     """Figures of area-uniform points of the scan's triangles whose corners are all `within`.
 
@@ -52,13 +60,9 @@ def area_uniform(scan: Surface, within: Bool[np.ndarray, "V"], mesh: Surface, se
     lies on the mesh's boundary; both shares are told.
     """
     part = Surface(vertices=scan.vertices, triangles=scan.triangles[within[scan.triangles].all(1)])
-    area = np.linalg.norm(part.normals(), axis=1)
-    if not area.sum():
+    if not part.normals().any():
         return {**summary(np.zeros(0)), "dropped_normals": None, "dropped_boundary": None}
-    rng = np.random.default_rng(seed)
-    face = rng.choice(len(area), SAMPLES, p=area / area.sum())
-    weight = rng.dirichlet((1.0, 1.0, 1.0), SAMPLES)
-    samples = barycentric_points(part.vertices, part.triangles, face, weight)
+    samples, face = spread(part, SAMPLES, seed)
     distance, hit, barycentric = closest_points(samples, mesh.vertices, mesh.triangles)
     there, here = mesh.normals()[hit], part.normals()[face]
     length = np.linalg.norm(there, axis=1) * np.linalg.norm(here, axis=1)
