@@ -106,7 +106,7 @@ def register_subject(
     """
     landmark_files = _landmark_files(landmarks)
     from registration.progress import shown
-    from workflows.local import register_subject
+    from workflows.subject import register_subject
 
     with shown() as progress:
         result = register_subject(

@@ -20,10 +20,10 @@ from registration.stages import recipe_named
 from workflows.coregistration import FIRST, Plan, State, decided, save
 from workflows.dataset import Split, read_dataset
 from workflows.jobs import Unusable
-from workflows.local import begin_subject
 from workflows.model_subjects import has_truths
 from workflows.places import capture_here, model_here
 from workflows.store import Store
+from workflows.subject import begin_subject
 from workflows.subject_folder import USABLE
 
 REGISTRATION = "registration"  # the folder within an attempt

@@ -1,8 +1,8 @@
 """The durable steps of coregistration: each loads, makes ONE public call, saves, and tells of it in JSON values.
 
 They meet only through named products on disk. A product that was made from the same inputs is there already and is
-told at once; a step that is interrupted leaves none, so that any of them may be called again at any time, by a plain
-loop (`coregistration.py`) as by a queue.
+told at once; a step that is interrupted leaves none, so that any of them may be called again at any time, which is what
+flows (`flows.py`) rely on.
 """
 
 import json
@@ -27,7 +27,7 @@ from registration.stabilize import folder as stabilized
 from registration.stabilize.components import LEAST_SAMPLES
 from registration.stabilize.meshes import SkullSkin
 from registration.stages import recipe_named
-from workflows import local
+from workflows import subject
 from workflows.dataset import Dataset, read_dataset
 from workflows.evaluate_models import evaluate_models
 from workflows.model_page import write_model_page
@@ -59,7 +59,7 @@ def register_subject(
     """A subject's captures -> the folder that `gnmreg subject` writes. What ended in an error is tried anew each time,
     but for the captures of `leave`, which tells why.
 
-    Raises InputError as `local.register_subject`.
+    Raises InputError as `subject.register_subject`.
     """
     captures = read_captures(Path(subject_dir))
     data = gnm_npz.read(Path(model))
@@ -72,7 +72,7 @@ def register_subject(
     place = Path(out)
     if (known := _known(place, wanted)) is not None and _contents(place, known["contents"]) == known["contents"]:
         return known
-    found = local.register_subject(
+    found = subject.register_subject(
         Path(subject_dir),
         model_path=Path(model),
         out=place,

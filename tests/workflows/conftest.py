@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import trimesh
 
-import workflows.local
+import workflows.subject
 from registration.artifacts import save_registration
 from registration.types import Registration
 from tests.capture import small
@@ -98,7 +98,7 @@ class FakeRegister:
 @pytest.fixture
 def fake(monkeypatch: pytest.MonkeyPatch) -> FakeRegister:
     fake = FakeRegister()
-    monkeypatch.setattr(workflows.local, "register", fake)
+    monkeypatch.setattr(workflows.subject, "register", fake)
     return fake
 
 

@@ -6,7 +6,7 @@ from types import SimpleNamespace
 import pytest
 
 import registration.register
-import workflows.local
+import workflows.subject
 from tests.capture.small import make
 from workflows.cli import main
 from workflows.subject_folder import Row, Subject
@@ -249,7 +249,7 @@ def test_subject_passes_every_argument_on(
         rows = tuple(Row(name=f"c{i}", expression="", status=s, reason="because") for i, s in enumerate(statuses))
         return Subject(subject="anna", model="ab", recipe="draft", neutral="c0", rows=rows)
 
-    monkeypatch.setattr(workflows.local, "register_subject", listen)
+    monkeypatch.setattr(workflows.subject, "register_subject", listen)
     flags = "--recipe studio --views 7 --seed 3 --neutral N --deterministic --force --variant cuda --landmarks 68=a 5=b"
     assert main(["subject", "S", "--model", "M.npz", "--out", "O", *flags.split()]) == code
     heard.pop("progress").note("told")
@@ -286,6 +286,6 @@ def test_an_interrupt_is_told_without_a_traceback(
     def interrupt(*args, **options) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(workflows.local, "register_subject", interrupt)
+    monkeypatch.setattr(workflows.subject, "register_subject", interrupt)
     assert main(["subject", "S", "--model", "M", "--out", "O"]) == 130
     assert capsys.readouterr().err == "interrupted\n"

@@ -12,8 +12,8 @@ import workflows.coregistration_page
 import workflows.evaluate_models
 import workflows.farm_coregistration
 import workflows.farm_steps
-import workflows.local
 import workflows.stabilize_run
+import workflows.subject
 from coregister.decide import Rule
 from registration.errors import InputError
 from registration.model import gnm_npz
@@ -38,8 +38,8 @@ TWICE = Rule(rounds=2, failures=1.0, early=False)
 def finds(monkeypatch) -> Finds:
     """Registrations that find the truth, in this process; and no pictures, which other tests look at."""
     found = Finds()
-    monkeypatch.setattr(workflows.local, "register", found)
-    monkeypatch.setattr(workflows.local, "thumbnail", lambda registration: None)
+    monkeypatch.setattr(workflows.subject, "register", found)
+    monkeypatch.setattr(workflows.subject, "thumbnail", lambda registration: None)
     monkeypatch.setattr(workflows.farm_steps, "register", found)
     monkeypatch.setattr(workflows.evaluate_models, "write_evaluate_page", lambda *a: "<html></html>")
     monkeypatch.setattr(workflows.stabilize_run, "write_stabilize_page", lambda *a: "<html></html>")

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import torch
 
-import workflows.local
+import workflows.subject
 from registration.artifacts import AXES, load_registration, read_manifest
 from registration.errors import InputError
 from registration.evaluate.evaluation import evaluate_folder
@@ -20,7 +20,7 @@ from registration.render import backend
 from registration.stages import RECIPES, Recipe, draft
 from tests.register import synthetic
 from tests.workflows.conftest import MODEL, FakeRegister, Notes, add_truths, change, manifest, statuses
-from workflows.local import register_subject
+from workflows.subject import register_subject
 from workflows.subject_folder import Subject
 
 REFUSED = InputError("The lens is dirty", where="cam3", expected="a clean one", got="dust", fix="wipe it")
@@ -191,13 +191,13 @@ def test_a_drift_that_is_newer_than_the_neutral_stays(subject: Path, fake: FakeR
     out, asked = tmp_path / "out", []
     add_truths(subject, "rest", "jaw2", "smile")
     run(subject)
-    monkeypatch.setattr(workflows.local, "register", lambda capture, *, out, **settings: load_registration(out))
+    monkeypatch.setattr(workflows.subject, "register", lambda capture, *, out, **settings: load_registration(out))
 
     def listen(registration, capture, **options):
         asked.append(capture.root.name)
         raise REFUSED
 
-    monkeypatch.setattr(workflows.local, "evaluate", listen)
+    monkeypatch.setattr(workflows.subject, "evaluate", listen)
     again = run(subject)
     assert asked == [] and again.rows[-1].figures["drift"]["face"]["mean_mm"] == pytest.approx(1.0, abs=0.05)
     os.utime(out / "rest" / "manifest.json")
@@ -259,6 +259,6 @@ def test_a_subject_equals_its_captures_registered_by_hand(tmp_path: Path, monkey
         raise AssertionError("there was nothing to compute")
 
     monkeypatch.setattr(backend, "activate", stop)
-    monkeypatch.setattr(workflows.local, "evaluate", stop)
+    monkeypatch.setattr(workflows.subject, "evaluate", stop)
     register_subject(subject, out=out, **settings)
     assert manifest(out) == record

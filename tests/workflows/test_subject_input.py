@@ -7,7 +7,7 @@ import pytest
 
 from registration.errors import InputError
 from tests.workflows.conftest import MODEL, FakeRegister, change
-from workflows.local import register_subject
+from workflows.subject import register_subject
 
 
 def files(folder: Path) -> list[Path]:

@@ -1,4 +1,4 @@
-"""Many captures on this machine, one after the other: a plain loop over the library's public calls."""
+"""The captures of a subject, one after the other: a plain loop over the library's public calls."""
 
 import traceback
 from collections.abc import Callable, Mapping
