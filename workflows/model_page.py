@@ -22,6 +22,7 @@ _CSS = """
 .pair { display: grid; grid-template-columns: 1fr 1fr; gap: 16px; margin-bottom: 16px; }
 .pair .sides { grid-template-columns: 1fr 1fr; }
 h3 { margin: 0 0 10px; font-size: 15.5px; } .panel + .panel { margin-top: 16px; } td.kind { color: var(--soft); }
+.pair .panel + .panel { margin-top: 0; }
 """
 
 
