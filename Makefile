@@ -1,6 +1,6 @@
 # make setup   makes .venv with exactly the versions of constraints.txt, and finds or installs what the system must have
 # make demo    sets up, makes a head model and a capture from nothing, and registers it: about five minutes
-# make demo-batch   a population of five, and two rounds of coregistration over it with two workers: half an hour
+# make demo-batch   a population of five in three expressions each, and two rounds of coregistration over it with two workers: half an hour
 # make check   sets up, then style, types and import directions
 # make test    sets up, checks and runs the tests, two files at a time
 # make test-durability   kills workers, drivers and a PostgreSQL server under load: minutes, not part of make test
@@ -43,7 +43,7 @@ demo-batch: setup
 	@rm -rf $(BATCH)
 	set -x
 	$(BIN)/gnmreg model bootstrap --out $(BATCH)/first/gnm_head_first.npz
-	$(BIN)/gnmreg dataset synth $(BATCH)/dataset --subjects 5 --held-out 2 --expressions smile,jaw_open,brows_up --views 8 --size 256 256 --jobs 2
+	$(BIN)/gnmreg dataset synth $(BATCH)/dataset --subjects 5 --held-out 2 --expressions smile,jaw_open --views 8 --size 256 256 --jobs 2
 	$(BIN)/gnmreg coregister $(BATCH)/dataset --local --workers 2 --recipe draft --iterations 2 --all-iterations --model $(BATCH)/first/gnm_head_first.npz --components 5 10 --out $(BATCH)/rounds
 	$(BIN)/gnmreg status --folder $(BATCH)/rounds.farm
 	{ set +x; } 2>/dev/null
