@@ -3,8 +3,9 @@
     python -m bench.real_shape CAPTURE... --model MODEL.npz --out OUT [--previous chosen] [--by-area] [--no-mirrored]
 
 Every neutral CAPTURE, with a scan, is registered with the `draft` recipe from MODEL into OUT/registrations; what is
-there already is not registered again. Then each subject in turn is left out: the next model is built from the others
-and MODEL, and both models are fitted to the one left out with the same numbers of components, in two ways:
+there already is not registered again. Then each subject in turn is left out: the next model is built from the others,
+as far as their registrations did not fail, and MODEL, and both models are fitted to the one left out with the same
+numbers of components, in two ways:
 
 scan      the scan's points of the face (as `gnmreg evaluate` takes them) from the model's surface, all coefficients and
           the rigid motion free (`coregister.scan_fit`): owes nothing to the registration of the one left out
@@ -104,7 +105,11 @@ def left_out(
         for number, (capture, one) in enumerate(pairs):
             progress.at(number, len(pairs), f"without {capture.subject}")
             points = face_points(capture, one)
-            others = subjects[:number] + subjects[number + 1 :]
+            others = [
+                subjects[other]
+                for other, (_, registration) in enumerate(pairs)
+                if other != number and registration.status in USABLE
+            ]
             rebuilt = build(others, previous, Build(identity=settings)).data
             found.append([errors_mm(data, one, points, counts) for data in (previous, rebuilt)])
     return np.array(found)
@@ -135,17 +140,18 @@ def main() -> None:
         parser.add_argument(f"--{name}", action=argparse.BooleanOptionalAction, default=default)
     options = parser.parse_args()
     pairs = registered(options.captures, options.model, options.out)
-    if bad := [capture.subject for capture, one in pairs if one.status not in USABLE or capture.scan is None]:
+    if bad := [capture.subject for capture, one in pairs if capture.scan is None]:
         raise InputError(
-            "Captures are no use",
-            where=", ".join(bad),
-            expected=f"a registration that is {' or '.join(USABLE)}, and a scan",
-            got="other",
-            fix="leave them out",
+            "Captures are no use", where=", ".join(bad), expected="a scan", got="none", fix="leave them out"
         )
+    for capture, one in pairs:
+        if one.status not in USABLE:
+            print(f"{capture.subject} is in no model: {one.reason}")
     share = None if options.previous == "chosen" else float(options.previous)
-    settings = Identity(previous=share, by_area=options.by_area, mirrored=options.mirrored)
     counts = sorted({*options.components, options.headline})
+    settings = Identity(
+        previous=share, by_area=options.by_area, mirrored=options.mirrored, share=1.0, most=counts[-1]
+    )  # as many as MODEL is measured with
     figures = left_out(pairs, gnm_npz.read(options.model), settings, counts)
     show([capture.subject for capture, _ in pairs], figures, counts)
     ratio = (figures[:, 1, 0] / figures[:, 0, 0])[:, counts.index(options.headline)]
