@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from workflows.engine.database import BELOW, below, checked_url, reading, require_queue, table
+from workflows.engine.database import BELOW, Ask, below, checked_url, reading, require_queue, table
 from workflows.jobs import check_id
 
 DAY_S = 24 * 3600.0
@@ -109,37 +109,40 @@ class Reader:
         among = f"{BELOW} AND " if run else ""
         parameters = below(check_id(run)) if run else {}
         now_ms = time.time() * 1000
-        jobs = self._rows(
-            f"SELECT name, status, count(*) FROM {self._status} WHERE {among}1 = 1 GROUP BY name, status", parameters
-        )
-        hour = self._rows(
-            f"SELECT count(*) FROM {self._status} WHERE {among}name = 'job' AND completed_at > :since",
-            {**parameters, "since": int(now_ms - 3600 * 1000)},
-        )
-        last = self._rows(
-            "SELECT count(*), min(completed_at) FROM ("
-            f"SELECT completed_at FROM {self._status} WHERE {among}name = 'job' AND status = 'SUCCESS' "
-            "AND completed_at IS NOT NULL ORDER BY completed_at DESC LIMIT 1000) AS last",
-            parameters,
-        )
-        workers = self._rows(
-            f"SELECT executor_id, count(*) FROM {self._status} WHERE {among}status = 'PENDING' AND name = 'job' "
-            "GROUP BY executor_id",
-            parameters,
-        )
+        with reading(self.url) as ask:
+            jobs = ask(
+                f"SELECT name, status, count(*) FROM {self._status} WHERE {among}1 = 1 GROUP BY name, status",
+                parameters,
+            )
+            hour = ask(
+                f"SELECT count(*) FROM {self._status} WHERE {among}name = 'job' AND completed_at > :since",
+                {**parameters, "since": int(now_ms - 3600 * 1000)},
+            )
+            last = ask(
+                "SELECT count(*), min(completed_at) FROM ("
+                f"SELECT completed_at FROM {self._status} WHERE {among}name = 'job' AND status = 'SUCCESS' "
+                "AND completed_at IS NOT NULL ORDER BY completed_at DESC LIMIT 1000) AS last",
+                parameters,
+            )
+            workers = ask(
+                f"SELECT executor_id, count(*) FROM {self._status} WHERE {among}status = 'PENDING' AND name = 'job' "
+                "GROUP BY executor_id",
+                parameters,
+            )
+            failures = self._failures(ask, among, parameters)
         done, since = last[0]
         return Figures(
             counts=_by_state([row[1:] for row in jobs if row[0] == "job"]),
             flows=_by_state([row[1:] for row in jobs if row[0] == "flow"]),
             ended_last_hour=int(hour[0][0]),
             a_day=done * DAY_S * 1000 / max(now_ms - since, 1000.0) if done else 0.0,
-            failures=self._failures(among, parameters),
+            failures=failures,
             workers={str(name): int(count) for name, count in workers},
         )
 
-    def _failures(self, among: str, parameters: dict[str, Any]) -> dict[str, int]:
+    def _failures(self, ask: Ask, among: str, parameters: dict[str, Any]) -> dict[str, int]:
         among = among.replace("workflow_uuid", "w.workflow_uuid")
-        rows = self._rows(
+        rows = ask(
             f"SELECT coalesce(o.error, w.error), count(*) FROM {self._status} w "
             f"LEFT JOIN {self._output} o ON o.workflow_uuid = w.workflow_uuid "
             f"WHERE {among}w.name = 'job' AND w.status IN {_FAILED} "
