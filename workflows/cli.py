@@ -456,6 +456,7 @@ def main(args: Sequence[str] | None = None) -> int:
     if args[:2] == ["stabilize", "review"]:  # a command that has both an argument and a command below it
         args[:2] = ["stabilize review"]
     try:
+        _check_said_once(args)
         return tyro.cli(
             _choice(COMMANDS),
             prog="gnmreg",
@@ -481,6 +482,20 @@ def _choice(commands: Mapping[str, Command | Group]) -> Any:
         else:
             choices.append(Annotated[Any, subcommand(name, constructor=command)])
     return Union[tuple(choices)]  # noqa: UP007  a union of types that only exist at run time
+
+
+def _check_said_once(args: Sequence[str]) -> None:
+    """Of an option that comes twice the parser would take the last and forget the other."""
+    said = [word.partition("=")[0].replace("_", "-") for word in args if word.startswith("--")]
+    for option in said:
+        if said.count(option) > 1:
+            raise InputError(
+                "An option is given more than once",
+                where=option,
+                expected="each option once",
+                got=f"{said.count(option)} times",
+                fix=f"give it once; where it takes several values, all after one {option}",
+            )
 
 
 def _sensor(noise: bool) -> Any:

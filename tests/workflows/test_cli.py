@@ -185,6 +185,13 @@ def test_malformed_breaks_are_told(pair: str, tmp_path: Path, capsys: pytest.Cap
     assert "VIEW=HOW" in error and pair in error and "fix:" in error and "Traceback" not in error
 
 
+def test_an_option_given_twice_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    flags = ["--break", "cam3=shifted", "--break=cam1=black"]
+    assert main(["capture", "spoil", str(tmp_path / "source"), str(tmp_path / "target"), *flags]) == 2
+    error = capsys.readouterr().err
+    assert "more than once" in error and "--break" in error and "fix:" in error
+
+
 def test_unknown_presets_stop_with_code_2(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     source = make(tmp_path / "source")
     with pytest.raises(SystemExit) as stop:
