@@ -95,7 +95,7 @@ class Region:
     """K components of one region; metres, the model's frame."""
 
     basis: Float[np.ndarray, "K V 3"]
-    energy: Float[np.ndarray, "K"]  # of the skin, m^2 summed over its coordinates
+    energy: Float[np.ndarray, "K"]  # of skin, in the lower face of lower teeth too, m^2 summed over coordinates
     share: float  # of the region's energy, kept
     previous: float  # share of it that is the previous model's
     method: str  # of the principal components
@@ -117,15 +117,17 @@ def regional_bases(
     settings: Expressions | None = None,
     memory_gb: float = 4.0,
 ) -> dict[str, Region]:
-    """By name of `REGIONS`: X_r = X * S_r, uncentred; the right eye mirrors the left; the jaw takes its parts along.
+    """By name of `REGIONS`: X_r = X * S_r, uncentred; the right eye mirrors the left; the jaw takes the tongue along.
 
     `displacements` of expressions from their neutrals, in the frame of the model `data`, whose template is the new one
-    and whose expression basis the previous; read several times. Only their skin counts. `weights` balance subjects.
+    and whose expression basis the previous; read several times. Their skin counts, and in the lower face their lower
+    teeth (paper, Head Expression: "the motion of the jaw together with the lower teeth"). `weights` balance subjects.
     """
     settings = settings or Expressions()
-    masks, mirror = regional_masks(data), data.mirror_indices
+    masks, mirror = dict(zip(REGIONS, regional_masks(data), strict=True)), data.mirror_indices
+    masks["lower_face_region"] = masks["lower_face_region"] + regions.lower_teeth(data)
     found: dict[str, Region] = {}
-    for name, mask in zip(REGIONS, masks, strict=True):
+    for name, mask in masks.items():
         if name == "right_eye_region":
             left = found["left_eye_region"]
             found[name] = Region(**{**vars(left), "basis": mirrored(left.basis, mirror)})
@@ -139,10 +141,14 @@ def regional_bases(
 
 
 def with_jaw(basis: Float[np.ndarray, "K V 3"], data: GNMData) -> Float[np.ndarray, "K V 3"]:
-    """The motion w x p + t of the jaw's skin in each component, everywhere: linear in the coefficient, as a full turn
-    would not be (algorithms, section 7, first placement)."""
+    """The motion w x p + t of the lower teeth in each component, everywhere: linear in the coefficient, as a full turn
+    would not be (algorithms, section 7).
+
+    The paper places teeth by the skin of chin and lower lip, once, as long as nothing tells their own motion. It is no
+    measure of it: of MakeHuman's open jaw, which moves the lower teeth by 22 mm, the chin alone misses 4.
+    """
     points = data.template_vertex_positions.astype(np.float64)
-    area = vertex_areas(points, data.triangles) * regions.jaw_skin(data)
+    area = vertex_areas(points, data.triangles) * regions.lower_teeth(data)
     points = points - area @ points / area.sum()
     return np.tensordot(fit_twists(basis, points, area), motion_fields(points), 1)
 

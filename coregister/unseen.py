@@ -1,4 +1,4 @@
-"""What no camera saw follows the previous model, given what was seen."""
+"""Skin that no camera saw follows the previous model, given what was seen."""
 
 from dataclasses import dataclass
 
@@ -26,13 +26,15 @@ class Completion:
 
     The model's coefficients have a standard normal prior (`basis` is scaled by standard deviations). Their mean given
     the seen skin, b = (B'WB + I)^-1 B'W d, with weights W = share seen x area / detail_size^2 / detail^2, displaces
-    what was not seen; what the seen skin differs by from that continues beyond its border (`geometry.fill.continued`).
+    the skin that was not seen; what the seen skin differs by from that continues beyond its border
+    (`geometry.fill.continued`). Teeth, tongue and eyes stay: they are a model's already, moved as a whole by whatever
+    of them was seen.
     """
 
     def __init__(self, data: GNMData, basis: Float[np.ndarray, "K V 3"], settings: Unseen):
         self._settings = settings
         self._triangles, self._points = data.triangles, data.template_vertex_positions.astype(np.float64)
-        self._exterior = regions.exterior(data)
+        self._exterior, self._skin = regions.exterior(data), regions.skin(data)
         area = vertex_areas(self._points, data.triangles)
         unit = settings.detail_size_mm * settings.detail_mm * 1e-6
         self._rows = _thinned(np.flatnonzero(self._exterior), 4)
@@ -51,7 +53,7 @@ class Completion:
         """Metres, the template's frame. As it came where everything outside is sure; linings count as unseen then."""
         if not self.unseen(confidence):
             return displacement
-        share = np.clip(confidence / self._settings.sure, 0, 1)
+        share = np.where(self._skin, np.clip(confidence / self._settings.sure, 0, 1), 1)
         guess = self._guess(displacement, share)
         difference = displacement - guess
         reach = self._settings.reach_mm / 1000

@@ -11,7 +11,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
-from tyro.conf import Positional, UseAppendAction, arg
+from tyro.conf import Positional, arg
 
 from registration.errors import InputError
 from workflows import store_cli
@@ -29,7 +29,7 @@ RunName = Annotated[str | None, arg(metavar="RUN")]
 def worker(
     folder: Folder = Path("."),
     db: Database = None,
-    root: UseAppendAction[Annotated[tuple[str, ...], arg(metavar="PLACE")]] = (),
+    root: Annotated[tuple[str, ...], arg(metavar="PLACE")] = (),
     gpu: Annotated[int | None, arg(metavar="N")] = None,
     queue: Annotated[tuple[str, ...], arg(metavar="NAME")] = ("gpu",),
 ) -> int:

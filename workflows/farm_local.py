@@ -79,7 +79,7 @@ class _Processes:
     def __init__(self, farm: LocalFarm) -> None:
         places = [["--gpu", str(number)] for number in farm.gpus] or [[] for _ in range(farm.workers)]
         shared = ["--folder", str(farm.folder)]
-        roots = [word for root in farm.roots for word in ("--root", root)]
+        roots = ["--root", *farm.roots] if farm.roots else []
         queues = ["--queue", "gpu", "rebuild"]
         self._commands = [["coordinator", *shared], *(["worker", *shared, *roots, *queues, *p] for p in places)]
         self._farm = farm

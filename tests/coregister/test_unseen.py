@@ -42,6 +42,13 @@ def test_what_the_model_spans_is_guessed_from_the_face(complete, model, hidden):
     assert away.mean() < 0.25 * still.mean()
 
 
+def test_teeth_tongue_and_eyes_stay_as_they_came(complete, model, hidden):
+    inside = ~regions.skin(model)
+    moved = np.full(model.template_vertex_positions.shape, 0.004)
+    found = complete(moved, np.where(inside, 0, hidden).astype(np.float32))
+    np.testing.assert_allclose(found[inside], moved[inside], atol=1e-12)
+
+
 def test_what_the_model_does_not_span_fades_out_beyond_the_border(complete, model, hidden):
     """A bump across the border goes on smoothly, and is gone further away; nowhere is there a jump."""
     points = model.template_vertex_positions.astype(np.float64)
