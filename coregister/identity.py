@@ -20,6 +20,7 @@ from registration.stabilize.meshes import SkullSkin
 _SHARE = 0.2  # of the previous model's
 _LEAST_TO_SHARE = 3  # heads, among which other shares can be compared
 _TYPICAL = 20  # components that it is compared with
+_FOLLOWS = 1e-3  # weight of teeth and tongue: neutral faces mostly hide them, so they come along and decide nothing
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -53,7 +54,7 @@ class HeadIdentity:
 def head_identity(
     heads: Float[np.ndarray, "N V 3"], data: GNMData, settings: Identity | None = None, memory_gb: float = 4.0
 ) -> HeadIdentity:
-    """The basis of aligned neutrals (`align.align_neutrals`), with everything that is no skin filled back.
+    """The basis of aligned neutrals (`align.align_neutrals`): of skin, teeth and tongue; eyeballs are filled back.
 
     The covariance is (1 - p) C + p (tr C / tr P) P: C of the heads about their mean, with N - 1; P = B'B of the
     previous model's components of the head, rigid motions taken out as alignment takes them out of heads (`Mixed`).
@@ -64,10 +65,12 @@ def head_identity(
     antisymmetric parts have between them: the former about their mean, with N - 1, the latter about zero, which is
     known, with N. Every component is symmetric or antisymmetric.
 
-    The template is the heads' mean alone; eyeballs are placed to fit its lids, teeth and tongue follow the inner lips.
+    The template is the heads' mean alone; eyeballs are placed to fit its lids. Teeth and tongue are the registrations'
+    as the skin is, of next to no weight; only of a first model would they follow the lips (paper, Initial Placement).
     """
     settings = settings or Identity()
-    rows = np.flatnonzero(regions.skin(data))
+    left, right = regions.eyeballs(data)
+    rows = np.flatnonzero(~(left | right))
     mirror = data.mirror_indices[rows] if settings.mirrored else None
     root = _root(data, settings)[rows]
     whole = heads.mean(0, dtype=np.float64)
@@ -75,7 +78,7 @@ def head_identity(
     previous = _previous(data, rows, settings.mirrored)
     previous = (previous * root).reshape(len(previous), 3 * len(rows))
     deviations = _Deviations(heads, rows, mirror, mean, root)
-    share, tried = _share(deviations, len(heads), previous, settings)
+    share, tried = _share(deviations, len(heads), previous, settings, int(regions.skin(data).sum()))
     stream = Mixed(
         deviations,
         np.ones(len(heads)) if mirror is None else np.repeat((1, 1 - 1 / len(heads)), len(heads)),
@@ -118,18 +121,16 @@ def _moves_skin(data: GNMData) -> np.ndarray:
 def _root(data: GNMData, settings: Identity) -> Float[np.ndarray, "V 1"]:
     """What displacements are multiplied by before they are compared."""
     skin = regions.skin(data)
-    if not settings.by_area:
-        return np.ones((len(skin), 1))
-    area = vertex_areas(data.template_vertex_positions, data.triangles)
+    area = vertex_areas(data.template_vertex_positions, data.triangles) if settings.by_area else np.ones(len(skin))
     if settings.mirrored:
         area = (area + area[data.mirror_indices]) / 2
     mean = area[skin].mean()
-    return np.sqrt(np.maximum(area, 0.01 * mean) / mean)[:, None]
+    return (np.sqrt(np.maximum(area, 0.01 * mean) / mean) * np.where(skin, 1, _FOLLOWS))[:, None]
 
 
 def _previous(data: GNMData, rows: Int[np.ndarray, "R"], both: bool) -> Float[np.ndarray, "K R 3"]:
-    """The previous model's components of the head on the skin, each without the rigid motion of the stable skin; with
-    `both` their symmetric and antisymmetric parts."""
+    """The previous model's components of the head in these rows, each without the rigid motion of the stable skin;
+    with `both` their symmetric and antisymmetric parts."""
     basis = data.vertex_identity_basis[_moves_skin(data)].astype(np.float64)
     stable = SkullSkin.of(data).area
     points = data.template_vertex_positions.astype(np.float64)
@@ -142,7 +143,7 @@ def _previous(data: GNMData, rows: Int[np.ndarray, "R"], both: bool) -> Float[np
 
 
 class _Deviations:
-    """Of every head from the mean, on the skin; with `mirror`, all symmetric parts and then all antisymmetric ones."""
+    """Of every head from the mean, in `rows`; with `mirror`, all symmetric parts and then all antisymmetric ones."""
 
     def __init__(
         self,
@@ -165,7 +166,7 @@ class _Deviations:
 
 
 def _share(
-    deviations: "_Deviations", heads: int, previous: Float[np.ndarray, "K D"], settings: Identity
+    deviations: "_Deviations", heads: int, previous: Float[np.ndarray, "K D"], settings: Identity, skin: int
 ) -> tuple[float, dict[float, float]]:
     """The previous model's share, and the shares that were compared for it. Samples are held in memory, in float32."""
     if settings.previous is not None:
@@ -179,7 +180,7 @@ def _share(
         gram += part @ part.T
     members = np.split(np.arange(2 * heads if settings.mirrored else heads), 2 if settings.mirrored else 1)
     rms = left_out_rms(gram, members, (True, False)[: len(members)], settings.most or _TYPICAL)
-    rms /= np.sqrt(rows.shape[1] / 3)
+    rms /= np.sqrt(skin)
     return SHARES[int(rms.argmin())], dict(zip(SHARES, rms.tolist(), strict=True))
 
 
@@ -196,15 +197,9 @@ def _settled(
 def _filled(
     template: Float[np.ndarray, "V 3"], basis: Float[np.ndarray, "K V 3"], data: GNMData, lids_rest: bool
 ) -> tuple[Float[np.ndarray, "V 3"], Float[np.ndarray, "K V 3"]]:
-    """Eyeballs between the lids; teeth and tongue moved as the mean of the inner lips (paper, Initial Placement)."""
+    """Eyeballs between the lids."""
     for socket in lids.sockets(data):
         template[socket.ball] += lids.placed(socket, template)
-    for part, lip in zip(
-        (regions.upper_teeth(data), regions.jaw_parts(data)), regions.inner_lip_halves(data), strict=True
-    ):
-        share = lip.astype(np.float64) / lip.sum(dtype=np.float64)
-        template[part] += share @ (template - data.template_vertex_positions)
-        basis[:, part] = np.einsum("v,kvc->kc", share, basis)[:, None]
     both = lids.sockets(replace(data, template_vertex_positions=template))
     shifts = np.stack([lids.following(socket, template, basis) for socket in both], 1)
     if lids_rest:

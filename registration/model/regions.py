@@ -133,13 +133,6 @@ def jaw_parts(data: GNMData) -> Bool[np.ndarray, "V"]:
     return lower_teeth(data) | tongue(data)
 
 
-def inner_lip_halves(data: GNMData) -> tuple[Float[np.ndarray, "V"], Float[np.ndarray, "V"]]:
-    """`inner_lips`, upper and lower apart; of a model without a mouth's lining, the lips as they are."""
-    inner = inner_lips(data)
-    upper, lower = (np.clip(group(data, name), 0, 1) for name in ("upper_lip", "lower_lip"))
-    return (inner * upper, inner * lower) if inner.any() else (upper, lower)
-
-
 def expression_skin(data: GNMData) -> Bool[np.ndarray, "V"]:
     """The skin of both eye regions of the expression basis, up to the middle of their blend into the lower face."""
     left, right = (group(data, f"expression_basis_{side}_eye") for side in ("left", "right"))
