@@ -1,6 +1,6 @@
 # make setup   makes .venv with exactly the versions of constraints.txt, and finds or installs what the system must have
 # make demo    sets up, makes a head model and a capture from nothing, and registers it: about five minutes
-# make demo-batch   a population of five in three expressions each, and two rounds of coregistration over it with two workers: half an hour
+# make demo-batch   a population of five in three expressions each, and two rounds of coregistration over it with two workers: quarter of an hour
 # make check   sets up, then style, types and import directions
 # make test    sets up, checks and runs the tests, two files at a time
 # make test-durability   kills workers, drivers and a PostgreSQL server under load: minutes, not part of make test
