@@ -90,7 +90,7 @@ def register(
         force: compute even if `out` already holds this result.
         variant: "llvm" (CPU) or "cuda".
         landmark_files: scheme name -> file, instead of those beside the model.
-        pictures: a folder for a picture of the fit at its start and after each stage, for debugging.
+        pictures: a folder for a picture and the mesh of the fit at its start and after each stage, for debugging.
         progress: where to report to.
 
     Returns:
@@ -260,7 +260,8 @@ def _fit(
     def draw(at: str) -> None:
         """What the fit looks like when `at` begins, under the name of what was before."""
         if pictures is not None and at != drawn[-1]:
-            write_stage(pictures / f"{len(drawn) - 1:02d}_{drawn[-1]}.png", report_views(*fit.picture(shown)))
+            views, vertices = report_views(*fit.picture(shown)), fit.vertices().cpu().numpy()
+            write_stage(pictures, f"{len(drawn) - 1:02d}_{drawn[-1]}", views, vertices, inputs.data.triangles)
             drawn.append(at)
 
     def on_step(stage: Stage, step: int) -> None:

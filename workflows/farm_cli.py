@@ -267,6 +267,8 @@ def debug(
     job: Positional[Annotated[str, arg(metavar="JOB")]],
     /,
     out: Annotated[Path, arg(metavar="DIR")],
+    view: bool = False,
+    port: Annotated[int, arg(metavar="PORT")] = 8080,
     folder: Folder = Path("."),
     db: Database = None,
 ) -> int:
@@ -275,6 +277,8 @@ def debug(
     Args:
         job: Its id.
         out: A new folder for what it makes: stages/, registration/, and inputs/ if they had to be fetched.
+        view: Also show the fit in the browser, in three dimensions, with the scan and the cameras; stops with Ctrl-C.
+        port: Where to serve that, on this machine only; from elsewhere: ssh -L PORT:127.0.0.1:PORT HOST.
         folder: The farm's folder.
         db: The queue's database, as for worker.
     """
@@ -285,8 +289,11 @@ def debug(
     if row.failure:
         print(f"in the farm: {row.failure['status']}: {row.failure['reason']}")
     with shown() as progress:
-        print(debug(row, out, progress))
-    print(out)
+        done = debug(row, out, progress, port=port if view else None)
+    print(f"{done.told}\n{out}", flush=True)
+    if done.page is not None:
+        print(f"Open http://127.0.0.1:{done.page.port} in a browser; Ctrl-C ends.", flush=True)
+        done.page.wait()
     return 0
 
 

@@ -8,7 +8,7 @@ import time
 
 import pytest
 
-from tests.workflows.farm.harness import ROOT, alive
+from tests.workflows.farm.harness import ROOT, alive, interruptible
 from workflows.children import ending_with_us, share_of_cores, side_by_side
 
 
@@ -46,7 +46,14 @@ def test_they_end_with_a_parent_that_is_killed_or_interrupted(tmp_path, number):
     (tmp_path / "sleeper.py").write_text(SLEEPER)
     environment = {**os.environ, "PYTHONPATH": str(ROOT)}
     command = [sys.executable, str(tmp_path / "sleeper.py")]
-    parent = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True, env=environment)
+    parent = subprocess.Popen(
+        command,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.DEVNULL,
+        text=True,
+        env=environment,
+        preexec_fn=interruptible,
+    )
     assert parent.stdout is not None
     child = int(parent.stdout.readline())
     time.sleep(0.5)

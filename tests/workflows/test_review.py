@@ -1,6 +1,5 @@
 """The review page in a headless Chromium with software WebGL: what is done there is what the function call does."""
 
-import shutil
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -13,17 +12,13 @@ from registration.stabilize.dataset import stabilize
 from registration.stabilize.decisions import Decision
 from tests.coregister.conftest import anatomy, model, model_file, source, wheel  # noqa: F401  fixtures
 from tests.stabilize import performed, runs
+from tests.workflows.browser import CHROMIUM, FLAGS, needs_browser
 from workflows.stabilize_folder import read_decisions, read_run
 from workflows.stabilize_run import stabilize_run
 from workflows.web.decide import Review
 from workflows.web.loops import swinging_head
 from workflows.web.review import Page, review
 
-CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
-FLAGS = (
-    *("--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "--disable-background-networking"),
-    *("--disable-component-update", "--disable-sync", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"),
-)
 NAMES = ("smile", "jaw_open", "brows_up")
 
 
@@ -42,7 +37,7 @@ def page(run, model_file) -> Iterator[Page]:  # noqa: F811
     served.close()
 
 
-@pytest.mark.skipif(CHROMIUM is None, reason="no chromium on the path")
+@needs_browser
 def test_a_person_steps_subtracts_undoes_and_saves(page, run, model, model_file, tmp_path):  # noqa: F811
     sync_api = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
     with sync_api.sync_playwright() as playwright:

@@ -1,4 +1,4 @@
-"""What the review page says about a component, as HTML with inline drawings."""
+"""What pages say beside their scene, as HTML with inline drawings."""
 
 from collections.abc import Sequence
 from html import escape
@@ -43,10 +43,10 @@ def about(part: Components, k: int, action: str, head: Head) -> str:
     return f'{_STYLE}<div class="rv">{badge} &nbsp; now: <b>{action}</b><table>{cells}</table></div>'
 
 
-def colour_bar(limit_mm: float) -> str:
+def colour_bar(limit_mm: float, title: str) -> str:
     stops = ", ".join(f"rgb{colour}" for colour in SCALE)
     return (
-        f'{_STYLE}<div class="rv"><h4>Displacement at 3 σ</h4>'
+        f'{_STYLE}<div class="rv"><h4>{escape(title)}</h4>'
         f'<i class="bar" style="background:linear-gradient(90deg,{stops})"></i><span class="soft">0 mm</span>'
         f'<span class="soft" style="float:right">{limit_mm:g} mm</span></div>'
     )

@@ -1,10 +1,9 @@
 """`gnmreg stabilize review`: a page in the browser on which a person decides about components (paper, end of Head
-Expression). Served by viser from this machine alone, over one port; the page asks nobody else for anything."""
+Expression)."""
 
 import threading
-import time
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -21,11 +20,8 @@ from workflows.stabilize_run import LOG, stabilize_run
 from workflows.web import panels
 from workflows.web.decide import Review
 from workflows.web.loops import SWING, swinging_head
+from workflows.web.server import serve, until_interrupted
 
-if TYPE_CHECKING:
-    from viser import ViserServer
-
-HOST = "127.0.0.1"
 _APART = 0.15  # metres, each head from the middle
 
 
@@ -75,7 +71,7 @@ class Page:
         number[self._shown] = np.arange(len(self._shown))
         faces = number[data.triangles]
         self._faces = faces[(faces >= 0).all(1)]
-        self._server = _serve(port)
+        self._server = serve(port, "Stabilization")
         self.port = self._server.get_port()
         self._build()
         self._show()
@@ -83,8 +79,7 @@ class Page:
     def wait(self) -> None:
         """Until Ctrl-C."""
         try:
-            while True:
-                time.sleep(1)
+            until_interrupted()
         finally:
             self.close()
 
@@ -102,12 +97,7 @@ class Page:
     def _build(self) -> None:
         """The scene and all controls, empty."""
         server, gui = self._server, self._server.gui
-        gui.configure_theme(brand_color=(31, 122, 116), show_logo=False, show_share_button=False, control_width="large")
-        gui.main_panel.dock_right()
         server.scene.set_up_direction("+y")
-        server.scene.configure_default_lights(False)
-        server.scene.configure_environment_map(None)  # colours mean millimetres: light must not wash them out
-        server.scene.add_light_ambient("/ambient", intensity=1.7)
         server.scene.add_light_directional("/key", intensity=1.6, position=(-0.5, 0.7, 1.0))
         server.initial_camera.position = (0.0, 0.0, 0.78)
         server.initial_camera.look_at = (0.0, 0.0, 0.0)
@@ -179,31 +169,9 @@ class Page:
             before, after = (motion[self._shown] for motion in review.motions(part.region, k))
             reach = 1e3 * SWING * np.linalg.norm(before, axis=1)
             limit = scale_limit_mm(reach)
-            self._bar.content = panels.colour_bar(limit)
+            self._bar.content = panels.colour_bar(limit, "Displacement at 3 σ")
             points = review.head.points[self._shown]
             for name, motion, x in (("before", before, -_APART), ("after", after, _APART)):
                 colours = scale_colours(1e3 * SWING * np.linalg.norm(motion, axis=1) / limit)
                 glb = swinging_head(points, motion, self._faces, colours)
                 self._server.scene.add_glb(f"/{name}", glb, position=(x, 0.0, 0.0))
-
-
-def _serve(port: int) -> "ViserServer":
-    """viser looks for the next free port by itself, but a tunnel leads to the one that was asked for."""
-    import socket
-
-    import viser
-
-    with socket.socket() as probe:
-        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        try:
-            probe.bind((HOST, port))
-            port = probe.getsockname()[1]
-        except (OSError, OverflowError) as error:
-            raise InputError(
-                "The page cannot be served",
-                where=f"{HOST}:{port}",
-                expected="a free port",
-                got=error,
-                fix="choose another one with --port",
-            ) from error
-    return viser.ViserServer(host=HOST, port=port, label="Stabilization", verbose=False)

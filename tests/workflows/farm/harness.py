@@ -19,6 +19,11 @@ ROOT = Path(__file__).parents[3]
 QUICK = {"look_s": 0.3, "free_s": 1.0, "up_s": 0.0}
 
 
+def interruptible() -> None:
+    """In a child, before it starts: a shell makes what it runs in the background, tests too, deaf to Ctrl-C."""
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
+
+
 class Farm:
     """A queue and its processes, named by their executor ids."""
 

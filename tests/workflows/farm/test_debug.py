@@ -1,5 +1,6 @@
 """A job again in the foreground, with stand-ins for what takes minutes."""
 
+import urllib.request
 from pathlib import Path
 from typing import Any
 
@@ -8,6 +9,7 @@ import pytest
 import registration.register
 from registration.errors import InputError
 from registration.progress import Silent
+from tests.capture import small
 from tests.report.test_page import a_registration
 from workflows.debug import debug
 from workflows.engine.reads import Row
@@ -49,7 +51,7 @@ def test_a_registration_is_made_again_with_pictures_and_out_of_the_way(
         "register stored": {"store": "/s", "key": "k"},
     }
     told = debug(row(step, **arguments, **places[step]), tmp_path / "out", Silent())
-    assert told == "failed: so it is"
+    assert told.told == "failed: so it is" and told.page is None
     (call,) = calls
     assert call["capture"] == Path("/c/e") and call["model_path"] == Path("/m.npz")
     assert call["out"] == tmp_path / "out" / "registration" and call["pictures"] == tmp_path / "out" / "stages"
@@ -69,6 +71,31 @@ def test_a_capture_from_a_url_is_kept_for_looking(
     assert calls[0]["capture"] == tmp_path / "out" / "inputs" / "e" and calls[0]["capture"].is_dir()
 
 
+def test_a_registration_can_be_watched(calls: list[dict[str, Any]], tmp_path: Path) -> None:
+    capture = small.make(tmp_path / "capture")
+    done = debug(row(capture=str(capture), model="/m.npz"), tmp_path / "out", Silent(), port=0)
+    assert done.page is not None
+    with urllib.request.urlopen(f"http://127.0.0.1:{done.page.port}", timeout=10) as answer:
+        assert answer.status == 200
+    done.page.close()
+
+
+def test_a_page_ends_with_the_registration_that_was_refused(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def refuse(*_: Any, **__: Any) -> None:
+        raise InputError("no", where="here", expected="a", got="b", fix="c")
+
+    ports: list[int] = []
+    monkeypatch.setattr(registration.register, "register", refuse)
+    monkeypatch.setattr(Silent, "note", lambda self, text: ports.append(int(text.split(":")[2].split(" ")[0])))
+    capture = small.make(tmp_path / "capture")
+    with pytest.raises(InputError, match="no"):
+        debug(row(capture=str(capture), model="/m.npz"), tmp_path / "out", Silent(), port=0)
+    with pytest.raises(OSError):
+        urllib.request.urlopen(f"http://127.0.0.1:{ports[0]}", timeout=10)
+
+
 def test_what_cannot_be_debugged_is_refused(calls: list[dict[str, Any]], tmp_path: Path) -> None:
     (tmp_path / "full").mkdir()
     (tmp_path / "full" / "x").write_text("mine")
@@ -80,4 +107,6 @@ def test_what_cannot_be_debugged_is_refused(calls: list[dict[str, Any]], tmp_pat
     ):
         with pytest.raises(InputError):
             debug(wrong, out, Silent())
+    with pytest.raises(InputError, match="a registration, to be viewed"):
+        debug(row(step="stabilize", run="/r", model="/m.npz", out="/o"), tmp_path / "out", Silent(), port=0)
     assert not calls and not (tmp_path / "out").exists()

@@ -12,7 +12,7 @@ import pytest
 
 from tests.capture import small
 from tests.register import synthetic
-from tests.workflows.farm.harness import ROOT, alive
+from tests.workflows.farm.harness import ROOT, alive, interruptible
 from workflows.batch import batch_jobs, put_batch
 from workflows.cli import main
 from workflows.engine.control import Queue
@@ -113,7 +113,8 @@ def test_a_local_farm_registers_and_is_interrupted_and_goes_on(tmp_path: Path) -
     places = [str(tmp_path / "captures" / name) for name in ("bad", "neutral", "smile")]
     command = [sys.executable, "-m", "workflows.cli", "batch", *places, "--model", str(synthetic.MODEL)]
     command += ["--out", str(tmp_path / "out"), "--local", "--workers", "1"]
-    first = subprocess.Popen(command, cwd=ROOT, stderr=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+    pipe = subprocess.PIPE
+    first = subprocess.Popen(command, cwd=ROOT, stderr=pipe, stdout=pipe, text=True, preexec_fn=interruptible)
     url = default_url(tmp_path / "out.farm")
     deadline = time.monotonic() + 500
     while not _done(url) and time.monotonic() < deadline:

@@ -1,0 +1,113 @@
+"""The page of a fit that is debugged, in a headless Chromium: stages appear while they are written."""
+
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from registration.capture.native import read
+from registration.errors import InputError
+from registration.report.stages import write_stage
+from registration.types import Capture
+from tests.capture import small
+from tests.report.test_pictures import a_view
+from tests.workflows.browser import CHROMIUM, FLAGS, needs_browser
+from workflows.web.fit_page import MOVED, PLAIN, TO_SCAN, FitPage
+
+
+def stage(folder: Path, name: str, scale: float) -> None:
+    """The ball of the small capture, larger or smaller than its scan."""
+    mesh = small.ball(scale)
+    write_stage(folder, name, (a_view(),), mesh.vertices, mesh.triangles)
+
+
+@pytest.fixture
+def capture(tmp_path: Path) -> Capture:
+    return read(small.make(tmp_path / "capture"))
+
+
+@pytest.fixture
+def page(tmp_path: Path, capture: Capture) -> Iterator[FitPage]:
+    served = FitPage(tmp_path / "stages", capture)
+    yield served
+    served.close()
+
+
+def test_stages_are_taken_up_as_they_are_written(page: FitPage, tmp_path: Path) -> None:
+    page.refresh()
+    assert page.stages == []
+    stage(tmp_path / "stages", "00_start", 1.02)
+    (tmp_path / "stages" / ".01_pose.ply").write_bytes(b"half of i")
+    page.refresh()
+    assert page.stages == ["00_start"] and page._stage.value == "00_start"
+    stage(tmp_path / "stages", "01_pose", 1.0)
+    page.refresh()
+    assert (
+        page.stages == ["00_start", "01_pose"] and page._stage.value == "01_pose"
+    )  # it was the last one, so it follows
+    page._stage.value = "00_start"
+    stage(tmp_path / "stages", "02_end", 1.0)
+    page.refresh()
+    assert page._stage.value == "00_start"  # somebody looks at it
+
+
+def test_colours_are_millimetres(page: FitPage, tmp_path: Path) -> None:
+    for name, scale in (("00_start", 1.02), ("01_pose", 1.0)):
+        stage(tmp_path / "stages", name, scale)
+    page.refresh()
+    off_mm = 20 * small.RADIUS_M
+    for colours, wanted in (
+        (TO_SCAN, {"00_start": off_mm, "01_pose": 0.0}),
+        (MOVED, {"00_start": 0.0, "01_pose": off_mm}),
+    ):
+        page._colours.value = colours
+        for name, distance in wanted.items():
+            found = page._distance_mm(name)
+            assert found is not None and np.abs(found - distance).max() < 0.02 * off_mm
+    page._colours.value = PLAIN
+    assert page._distance_mm("01_pose") is None
+
+
+def test_without_a_scan_there_is_no_distance_to_it(capture: Capture, tmp_path: Path) -> None:
+    page = FitPage(tmp_path / "stages", replace(capture, scan=None))
+    try:
+        assert page._colours.options == (MOVED, PLAIN)
+    finally:
+        page.close()
+
+
+def test_a_port_in_use_is_refused(page: FitPage, capture: Capture, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=str(page.port)):
+        FitPage(tmp_path / "stages", capture, page.port)
+
+
+@needs_browser
+def test_a_person_watches_a_fit(page: FitPage, tmp_path: Path) -> None:
+    sync_api = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
+    with sync_api.sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=list(FLAGS))
+        tab = browser.new_page(viewport={"width": 1360, "height": 900})
+        asked = []
+        tab.on("request", lambda request: asked.append(request.url))
+        tab.goto(f"http://127.0.0.1:{page.port}")
+        see = sync_api.expect
+        see(tab.get_by_text("ball, neutral")).to_be_visible(timeout=60_000)
+        tab.set_default_timeout(15_000)
+        choice = tab.get_by_role("combobox", name="Stage")
+        see(choice).to_have_value("waiting")
+        stage(tmp_path / "stages", "00_start", 1.02)
+        see(choice).to_have_value("00_start")
+        stage(tmp_path / "stages", "01_pose", 1.0)
+        see(choice).to_have_value("01_pose")
+        see(tab.locator("h4", has_text=TO_SCAN)).to_be_visible()
+        for name in ("Scan", "Cameras"):
+            tab.get_by_label(name, exact=True).check()
+        tab.wait_for_function("document.querySelectorAll('canvas').length > 0")
+        picture = tab.screenshot()
+        browser.close()
+    assert len(picture) > 20_000
+    own = (f"http://127.0.0.1:{page.port}/", f"blob:http://127.0.0.1:{page.port}/", "data:")
+    assert asked and all(url.startswith(own) for url in asked)  # nothing from anywhere else
+    (tmp_path / "watched.png").write_bytes(picture)

@@ -1,0 +1,184 @@
+"""`gnmreg debug --view`: a fit in three dimensions, stage after stage, with the capture's scan and cameras.
+
+The page reads what `registration.report.stages.write_stage` leaves, and shows a stage as soon as it is there.
+"""
+
+import threading
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import trimesh
+from jaxtyping import Float
+from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
+
+from registration.capture.pixels import read_view
+from registration.capture.scan import Scan, read_scan
+from registration.evaluate.distances import Surface, distances_mm
+from registration.frames import MM_PER_M, linear_to_srgb, srgb_to_linear
+from registration.report.heat import scale_limit_mm
+from registration.report.pictures import scale_colours
+from registration.types import Camera, Capture
+from workflows.web import panels
+from workflows.web.server import serve, until_interrupted
+
+TO_SCAN, MOVED, PLAIN = "distance to the scan", "moved in this stage", "nothing"
+_SKIN, _SCAN = (206, 176, 158), (96, 110, 128)
+_POINTS = 60_000  # of the scan, shown at most
+_THUMBNAIL_PX = 200  # height of the images in the cameras' frusta, at most
+_LOOK_S = 0.5
+
+
+class FitPage:
+    """The page of one fit; everyone who opens it sees the same."""
+
+    def __init__(self, stages: Path, capture: Capture, port: int = 0):
+        """Serves at once. `stages` need not be there yet.
+
+        Raises:
+            InputError: the scan cannot be read, or the port cannot be had.
+        """
+        self._folder, self._capture = Path(stages), capture
+        self._scan = None if capture.scan is None else read_scan(capture.scan)
+        self._meshes: dict[str, Scan] = {}  # stage -> its mesh
+        self._lock, self._closed = threading.RLock(), threading.Event()
+        self._server = serve(port, "Fit")
+        self.port = self._server.get_port()
+        self._build()
+        threading.Thread(target=self._live, daemon=True).start()
+
+    def wait(self) -> None:
+        """Until Ctrl-C."""
+        try:
+            until_interrupted()
+        finally:
+            self.close()
+
+    def close(self) -> None:
+        self._closed.set()
+        self._server.stop()
+
+    @property
+    def stages(self) -> list[str]:
+        """What there is to choose."""
+        return list(self._meshes)
+
+    def _build(self) -> None:
+        """Scene and controls before the first stage."""
+        gui, scene, capture = self._server.gui, self._server.scene, self._capture
+        gui.add_markdown(f"### {capture.subject}, {capture.expression}\n{len(capture.views)} views")
+        # viser's setters have types of their own that type checkers take for read-only properties.
+        self._stage: Any = gui.add_dropdown("Stage", ("waiting",))
+        self._colours: Any = gui.add_dropdown("Colours show", (*([TO_SCAN] if self._scan else []), MOVED, PLAIN))
+        self._bar = gui.add_html("")
+        scan: Any = gui.add_checkbox("Scan", False, disabled=self._scan is None)
+        cameras: Any = gui.add_checkbox("Cameras", False)
+        gui.add_markdown("Target, rendering, their difference (x 4), normals:")
+        self._sheet: Any = gui.add_image(np.full((2, 4, 3), 255, np.uint8))
+        self._points: Any = None
+        if self._scan is not None:
+            step = -(-len(self._scan.vertices) // _POINTS)
+            points = self._scan.vertices[::step].astype(np.float32)
+            self._points = scene.add_point_cloud("/scan", points, _SCAN, point_size=5e-4, precision="float32")
+            self._points.visible = False
+        self._frusta: Any = scene.add_frame("/cameras", show_axes=False, visible=False)
+        self._stage.on_update(lambda _: self._show())
+        self._colours.on_update(lambda _: self._show())
+        scan.on_update(lambda _: setattr(self._points, "visible", scan.value))
+        cameras.on_update(lambda _: setattr(self._frusta, "visible", cameras.value))
+
+    def _live(self) -> None:
+        """Stages as they come, and the cameras, whose images take seconds."""
+        for view in self._capture.views:
+            self.refresh()
+            camera = view.camera
+            bare = replace(view, mask=None, normals=None, segmentation=None)
+            pixels = read_view(bare, self._capture, downsample=-(-camera.height_px // _THUMBNAIL_PX))
+            image = (np.clip(linear_to_srgb(pixels.rgb), 0, 1) * 255).astype(np.uint8)
+            if self._closed.is_set():
+                return
+            turn = Rotation.from_matrix(camera.T_cam_world[:3, :3].T).as_quat(scalar_first=True)
+            self._server.scene.add_camera_frustum(
+                f"/cameras/{view.name}",
+                fov=2 * float(np.arctan(camera.height_px / 2 / camera.intrinsics[1, 1])),
+                aspect=camera.width_px / camera.height_px,
+                scale=0.05,
+                thickness=1e-3,
+                image=image,
+                wxyz=turn,
+                position=camera.centre,
+            )
+        while not self._closed.wait(_LOOK_S):
+            self.refresh()
+
+    def refresh(self) -> None:
+        """Take up stages that were written since; whoever looks at the last one goes along."""
+        with self._lock:
+            fresh = [file for file in sorted(self._folder.glob("[0-9]*.ply")) if file.stem not in self._meshes]
+            if not fresh:
+                return
+            follows = not self._meshes or self._stage.value == self.stages[-1]
+            first, stands = not self._meshes, self._stage.value
+            self._meshes |= {file.stem: read_scan(file) for file in fresh}
+            self._stage.options = tuple(self.stages)
+            self._stage.value = self.stages[-1] if follows else stands
+            if first:
+                self._look_at(next(iter(self._meshes.values())).vertices)
+            self._show()
+
+    def _look_at(self, head: Float[np.ndarray, "V 3"]) -> None:
+        """From where the cameras are, on average, with their up as up."""
+        cameras = [view.camera for view in self._capture.views]
+        up, middle = -np.mean([c.T_cam_world[1, :3] for c in cameras], axis=0), head.mean(0)
+        front = np.mean([_towards(camera, middle) for camera in cameras], axis=0)
+        front /= max(np.linalg.norm(front), 1e-9)
+        self._server.scene.set_up_direction(up / np.linalg.norm(up))
+        self._server.scene.add_light_directional("/key", intensity=1.6, position=front + up)
+        camera = self._server.initial_camera
+        camera.position, camera.look_at, camera.fov = middle + 0.8 * front, middle, float(np.radians(38))
+        for client in self._server.get_clients().values():
+            client.camera.up_direction = up
+            client.camera.position, client.camera.look_at = middle + 0.8 * front, middle
+
+    def _show(self) -> None:
+        """The chosen stage in the chosen colours."""
+        with self._lock:
+            name = self._stage.value
+            if name not in self._meshes:
+                return
+            mesh = self._meshes[name]
+            distance = self._distance_mm(name)
+            if distance is None:
+                colours, self._bar.content = np.tile(np.array(_SKIN, float), (len(mesh.vertices), 1)), ""
+            else:
+                limit = scale_limit_mm(distance)
+                self._bar.content = panels.colour_bar(limit, self._colours.value)
+                colours = scale_colours(distance / limit)
+            linear = (srgb_to_linear(colours / 255) * 255).astype(np.uint8)
+            drawn = trimesh.Trimesh(mesh.vertices, mesh.triangles, vertex_colors=linear, process=False)
+            self._server.scene.add_mesh_trimesh("/head", drawn)
+            sheet = cv2.imread(str(self._folder / f"{name}.png"))
+            if sheet is not None:
+                self._sheet.image = sheet[..., ::-1]
+
+    def _distance_mm(self, name: str) -> Float[np.ndarray, "V"] | None:
+        mesh, kind = self._meshes[name], self._colours.value
+        if kind == MOVED:
+            earlier = self.stages[max(self.stages.index(name) - 1, 0)]
+            return np.linalg.norm(mesh.vertices - self._meshes[earlier].vertices, axis=1) * MM_PER_M
+        if kind == TO_SCAN and self._scan is not None:
+            if len(self._scan.triangles):
+                return distances_mm(
+                    mesh.vertices, Surface(vertices=self._scan.vertices, triangles=self._scan.triangles)
+                )
+            return cKDTree(self._scan.vertices).query(mesh.vertices)[0] * MM_PER_M
+        return None
+
+
+def _towards(camera: Camera, point: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3"]:
+    """The unit direction from a point to a camera."""
+    away = camera.centre - point
+    return np.asarray(away / np.linalg.norm(away))
