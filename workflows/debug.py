@@ -65,12 +65,13 @@ def _register(arguments: Mapping[str, Any], out: Path, progress: Progress, port:
         place = str(out / INPUTS / local_path(place).name)
     neutral = arguments.get("neutral")
     with ExitStack() as until_done, capture_here(place) as capture:
-        page = None if port is None else _page(out / PICTURES, capture, port, progress)
+        model = model_here(str(arguments["model"]))
+        page = None if port is None else _page(out / PICTURES, capture, model, port, progress)
         if page is not None:
             until_done.callback(page.close)
         result = register(
             capture,
-            model_path=model_here(str(arguments["model"])),
+            model_path=model,
             out=out / REGISTRATION,
             neutral=None if neutral is None else Path(neutral),
             pictures=out / PICTURES,
@@ -81,11 +82,12 @@ def _register(arguments: Mapping[str, Any], out: Path, progress: Progress, port:
     return Debugged(told=f"{result.status}: {result.reason}", page=page)
 
 
-def _page(stages: Path, capture: Path, port: int, progress: Progress) -> "FitPage":
+def _page(stages: Path, capture: Path, model: Path, port: int, progress: Progress) -> "FitPage":
     from registration.capture.native import read
+    from registration.model import gnm_npz, regions
     from workflows.web.fit_page import FitPage
 
-    page = FitPage(stages, read(capture), port)
+    page = FitPage(stages, read(capture), regions.exterior(gnm_npz.read(model)), port)
     progress.note(f"open http://127.0.0.1:{page.port} in a browser")
     return page
 

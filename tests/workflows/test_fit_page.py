@@ -16,6 +16,8 @@ from tests.report.test_pictures import a_view
 from tests.workflows.browser import CHROMIUM, FLAGS, needs_browser
 from workflows.web.fit_page import MOVED, PLAIN, TO_SCAN, FitPage
 
+OUTSIDE = np.ones(len(small.ball().vertices), bool)
+
 
 def stage(folder: Path, name: str, scale: float) -> None:
     """The ball of the small capture, larger or smaller than its scan."""
@@ -30,7 +32,7 @@ def capture(tmp_path: Path) -> Capture:
 
 @pytest.fixture
 def page(tmp_path: Path, capture: Capture) -> Iterator[FitPage]:
-    served = FitPage(tmp_path / "stages", capture)
+    served = FitPage(tmp_path / "stages", capture, OUTSIDE)
     yield served
     served.close()
 
@@ -71,7 +73,7 @@ def test_colours_are_millimetres(page: FitPage, tmp_path: Path) -> None:
 
 
 def test_without_a_scan_there_is_no_distance_to_it(capture: Capture, tmp_path: Path) -> None:
-    page = FitPage(tmp_path / "stages", replace(capture, scan=None))
+    page = FitPage(tmp_path / "stages", replace(capture, scan=None), OUTSIDE)
     try:
         assert page._colours.options == (MOVED, PLAIN)
     finally:
@@ -80,7 +82,7 @@ def test_without_a_scan_there_is_no_distance_to_it(capture: Capture, tmp_path: P
 
 def test_a_port_in_use_is_refused(page: FitPage, capture: Capture, tmp_path: Path) -> None:
     with pytest.raises(InputError, match=str(page.port)):
-        FitPage(tmp_path / "stages", capture, page.port)
+        FitPage(tmp_path / "stages", capture, OUTSIDE, page.port)
 
 
 @needs_browser

@@ -16,7 +16,7 @@ from tests.workflows.browser import CHROMIUM, FLAGS, needs_browser
 from workflows.stabilize_folder import read_decisions, read_run
 from workflows.stabilize_run import stabilize_run
 from workflows.web.decide import Review
-from workflows.web.loops import swinging_head
+from workflows.web.heads import swinging_head
 from workflows.web.review import Page, review
 
 NAMES = ("smile", "jaw_open", "brows_up")

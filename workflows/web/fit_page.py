@@ -10,19 +10,19 @@ from typing import Any
 
 import cv2
 import numpy as np
-import trimesh
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from registration.capture.pixels import read_view
 from registration.capture.scan import Scan, read_scan
 from registration.evaluate.distances import Surface, distances_mm
-from registration.frames import MM_PER_M, linear_to_srgb, srgb_to_linear
+from registration.frames import MM_PER_M, linear_to_srgb
 from registration.report.heat import scale_limit_mm
 from registration.report.pictures import scale_colours
 from registration.types import Camera, Capture
 from workflows.web import panels
+from workflows.web.heads import still_head
 from workflows.web.server import serve, until_interrupted
 
 TO_SCAN, MOVED, PLAIN = "distance to the scan", "moved in this stage", "nothing"
@@ -35,13 +35,13 @@ _LOOK_S = 0.5
 class FitPage:
     """The page of one fit; everyone who opens it sees the same."""
 
-    def __init__(self, stages: Path, capture: Capture, port: int = 0):
-        """Serves at once. `stages` need not be there yet.
+    def __init__(self, stages: Path, capture: Capture, outside: Bool[np.ndarray, "V"], port: int = 0):
+        """Serves at once. `stages` need not be there yet; `outside`: vertices that a scan can show.
 
         Raises:
             InputError: the scan cannot be read, or the port cannot be had.
         """
-        self._folder, self._capture = Path(stages), capture
+        self._folder, self._capture, self._outside = Path(stages), capture, outside
         self._scan = None if capture.scan is None else read_scan(capture.scan)
         self._meshes: dict[str, Scan] = {}  # stage -> its mesh
         self._lock, self._closed = threading.RLock(), threading.Event()
@@ -154,12 +154,10 @@ class FitPage:
             if distance is None:
                 colours, self._bar.content = np.tile(np.array(_SKIN, float), (len(mesh.vertices), 1)), ""
             else:
-                limit = scale_limit_mm(distance)
+                limit = scale_limit_mm(distance[self._outside])
                 self._bar.content = panels.colour_bar(limit, self._colours.value)
                 colours = scale_colours(distance / limit)
-            linear = (srgb_to_linear(colours / 255) * 255).astype(np.uint8)
-            drawn = trimesh.Trimesh(mesh.vertices, mesh.triangles, vertex_colors=linear, process=False)
-            self._server.scene.add_mesh_trimesh("/head", drawn)
+            self._server.scene.add_glb("/head", still_head(mesh.vertices, mesh.triangles, colours))
             sheet = cv2.imread(str(self._folder / f"{name}.png"))
             if sheet is not None:
                 self._sheet.image = sheet[..., ::-1]

@@ -19,7 +19,7 @@ from workflows.stabilize_folder import read_decisions
 from workflows.stabilize_run import LOG, stabilize_run
 from workflows.web import panels
 from workflows.web.decide import Review
-from workflows.web.loops import SWING, swinging_head
+from workflows.web.heads import SWING, swinging_head
 from workflows.web.server import serve, until_interrupted
 
 _APART = 0.15  # metres, each head from the middle

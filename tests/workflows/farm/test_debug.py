@@ -10,6 +10,7 @@ import registration.register
 from registration.errors import InputError
 from registration.progress import Silent
 from tests.capture import small
+from tests.register import synthetic
 from tests.report.test_page import a_registration
 from workflows.debug import debug
 from workflows.engine.reads import Row
@@ -73,7 +74,7 @@ def test_a_capture_from_a_url_is_kept_for_looking(
 
 def test_a_registration_can_be_watched(calls: list[dict[str, Any]], tmp_path: Path) -> None:
     capture = small.make(tmp_path / "capture")
-    done = debug(row(capture=str(capture), model="/m.npz"), tmp_path / "out", Silent(), port=0)
+    done = debug(row(capture=str(capture), model=str(synthetic.MODEL)), tmp_path / "out", Silent(), port=0)
     assert done.page is not None
     with urllib.request.urlopen(f"http://127.0.0.1:{done.page.port}", timeout=10) as answer:
         assert answer.status == 200
@@ -91,7 +92,7 @@ def test_a_page_ends_with_the_registration_that_was_refused(
     monkeypatch.setattr(Silent, "note", lambda self, text: ports.append(int(text.split(":")[2].split(" ")[0])))
     capture = small.make(tmp_path / "capture")
     with pytest.raises(InputError, match="no"):
-        debug(row(capture=str(capture), model="/m.npz"), tmp_path / "out", Silent(), port=0)
+        debug(row(capture=str(capture), model=str(synthetic.MODEL)), tmp_path / "out", Silent(), port=0)
     with pytest.raises(OSError):
         urllib.request.urlopen(f"http://127.0.0.1:{ports[0]}", timeout=10)
 

@@ -1,8 +1,9 @@
-"""A head that swings between -3 and +3 standard deviations, as a GLB file: the browser animates it by itself, so that a
-slow line carries it once and nothing while it moves."""
+"""Coloured heads as GLB files, still or swinging between -3 and +3 standard deviations: the browser animates these by
+itself, so that a slow line carries them once and nothing while they move."""
 
 import json
 import struct
+from typing import Any
 
 import numpy as np
 import torch
@@ -16,6 +17,14 @@ _SECONDS = 4.0  # a period
 _KEYS = 33
 _FLOAT, _UINT = 5126, 5125
 _ARRAY, _ELEMENTS = 34962, 34963
+
+
+def still_head(
+    points: Float[np.ndarray, "P 3"], triangles: Int[np.ndarray, "F 3"], colours: Float[np.ndarray, "P 3"]
+) -> bytes:
+    """A GLB. Metres; colours are sRGB in [0, 255]."""
+    normals = vertex_normals(torch.from_numpy(points), torch.from_numpy(triangles.astype(np.int64))).numpy()
+    return _glb({"POSITION": points, "NORMAL": normals, "COLOR_0": _linear(colours)}, triangles)
 
 
 def swinging_head(
@@ -35,18 +44,23 @@ def swinging_head(
     arrays = {
         "POSITION": points,
         "NORMAL": rest,
-        "COLOR_0": srgb_to_linear(np.clip(colours, 0, 255) / 255),
+        "COLOR_0": _linear(colours),
         "motion": SWING * motion,
         "turned": (high - low) / 2,
         "times": times,
         "weights": np.sin(2 * np.pi * times / _SECONDS),
     }
+    return _glb(arrays, triangles)
+
+
+def _linear(colours: Float[np.ndarray, "P 3"]) -> np.ndarray:
+    return srgb_to_linear(np.clip(colours, 0, 255) / 255)
+
+
+def _glb(arrays: dict[str, np.ndarray], triangles: Int[np.ndarray, "F 3"]) -> bytes:
+    """Arrays by what they are called in the format; of a head that swings also motion, turned, times and weights."""
     blobs = {name: np.ascontiguousarray(array, "<f4") for name, array in arrays.items()}
     blobs["faces"] = np.ascontiguousarray(triangles, "<u4").reshape(-1)
-    return _glb(blobs)
-
-
-def _glb(blobs: dict[str, np.ndarray]) -> bytes:
     number = {name: k for k, name in enumerate(blobs)}
     views, accessors, offset = [], [], 0
     for name, array in blobs.items():
@@ -60,26 +74,29 @@ def _glb(blobs: dict[str, np.ndarray]) -> bytes:
             accessor |= {"min": np.atleast_1d(array.min(0)).tolist(), "max": np.atleast_1d(array.max(0)).tolist()}
         accessors.append(accessor)
         offset += array.nbytes
-    primitive = {
+    primitive: dict[str, Any] = {
         "attributes": {name: number[name] for name in ("POSITION", "NORMAL", "COLOR_0")},
-        "targets": [{"POSITION": number["motion"], "NORMAL": number["turned"]}],
         "indices": number["faces"],
         "material": 0,
     }
     skin = {"pbrMetallicRoughness": {"metallicFactor": 0, "roughnessFactor": 0.75}, "doubleSided": True}
-    sampler = {"input": number["times"], "output": number["weights"], "interpolation": "LINEAR"}
-    scene = {
+    scene: dict[str, Any] = {
         "asset": {"version": "2.0"},
         "scene": 0,
         "scenes": [{"nodes": [0]}],
         "nodes": [{"mesh": 0, "name": "head"}],
-        "meshes": [{"primitives": [primitive], "weights": [0]}],
+        "meshes": [{"primitives": [primitive]}],
         "materials": [skin],
-        "animations": [{"samplers": [sampler], "channels": [{"sampler": 0, "target": {"node": 0, "path": "weights"}}]}],
         "buffers": [{"byteLength": offset}],
         "bufferViews": views,
         "accessors": accessors,
     }
+    if "motion" in number:
+        primitive["targets"] = [{"POSITION": number["motion"], "NORMAL": number["turned"]}]
+        scene["meshes"][0]["weights"] = [0]
+        sampler = {"input": number["times"], "output": number["weights"], "interpolation": "LINEAR"}
+        channel = {"sampler": 0, "target": {"node": 0, "path": "weights"}}
+        scene["animations"] = [{"samplers": [sampler], "channels": [channel]}]
     text = json.dumps(scene, separators=(",", ":")).encode()
     text += b" " * (-len(text) % 4)
     body = b"".join(array.tobytes() for array in blobs.values())
