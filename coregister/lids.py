@@ -133,9 +133,11 @@ def gap_change_mm(
     both: tuple[Socket, Socket], template: Float[np.ndarray, "V 3"], basis: Float[np.ndarray, "K V 3"]
 ) -> Float[np.ndarray, "K"]:
     """How much distances of lids from eyeballs change with each component at +-BOUND: the rim's mean, mm, the worst of
-    both eyes and signs. `both` are of that template."""
+    both eyes and signs; 0 of an eyeball that no lid is near. `both` are of that template."""
     found = np.zeros((len(basis), 2, 2))
     for side, socket in enumerate(both):
+        if not len(socket.rim):
+            continue
         rest, centre = template[socket.rim], socket.ball
         for k, component in enumerate(BOUND * basis.astype(np.float64)):
             shift = component[centre].mean(0)

@@ -161,6 +161,12 @@ def test_lids_stay_on_the_eyeballs(of_people, model):
     assert lids.gap_change_mm(both, found.template, still).max() > 2 * change.max()
 
 
+def test_an_eyeball_without_lids_has_no_gap_that_changes(of_people):
+    new, found, _ = of_people
+    bare = tuple(replace(socket, rim=np.zeros(0, int), gap=np.zeros(0)) for socket in lids.sockets(new))
+    assert not lids.gap_change_mm(bare, found.template, found.basis[:2]).any()
+
+
 def test_settling_lids_changes_nothing_else(of_people, model):
     _, found, left = of_people
     away = np.linalg.norm(found.basis - left.basis, axis=2).max(0)
