@@ -71,7 +71,7 @@ def register_subject(
     wanted = hashes.input_hash(inputs, {"recipe": hashes.plain(recipe_named(recipe)), "views": views, "seed": seed})
     place = Path(out)
     if (known := _known(place, wanted)) is not None and _contents(place, known["contents"]) == known["contents"]:
-        return known
+        return {**known, "out": out}
     found = subject.register_subject(
         Path(subject_dir),
         model_path=Path(model),
@@ -106,7 +106,7 @@ def hold_out(
     wanted = hashes.input_hash(inputs, {"categories": found.categories})
     place = Path(out)
     if (known := _known(place, wanted)) is not None and (place / PEOPLE).is_file():
-        return known
+        return {**known, "people": str(place / PEOPLE)}
     people, lost, skin = [], list[str](), SkullSkin.of(data)
     for name in names:
         meshes = true_meshes(found.subjects[name], data) if name in true else None
@@ -162,7 +162,7 @@ def build(
     wanted = hashes.input_hash(inputs, {"settings": hashes.plain(settings), "tags": tags})
     known = _known(Path(out), wanted)
     if known is not None and _is_model(Path(out) / MODEL, known["content_id"]):
-        return known
+        return {**known, "model": str(Path(out) / MODEL)}
     (progress or Silent()).note(f"building a model from {len(subjects.usable)} subjects")
     built = build_model(subjects, data, settings)
     told = {
@@ -253,7 +253,7 @@ def _is_model(file: Path, content: str) -> bool:
 
 
 def _known(place: Path, wanted: str) -> Told | None:
-    """What a step told when it made the product in `place` from the same inputs."""
+    """What a step told when it made the product in `place`, which may have lain elsewhere, from the same inputs."""
     try:
         told = json.loads((place / STEP).read_text("utf-8"))
     except (OSError, ValueError):

@@ -150,6 +150,18 @@ def test_a_killed_loop_goes_on_without_computing_anything_twice(dataset, finds, 
     assert len(built) == count and written(out) == last
 
 
+def test_a_folder_that_was_moved_is_as_good(dataset, finds, tmp_path):
+    go(dataset, tmp_path / "out")
+    made, elsewhere = len(finds.made), tmp_path / "elsewhere" / "out"
+    elsewhere.parent.mkdir()
+    (tmp_path / "out").rename(elsewhere)
+    before = written(elsewhere)
+    record = go(dataset, elsewhere)
+    assert len(finds.made) == made and written(elsewhere) == before
+    assert record["verdict"]["reason"] == "all 2 rounds done"
+    assert str(tmp_path / "out") not in (elsewhere / "coregistration.json").read_text()
+
+
 def test_one_failing_capture_does_not_stop_the_rest(dataset, finds, tmp_path):
     finds.outcomes = {"p0/smile": RuntimeError("out of luck"), "p1/neutral": ValueError("odd")}
     write_person(dataset / "p0" / "neutral", dataset / "p5", 5)
