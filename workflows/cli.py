@@ -225,7 +225,7 @@ def review_stabilization(
             port=port,
             progress=progress,
         )
-    print(f"Open http://127.0.0.1:{page.port} in a browser; Ctrl-C ends.", flush=True)
+    print(f"Open {page.url} in a browser; Ctrl-C ends.", flush=True)
     page.wait()
     return 0
 

@@ -88,7 +88,7 @@ def _page(stages: Path, capture: Path, model: Path, port: int, progress: Progres
     from workflows.web.fit_page import FitPage
 
     page = FitPage(stages, read(capture), regions.exterior(gnm_npz.read(model)), port)
-    progress.note(f"open http://127.0.0.1:{page.port} in a browser")
+    progress.note(f"open {page.url} in a browser")
     return page
 
 

@@ -292,7 +292,7 @@ def debug(
         done = debug(row, out, progress, port=port if view else None)
     print(f"{done.told}\n{out}", flush=True)
     if done.page is not None:
-        print(f"Open http://127.0.0.1:{done.page.port} in a browser; Ctrl-C ends.", flush=True)
+        print(f"Open {done.page.url} in a browser; Ctrl-C ends.", flush=True)
         done.page.wait()
     return 0
 

@@ -4,7 +4,9 @@ The page reads what `registration.report.stages.write_stage` leaves, and shows a
 """
 
 import threading
+from collections.abc import Callable
 from dataclasses import replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -16,14 +18,14 @@ from scipy.spatial.transform import Rotation
 
 from registration.capture.pixels import read_view
 from registration.capture.scan import Scan, read_scan
-from registration.evaluate.distances import Surface, distances_mm
 from registration.frames import MM_PER_M, linear_to_srgb
+from registration.geometry.closest_point import Searched
 from registration.report.heat import scale_limit_mm
 from registration.report.pictures import scale_colours
 from registration.types import Camera, Capture
 from workflows.web import panels
 from workflows.web.heads import still_head
-from workflows.web.server import serve, until_interrupted
+from workflows.web.server import Served
 
 TO_SCAN, MOVED, PLAIN = "distance to the scan", "moved in this stage", "nothing"
 _SKIN, _SCAN = (206, 176, 158), (96, 110, 128)
@@ -32,7 +34,7 @@ _THUMBNAIL_PX = 200  # height of the images in the cameras' frusta, at most
 _LOOK_S = 0.5
 
 
-class FitPage:
+class FitPage(Served):
     """The page of one fit; everyone who opens it sees the same."""
 
     def __init__(self, stages: Path, capture: Capture, outside: Bool[np.ndarray, "V"], port: int = 0):
@@ -45,21 +47,13 @@ class FitPage:
         self._scan = None if capture.scan is None else read_scan(capture.scan)
         self._meshes: dict[str, Scan] = {}  # stage -> its mesh
         self._lock, self._closed = threading.RLock(), threading.Event()
-        self._server = serve(port, "Fit")
-        self.port = self._server.get_port()
+        super().__init__(port, "Fit")
         self._build()
         threading.Thread(target=self._live, daemon=True).start()
 
-    def wait(self) -> None:
-        """Until Ctrl-C."""
-        try:
-            until_interrupted()
-        finally:
-            self.close()
-
     def close(self) -> None:
         self._closed.set()
-        self._server.stop()
+        super().close()
 
     @property
     def stages(self) -> list[str]:
@@ -121,13 +115,12 @@ class FitPage:
             if not fresh:
                 return
             follows = not self._meshes or self._stage.value == self.stages[-1]
-            first, stands = not self._meshes, self._stage.value
+            if not self._meshes:
+                self._look_at(read_scan(fresh[0]).vertices)
             self._meshes |= {file.stem: read_scan(file) for file in fresh}
-            self._stage.options = tuple(self.stages)
-            self._stage.value = self.stages[-1] if follows else stands
-            if first:
-                self._look_at(next(iter(self._meshes.values())).vertices)
-            self._show()
+            self._stage.options = tuple(self.stages)  # what was chosen stays; the first ones replace "waiting"
+            if follows:
+                self._stage.value = self.stages[-1]
 
     def _look_at(self, head: Float[np.ndarray, "V 3"]) -> None:
         """From where the cameras are, on average, with their up as up."""
@@ -162,17 +155,23 @@ class FitPage:
             if sheet is not None:
                 self._sheet.image = sheet[..., ::-1]
 
+    @cached_property
+    def _from_scan(self) -> Callable[[Float[np.ndarray, "P 3"]], Float[np.ndarray, "P"]]:
+        """Distances of points from the scan, metres; a point cloud has no surface, so from its points."""
+        assert self._scan is not None  # else there is no such choice
+        if len(self._scan.triangles):
+            surface = Searched(self._scan.vertices, self._scan.triangles)
+            return lambda points: surface.closest(points)[0]
+        tree = cKDTree(self._scan.vertices)
+        return lambda points: np.asarray(tree.query(points)[0])
+
     def _distance_mm(self, name: str) -> Float[np.ndarray, "V"] | None:
         mesh, kind = self._meshes[name], self._colours.value
         if kind == MOVED:
             earlier = self.stages[max(self.stages.index(name) - 1, 0)]
             return np.linalg.norm(mesh.vertices - self._meshes[earlier].vertices, axis=1) * MM_PER_M
-        if kind == TO_SCAN and self._scan is not None:
-            if len(self._scan.triangles):
-                return distances_mm(
-                    mesh.vertices, Surface(vertices=self._scan.vertices, triangles=self._scan.triangles)
-                )
-            return cKDTree(self._scan.vertices).query(mesh.vertices)[0] * MM_PER_M
+        if kind == TO_SCAN:
+            return self._from_scan(mesh.vertices) * MM_PER_M
         return None
 
 

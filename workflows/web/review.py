@@ -20,7 +20,7 @@ from workflows.stabilize_run import LOG, stabilize_run
 from workflows.web import panels
 from workflows.web.decide import Review
 from workflows.web.heads import SWING, swinging_head
-from workflows.web.server import serve, until_interrupted
+from workflows.web.server import Served
 
 _APART = 0.15  # metres, each head from the middle
 
@@ -49,7 +49,7 @@ def review(
     return Page(Review(disk.read_components(outcome.out), head, log, outcome.dataset, saved), port)
 
 
-class Page:
+class Page(Served):
     """The page of one review; everyone who opens it sees, and decides about, the same."""
 
     def __init__(self, review: Review, port: int):
@@ -71,20 +71,9 @@ class Page:
         number[self._shown] = np.arange(len(self._shown))
         faces = number[data.triangles]
         self._faces = faces[(faces >= 0).all(1)]
-        self._server = serve(port, "Stabilization")
-        self.port = self._server.get_port()
+        super().__init__(port, "Stabilization")
         self._build()
         self._show()
-
-    def wait(self) -> None:
-        """Until Ctrl-C."""
-        try:
-            until_interrupted()
-        finally:
-            self.close()
-
-    def close(self) -> None:
-        self._server.stop()
 
     @property
     def _part(self) -> Components:

@@ -81,9 +81,7 @@ def test_a_registration_can_be_watched(calls: list[dict[str, Any]], tmp_path: Pa
     done.page.close()
 
 
-def test_a_page_ends_with_the_registration_that_was_refused(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_page_ends_with_the_registration_that_was_refused(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     def refuse(*_: Any, **__: Any) -> None:
         raise InputError("no", where="here", expected="a", got="b", fix="c")
 
