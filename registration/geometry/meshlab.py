@@ -5,6 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, Int
 
+from registration.geometry.quads import edges_of
+
 
 @dataclass(frozen=True, kw_only=True)
 class ScanTopology:
@@ -37,13 +39,7 @@ def scan_topology(vertices: Float[np.ndarray, "V 3"], triangles: Int[np.ndarray,
         components=found["connected_components_number"],
         holes=found["number_holes"],
         boundary_edges=found["boundary_edges"],
-        non_manifold_edges=_crowded_edges(triangles),  # MeshLab's own count is of memory that nothing was written to
+        # MeshLab's own count is of memory that nothing was written to.
+        non_manifold_edges=int((edges_of(triangles)[2] > 2).sum()),
         non_manifold_vertices=found["non_two_manifold_vertices"],
     )
-
-
-def _crowded_edges(triangles: Int[np.ndarray, "F 3"]) -> int:
-    """How many edges have more than two triangles."""
-    ends = np.sort(np.stack([triangles, np.roll(triangles, -1, axis=1)], -1).reshape(-1, 2).astype(np.int64), axis=1)
-    _, count = np.unique(ends[:, 0] * (ends.max(initial=0) + 1) + ends[:, 1], return_counts=True)
-    return int((count > 2).sum())

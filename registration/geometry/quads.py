@@ -19,12 +19,14 @@ def corner_triangles(corners: Float[np.ndarray, "Q 4 D"]) -> Float[np.ndarray, "
 
 
 def edges_of(
-    quads: Int[np.ndarray, "Q 4"],
-) -> tuple[Int[np.ndarray, "E 2"], Int[np.ndarray, "Q 4"], Int[np.ndarray, "E"]]:
-    """Edges (lower vertex first), each quad's four edges (edge k joins corners k and k + 1), quads per edge."""
-    sides = np.sort(np.stack([quads, np.roll(quads, -1, 1)], -1).reshape(-1, 2), 1)
-    edges, inverse, count = np.unique(sides, axis=0, return_inverse=True, return_counts=True)
-    return edges, inverse.reshape(-1, 4), count
+    faces: Int[np.ndarray, "F S"],
+) -> tuple[Int[np.ndarray, "E 2"], Int[np.ndarray, "F S"], Int[np.ndarray, "E"]]:
+    """Edges (lower vertex first), each face's edges (edge k joins corners k and k + 1), faces per edge. Quads, or
+    triangles of any mesh, manifold or not."""
+    low, high = np.sort(np.stack([faces, np.roll(faces, -1, 1)]).astype(np.int64), 0)
+    size = int(faces.max(initial=0)) + 1
+    number, inverse, count = np.unique(low * size + high, return_inverse=True, return_counts=True)  # rows sort slower
+    return np.stack(np.divmod(number, size), 1), inverse.reshape(faces.shape), count
 
 
 def boundary_loops(quads: Int[np.ndarray, "Q 4"]) -> list[Int[np.ndarray, "N"]]:

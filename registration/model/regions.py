@@ -118,11 +118,6 @@ def skin(data: GNMData) -> Bool[np.ndarray, "V"]:
     return group(data, "skin") > _INSIDE
 
 
-def upper_teeth(data: GNMData) -> Bool[np.ndarray, "V"]:
-    """Upper teeth with their gums: they stay with the skull."""
-    return group(data, "upper_teeth_and_gums") > _INSIDE
-
-
 def lower_teeth(data: GNMData) -> Bool[np.ndarray, "V"]:
     """Lower teeth with their gums: they move with the jaw, and tell how it moves."""
     return group(data, "lower_teeth_and_gums") > _INSIDE

@@ -124,7 +124,7 @@ def test_parts_in_the_mouth_move_as_they_do_in_the_heads(model):
     rng = np.random.default_rng(4)
     heads = _aligned(model, _drawn(model, rng, 120), rng)
     found = head_identity(heads[:-10], model, RAW)
-    mouth = regions.upper_teeth(model) | regions.jaw_parts(model)
+    mouth = (regions.group(model, "upper_teeth_and_gums") > 0.5) | regions.jaw_parts(model)
     away = heads[-10:] - found.template
     coefficients = np.linalg.lstsq(_skin(found.basis, model).T, _skin(away, model).T, rcond=None)[0].T
     error = np.tensordot(coefficients, found.basis, 1)[:, mouth] - away[:, mouth]
