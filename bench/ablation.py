@@ -1,6 +1,6 @@
 """What each term of a fit is worth: the draft recipe without it, on a neutral and on an expression from it.
 
-    python bench/ablation.py --model MODEL.npz --neutral CAPTURE --expression CAPTURE --out FOLDER [--only NAME ...]
+    python -m bench.ablation --model MODEL.npz --neutral CAPTURE --expression CAPTURE --out FOLDER [--only NAME ...]
 
 Registrations are kept in FOLDER, so that a run that was stopped goes on where it was. The expression starts from the
 neutral of the whole recipe throughout: what is left out is left out of its own fit only. mm on the face; "too deep"

@@ -1,6 +1,6 @@
 """Two rounds of coregistration from the first model: what registrations teach a model about people it has not seen.
 
-    python bench/coregistration.py [--out DIR] [--training 40] [--held-out 10] [--rounds 2] [--jobs 2]
+    python -m bench.coregistration [--out DIR] [--training 40] [--held-out 10] [--rounds 2] [--jobs 2]
 
 A synthetic population of any adult age and build, neutrals only, 8 views of 256 x 256 (`gnmreg dataset synth`), goes
 through the loop of `gnmreg coregister`. Held-out people are measured on their true meshes with the same number of
@@ -20,31 +20,28 @@ from pathlib import Path
 
 import numpy as np
 
-if not __package__:  # run as a file: the packages lie beside `bench`
-    sys.path[0] = str(Path(__file__).resolve().parents[1])
-
-from coregister import bootstrap  # noqa: E402
-from coregister.build import build  # noqa: E402
-from coregister.decide import Rule  # noqa: E402
-from coregister.evaluate import HeldOut  # noqa: E402
-from coregister.generalization import LinearPart, fit, identity_part, surface_part  # noqa: E402
-from coregister.samples import NEUTRAL, Mesh, Subject  # noqa: E402
-from coregister.scan_fit import fit_scan  # noqa: E402
-from coregister.specificity import specificity_mm  # noqa: E402
-from coregister.synth import Studio  # noqa: E402
-from registration.capture.scan import read_truth  # noqa: E402
-from registration.evaluate.distances import Surface, spread  # noqa: E402
-from registration.model import gnm_npz, regions  # noqa: E402
-from registration.model.gnm_npz import GNMData  # noqa: E402
-from registration.progress import shown  # noqa: E402
-from registration.render.studio.shoot import Quality  # noqa: E402
-from workflows import steps  # noqa: E402
-from workflows.coregistration import FIRST, planned  # noqa: E402
-from workflows.engine.database import default_url  # noqa: E402
-from workflows.engine.durable import migrate  # noqa: E402
-from workflows.farm_coregistration import coregister  # noqa: E402
-from workflows.held_out import read_held_out  # noqa: E402
-from workflows.synth_dataset import Population, synth_dataset  # noqa: E402
+from coregister import bootstrap
+from coregister.build import build
+from coregister.decide import Rule
+from coregister.evaluate import HeldOut
+from coregister.generalization import LinearPart, fit, identity_part, surface_part
+from coregister.samples import NEUTRAL, Mesh, Subject
+from coregister.scan_fit import fit_scan
+from coregister.specificity import specificity_mm
+from coregister.synth import Studio
+from registration.capture.scan import read_truth
+from registration.evaluate.distances import Surface, spread
+from registration.model import gnm_npz, regions
+from registration.model.gnm_npz import GNMData
+from registration.progress import shown
+from registration.render.studio.shoot import Quality
+from workflows import steps
+from workflows.coregistration import FIRST, planned
+from workflows.engine.database import default_url
+from workflows.engine.durable import migrate
+from workflows.farm_coregistration import coregister
+from workflows.held_out import read_held_out
+from workflows.synth_dataset import Population, synth_dataset
 
 COMPONENTS = (10, 20, 40)
 AT = "20"  # what counts

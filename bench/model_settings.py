@@ -20,7 +20,7 @@ from itertools import product
 import numpy as np
 from jaxtyping import Float
 
-from bench.evaluate import Moves
+from bench.evaluation import Moves
 from coregister import anatomy as anatomy_of
 from coregister import bootstrap, identity, makehuman, population
 from coregister.anatomy import Anatomy

@@ -1,6 +1,6 @@
 """Register captures and print how well, how fast and with how much memory; nothing is kept.
 
-    python bench/register.py --model MODEL.npz CAPTURE... [--recipe draft]
+    python -m bench.register --model MODEL.npz CAPTURE... [--recipe draft]
 
 Each capture gets a process of its own, so that the peak is its own; seconds are the whole command's.
 """

@@ -1,12 +1,12 @@
 """What one step of the renderer costs, as a ratio to the bare ray cast of every pixel of every view.
 
-    python bench/renderer.py --case 22x512 --case 8x512 --case 8x256 [--variant llvm|cuda] [--memory] [--stock]
+    python -m bench.renderer --case 22x512 --case 8x512 --case 8x256 [--variant llvm|cuda] [--memory] [--stock]
 
 A case is VIEWSxSIDE. The scene is the first model's head and the studio's rig; the head moves in every iteration. The
 floor is one coherent cast of *all* pixels with the BVH built; what the renderer draws is what a fit compares, the
 pixels in and near the head. Stages are medians over interleaved repeats. `misses` counts kernels that had to be
 compiled after the second iteration; `memory_growth` is the process' size at iteration 1,000 over that at 100, minus 1.
-`--stock` sets our whole iteration and that of Mitsuba's own projective integrator (`stock.py`) against the same floor.
+`--stock` compares our whole iteration and that of Mitsuba's own projective integrator with the same floor.
 """
 
 import argparse
@@ -183,9 +183,9 @@ def measure(case: Case) -> dict[str, float]:
 
 def measure_stock(case: Case) -> dict[str, float]:
     """Median seconds of the floor, of our iteration and of stock Mitsuba's."""
-    import stock
+    from bench.support import stock_renderer
 
-    theirs = stock.iteration(case.all.cameras, case.triangles, case.corner_uvs, case.texture, case.moved)
+    theirs = stock_renderer.iteration(case.all.cameras, case.triangles, case.corner_uvs, case.texture, case.moved)
     calls = {CAST: floor(case), WHOLE: case.iterate, STOCK: theirs}
     for _ in range(3):
         for call in calls.values():

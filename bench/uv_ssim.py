@@ -21,6 +21,8 @@ import torch
 from rich.console import Console
 from rich.table import Table
 
+from bench.support import sliding
+from bench.support.sliding import OnSurface, Problem, Term
 from coregister.bootstrap import bootstrap
 from registration.capture.native import read
 from registration.frames import MM_PER_M
@@ -34,8 +36,6 @@ from registration.render.renderer import Renderer
 from registration.targets.classes import class_map
 from registration.targets.pyramid import build_pyramid
 from registration.types import Targets
-from tests.losses import sliding
-from tests.losses.sliding import OnSurface, Problem, Term
 
 VIEWS = ((-75, 0), (-45, -20), (-25, 15), (-8, -30), (8, 25), (25, -15), (50, 15), (75, -5))  # yaw, pitch
 STAGES = ((40, 20.0, 4e-3, 2e-3), (60, 8.0, 2e-3, 1e-3), (60, 4.0, 1e-3, 5e-5))  # steps, smoothing mm, rates m

@@ -1,6 +1,6 @@
 """Make a model that cannot say one known person: that person's direction is projected out of its identity basis.
 
-    python bench/without_identity.py MODEL.npz SAMPLES.npz OUT.npz [--sample 0]
+    python -m bench.without_identity MODEL.npz SAMPLES.npz OUT.npz [--sample 0]
 
 A fit with such a model shows how far vertices slide where no prior holds them: scan distance does not see it, vertex
 error against the person's true mesh does. SAMPLES holds identity deltas `identity_deltas` (S, V, 3) in metres, or

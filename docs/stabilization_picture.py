@@ -13,13 +13,13 @@ import cv2
 import numpy as np
 from playwright.sync_api import sync_playwright
 
+from bench.support import performances
 from coregister import anatomy as anatomy_of
 from coregister import bootstrap, makehuman, population
 from registration.geometry.rigid import motion_fields
 from registration.model import gnm_npz
 from registration.stabilize.components import Head, regional_components
 from registration.stabilize.folder import StoredComponents
-from tests.stabilize import performed
 from tests.workflows.test_review import CHROMIUM, FLAGS
 from workflows.stabilize_run import along
 from workflows.web.decide import Review
@@ -32,7 +32,7 @@ WAIT_MS = 6000  # until the heads are somewhere in their swing
 
 def stored(head: Head) -> StoredComponents:
     anatomy = anatomy_of.make(makehuman.read(makehuman.fetch()), population.mean_person())
-    truths = [performed.perform(anatomy, 1000 + number) for number in range(16)]
+    truths = [performances.perform(anatomy, 1000 + number) for number in range(16)]
     rng = np.random.default_rng(5)
     twists = rng.normal(size=(2, 2, 3))
     twists *= np.array([np.radians(1.0), 2e-3])[:, None] / np.linalg.norm(twists, axis=2, keepdims=True)

@@ -43,7 +43,7 @@ def stabilize_subject(meshes: SubjectMeshes, skin: SkullSkin, settings: Automati
     rigid alignment to the neutral; then aligns each expression alone by iteratively reweighted least squares with Geman
     and McClure's kernel. Weights are times the registrations' confidence, so that unseen vertices carry none.
 
-    Beyond section 6, measured by bench/stabilize.py: weights are also times the area that a vertex stands for, since
+    Beyond section 6, measured by `bench.stabilization`: weights are also times the area that a vertex stands for, since
     models are dense where faces move (lids, lips); that halves the errors. The neck does not take part.
 
     `meshes` as `subject_meshes` returns them. Never fails: with little skin seen in common the motion is a poor one.

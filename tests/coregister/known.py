@@ -3,11 +3,11 @@
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from bench.support import performances
 from coregister.anatomy import Anatomy
 from coregister.samples import Mesh, Subject
 from registration.model import regions
 from registration.model.gnm_npz import GNMData
-from tests.stabilize import performed
 
 
 def whitened(rng: np.random.Generator, count: int, size: int) -> np.ndarray:
@@ -43,7 +43,7 @@ def people(anatomy: Anatomy, model: GNMData, seeds: range, acts: tuple[str, ...]
     """Subjects beyond the first model's span, with expressions of their own strength."""
     found = []
     for seed in seeds:
-        truth = performed.perform(anatomy, seed, acts)
+        truth = performances.perform(anatomy, seed, acts)
         expressions = tuple(mesh(name, v, model) for name, v in zip(truth.labels, truth.vertices, strict=True))
         tags = {"age": 20 + seed % 50, "gender": ("female", "male")[seed % 2]}
         neutral = mesh("neutral", truth.neutral, model)

@@ -5,9 +5,9 @@ import pytest
 import torch
 import trimesh
 
+from bench.support.crossed_parts import winding
 from registration.geometry.closest_point import closest_points
 from registration.geometry.contacts import Depths, Flesh, Solids, Watched, depths
-from tests.losses.crossing import winding
 
 
 class Scene:

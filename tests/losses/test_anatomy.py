@@ -6,14 +6,7 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from registration.errors import InputError
-from registration.geometry.topology import vertex_normals
-from registration.losses.anatomy import SelfIntersection
-from registration.model import gnm_npz, regions
-from registration.model.gnm_npz import GNMData
-from tests.conftest import SHARED, needs_shared
-from tests.fixtures.make_fixtures import tiny_model
-from tests.losses.crossing import (
+from bench.support.crossed_parts import (
     displaced,
     moved,
     pressed_lid,
@@ -22,6 +15,13 @@ from tests.losses.crossing import (
     tooth_depths_mm,
     winding,
 )
+from registration.errors import InputError
+from registration.geometry.topology import vertex_normals
+from registration.losses.anatomy import SelfIntersection
+from registration.model import gnm_npz, regions
+from registration.model.gnm_npz import GNMData
+from tests.conftest import SHARED, needs_shared
+from tests.fixtures.make_fixtures import tiny_model
 
 CPU = torch.device("cpu")
 PAIRS = (

@@ -1,13 +1,10 @@
-"""Parts that cross come apart again, and nothing else moves much; `bench/anatomy.py` has more of it."""
+"""Parts that cross come apart again, and nothing else moves much; `bench/self_intersection.py` has more of it."""
 
 import numpy as np
 import pytest
 import torch
 
-from registration.model import gnm_npz, regions
-from registration.model.gnm_npz import GNMData
-from tests.conftest import SHARED, needs_shared
-from tests.losses.crossing import (
+from bench.support.crossed_parts import (
     cheeks,
     eyeball_depths_mm,
     lip_depths_mm,
@@ -15,6 +12,9 @@ from tests.losses.crossing import (
     raised_lower_lip,
     recover,
 )
+from registration.model import gnm_npz, regions
+from registration.model.gnm_npz import GNMData
+from tests.conftest import SHARED, needs_shared
 
 pytestmark = needs_shared
 

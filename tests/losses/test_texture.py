@@ -10,6 +10,8 @@ import numpy as np
 import pytest
 import torch
 
+from bench.support import sliding
+from bench.support.sliding import Problem
 from registration.geometry.quads import corner_triangles, triangles_of
 from registration.geometry.texels import eroded, texels
 from registration.losses.texture import trusted
@@ -19,8 +21,6 @@ from registration.render import backend
 from registration.types import Targets
 from tests.conftest import SHARED, needs_shared
 from tests.fixtures.make_fixtures import ball, tiny_model
-from tests.losses import sliding
-from tests.losses.sliding import Problem
 
 RADIUS = 0.08  # metres
 SIZE_PX = 256  # of the textures that are compared

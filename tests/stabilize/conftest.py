@@ -2,12 +2,12 @@
 
 import pytest
 
+from bench.support import performances
+from bench.support.performances import Performed, Seen
 from registration.model.gnm_npz import GNMData
 from registration.stabilize.components import Head
 from registration.stabilize.meshes import SkullSkin
 from tests.coregister.conftest import anatomy, model, model_file, source, wheel  # noqa: F401  fixtures
-from tests.stabilize import performed
-from tests.stabilize.performed import Performed, Seen
 
 
 @pytest.fixture(scope="session")
@@ -22,9 +22,9 @@ def skin(model: GNMData) -> SkullSkin:  # noqa: F811
 
 @pytest.fixture(scope="session")
 def truths(anatomy) -> list[Performed]:  # noqa: F811
-    return [performed.perform(anatomy, 1000 + number) for number in range(3)]
+    return [performances.perform(anatomy, 1000 + number) for number in range(3)]
 
 
 @pytest.fixture(scope="session")
 def seens(truths: list[Performed]) -> list[Seen]:
-    return [performed.seen(truth, number) for number, truth in enumerate(truths)]
+    return [performances.seen(truth, number) for number, truth in enumerate(truths)]

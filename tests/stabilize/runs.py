@@ -6,11 +6,11 @@ from pathlib import Path
 
 import numpy as np
 
+from bench.support.performances import Performed, Seen
 from registration.artifacts import save_registration
 from registration.model import gnm_npz
 from registration.model.gnm_npz import GNMData
 from tests.report.test_page import a_registration
-from tests.stabilize.performed import Performed, Seen
 
 
 def write_subject(folder: Path, name: str, data: GNMData, heads: dict[str, tuple[str, np.ndarray, np.ndarray]]) -> Path:

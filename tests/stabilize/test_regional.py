@@ -3,16 +3,16 @@
 import numpy as np
 import pytest
 
+from bench.support import performances, stabilization_measures
 from registration.errors import InputError
 from registration.geometry.rigid import motion_fields
 from registration.stabilize.components import free_of_label, label_part, regional_components
 from registration.stabilize.decisions import Decision, change, corrections, decided_actions, default_actions
-from tests.stabilize import measures, performed
 
 
 @pytest.fixture(scope="module")
 def injected(truths, model):
-    return measures.injected(truths, model, seed=0)
+    return stabilization_measures.injected(truths, model, seed=0)
 
 
 def test_most_of_a_spurious_motion_goes_and_expressions_stay(injected):
@@ -24,8 +24,8 @@ def test_most_of_a_spurious_motion_goes_and_expressions_stay(injected):
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", range(3))
 def test_in_a_third_of_400_samples(anatomy, model, seed):
-    truths = [performed.perform(anatomy, 1000 + number) for number in range(20)]
-    found = measures.injected(truths, model, seed)
+    truths = [performances.perform(anatomy, 1000 + number) for number in range(20)]
+    found = stabilization_measures.injected(truths, model, seed)
     assert found.reduced >= 0.8 and found.lost < 0.02
 
 

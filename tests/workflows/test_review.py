@@ -6,12 +6,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from bench.support import performances
 from registration.errors import InputError
 from registration.stabilize import folder as disk
 from registration.stabilize.dataset import stabilize
 from registration.stabilize.decisions import Decision
 from tests.coregister.conftest import anatomy, model, model_file, source, wheel  # noqa: F401  fixtures
-from tests.stabilize import performed, runs
+from tests.stabilize import runs
 from tests.workflows.browser import CHROMIUM, FLAGS, needs_browser
 from workflows.stabilize_folder import read_decisions, read_run
 from workflows.stabilize_run import stabilize_run
@@ -24,8 +25,8 @@ NAMES = ("smile", "jaw_open", "brows_up")
 
 @pytest.fixture(scope="module")
 def run(anatomy, model, tmp_path_factory) -> Path:  # noqa: F811
-    truths = [performed.perform(anatomy, number, NAMES) for number in range(2)]
-    seens = [performed.seen(truth, number, unseen=0.02) for number, truth in enumerate(truths)]
+    truths = [performances.perform(anatomy, number, NAMES) for number in range(2)]
+    seens = [performances.seen(truth, number, unseen=0.02) for number, truth in enumerate(truths)]
     return runs.write_run(tmp_path_factory.mktemp("review"), model, truths, seens)
 
 

@@ -7,13 +7,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from bench.support import performances
 from registration.errors import InputError
 from registration.model import gnm_npz
 from registration.stabilize import folder as disk
 from registration.stabilize.dataset import stabilize
 from registration.stabilize.decisions import Decision
 from tests.coregister.conftest import anatomy, model, model_file, source, wheel  # noqa: F401  fixtures
-from tests.stabilize import performed, runs
+from tests.stabilize import runs
 from workflows.cli import main
 from workflows.stabilize_folder import append_decisions, read_decisions, read_run
 from workflows.stabilize_run import stabilize_run
@@ -23,8 +24,8 @@ NAMES = ("smile", "jaw_open", "brows_up")
 
 @pytest.fixture(scope="module")
 def run(anatomy, model, tmp_path_factory) -> Path:  # noqa: F811
-    truths = [performed.perform(anatomy, number, NAMES) for number in range(2)]
-    seens = [performed.seen(truth, number, unseen=0.02) for number, truth in enumerate(truths)]
+    truths = [performances.perform(anatomy, number, NAMES) for number in range(2)]
+    seens = [performances.seen(truth, number, unseen=0.02) for number, truth in enumerate(truths)]
     return runs.write_run(tmp_path_factory.mktemp("run"), model, truths, seens)
 
 

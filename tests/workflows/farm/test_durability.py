@@ -13,8 +13,8 @@ from pathlib import Path
 import pytest
 import sqlalchemy as sa
 
+from bench.support.postgres_server import Server, programs, server
 from tests.workflows.farm.harness import QUICK, Farm, alive, children_of, farm
-from tests.workflows.farm.postgres import Server, programs, server
 from workflows.engine.database import checked_url, engine
 from workflows.jobs import FlowJob, Job
 from workflows.store import Store

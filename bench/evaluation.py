@@ -1,6 +1,6 @@
 """What head models are worth on people of the synthetic population, and how good any model of them could be.
 
-    python -m bench.evaluate [--subjects 10] [--training 40 200] [--samples 100]
+    python -m bench.evaluation [--subjects 10] [--training 40 200] [--samples 100]
 
 Held-out people that the first model does not span, with five expressions each, evaluated as `gnmreg model evaluate`
 does. Beside the first model stand models of the true meshes of other people: what a rebuilt model could reach, if

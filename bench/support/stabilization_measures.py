@@ -5,6 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from bench.support.performances import BROWS, JAW, Performed, Seen
 from registration.frames import MM_PER_M, transform_points
 from registration.geometry.rigid import angle_deg, motion_fields
 from registration.model.gnm_npz import GNMData
@@ -12,7 +13,6 @@ from registration.model.regions import group
 from registration.stabilize.components import Components, Head, regional_components
 from registration.stabilize.dataset import StabilizedSubject
 from registration.stabilize.decisions import corrections, default_actions
-from tests.stabilize.performed import BROWS, JAW, Performed, Seen
 
 
 def face(data: GNMData) -> np.ndarray:

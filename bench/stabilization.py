@@ -1,7 +1,7 @@
 """Stabilization against known truth: does the skull stand still, and are expressions what they were?
 
-    python bench/stabilize.py [--subjects 20]
-    python bench/stabilize.py --run OUT --model MODEL.npz
+    python -m bench.stabilization [--subjects 20]
+    python -m bench.stabilization --run OUT --model MODEL.npz
 
 Subjects that the first model does not span perform 20 expressions; their heads are turned by up to 5 degrees and moved
 by up to 10 mm, with noise of 0.3 mm (smooth over 15 mm) and 0.1 mm (white) in each coordinate, and a tenth of the
@@ -13,33 +13,29 @@ registrations, as `gnmreg subject` wrote them, and applies 50 motions to their v
 
 import argparse
 import resource
-import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 
-if not __package__:  # run as a file: the tests' measures lie beside `bench`
-    sys.path[0] = str(Path(__file__).resolve().parents[1])
-
-from coregister import anatomy as anatomy_of  # noqa: E402
-from coregister import bootstrap, makehuman, population  # noqa: E402
-from registration.geometry.rigid import align  # noqa: E402
-from registration.model import gnm_npz  # noqa: E402
-from registration.model.gnm_npz import GNMData  # noqa: E402
-from registration.stabilize.automatic import stabilize_subject  # noqa: E402
-from registration.stabilize.components import Head  # noqa: E402
-from registration.stabilize.dataset import (  # noqa: E402
+from bench.support import performances, stabilization_measures
+from coregister import anatomy as anatomy_of
+from coregister import bootstrap, makehuman, population
+from registration.geometry.rigid import align
+from registration.model import gnm_npz
+from registration.model.gnm_npz import GNMData
+from registration.stabilize.automatic import stabilize_subject
+from registration.stabilize.components import Head
+from registration.stabilize.dataset import (
     Stabilization,
     StabilizedSubject,
     automatic_stage,
     corrected,
     regional_stage,
 )
-from registration.stabilize.meshes import SkullSkin, SubjectMeshes  # noqa: E402
-from tests.stabilize import measures, performed  # noqa: E402
-from workflows.stabilize_folder import read_run  # noqa: E402
+from registration.stabilize.meshes import SkullSkin, SubjectMeshes
+from workflows.stabilize_folder import read_run
 
 DRAWS = 5
 MOTIONS = 50
@@ -49,29 +45,29 @@ def population_bench(subjects: int) -> None:
     """The figures that count, last."""
     data = gnm_npz.read(bootstrap.bootstrap())
     anatomy = anatomy_of.make(makehuman.read(makehuman.fetch()), population.mean_person())
-    truths = [performed.perform(anatomy, 1000 + number) for number in range(subjects)]
-    injected = [measures.injected(truths, data, seed) for seed in range(DRAWS)]
+    truths = [performances.perform(anatomy, 1000 + number) for number in range(subjects)]
+    injected = [stabilization_measures.injected(truths, data, seed) for seed in range(DRAWS)]
     print(f"spurious_energy_reduced {min(found.reduced for found in injected):.3f}")
     print(f"spurious_expression_lost {max(found.lost for found in injected):.4f}")
     skin, head, settings = SkullSkin.of(data), Head.of(data), Stabilization()
     steady: list[StabilizedSubject] = []
     figures, plain, necks, seconds = [], [], [], 0.0
     for number, truth in enumerate(truths):
-        seen = performed.seen(truth, number)
-        meshes = performed.meshes(truth, seen)
+        seen = performances.seen(truth, number)
+        meshes = performances.meshes(truth, seen)
         begun = time.perf_counter()
         steady.append(automatic_stage(meshes, head, skin, settings))
         seconds += time.perf_counter() - begun
-        figures.append(measures.left(steady[-1].T_neutral_expression, seen, truth, data))
-        turned = stabilize_subject(performed.meshes(truth, performed.body_stays(seen, data)), skin)
-        necks.append(measures.left(turned.T_neutral_expression, seen, truth, data)[1])
+        figures.append(stabilization_measures.left(steady[-1].T_neutral_expression, seen, truth, data))
+        turned = stabilize_subject(performances.meshes(truth, performances.body_stays(seen, data)), skin)
+        necks.append(stabilization_measures.left(turned.T_neutral_expression, seen, truth, data)[1])
         procrustes = align(seen.vertices, seen.neutral, np.ones(seen.confidence.shape))
-        plain.append(measures.left(procrustes, seen, truth, data)[1])
+        plain.append(stabilization_measures.left(procrustes, seen, truth, data)[1])
     samples = sum(len(subject.names) for subject in steady)
     print(f"automatic_seconds {seconds:.1f}  # {samples} samples of {len(head.points):,} vertices")
     begun = time.perf_counter()
     _, correction = regional_stage(lambda: iter(steady), head, settings)
-    final = [corrected(subject, correction, performed.COUNT * k) for k, subject in enumerate(steady)]
+    final = [corrected(subject, correction, performances.COUNT * k) for k, subject in enumerate(steady)]
     print(f"regional_seconds {time.perf_counter() - begun:.1f}")
     print(f"peak_gb {resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20:.2f}")
     deg, mm = np.concatenate(figures, 1)
@@ -81,7 +77,7 @@ def population_bench(subjects: int) -> None:
     print(f"median_mm {np.median(mm):.3f}")
     print(f"p95_mm {np.percentile(mm, 95):.3f}")
     print(f"procrustes_mm {np.median(np.concatenate(plain)):.3f}")
-    print(f"energy_lost {max(measures.lost_by_label(final, truths, head).values()):.4f}")
+    print(f"energy_lost {max(stabilization_measures.lost_by_label(final, truths, head).values()):.4f}")
 
 
 def moved_run(run: Path, data: GNMData) -> None:
@@ -89,17 +85,17 @@ def moved_run(run: Path, data: GNMData) -> None:
     skin, rng = SkullSkin.of(data), np.random.default_rng(0)
     found = []
     for meshes in read_run(run, data).meshes():
-        face = meshes.neutral[measures.face(data)].astype(np.float64)
+        face = meshes.neutral[stabilization_measures.face(data)].astype(np.float64)
         for motions in _rounds(meshes, rng):
-            result = stabilize_subject(performed.moved(meshes, motions), skin)
-            found.append(measures.residual(result.T_neutral_expression @ motions, face))
+            result = stabilize_subject(performances.moved(meshes, motions), skin)
+            found.append(stabilization_measures.residual(result.T_neutral_expression @ motions, face))
     deg, mm = np.concatenate(found, 1)[:, :MOTIONS]
     print(f"run_median_deg {np.median(deg):.3f}\nrun_median_mm {np.median(mm):.3f}\nrun_worst_mm {mm.max():.3f}")
 
 
 def _rounds(meshes: SubjectMeshes, rng: np.random.Generator) -> Iterator[np.ndarray]:
     for _ in range(-(-MOTIONS // len(meshes.names))):
-        yield np.stack([performed.motion(rng, 5.0, 10.0, meshes.neutral.mean(0)) for _ in meshes.names])
+        yield np.stack([performances.motion(rng, 5.0, 10.0, meshes.neutral.mean(0)) for _ in meshes.names])
 
 
 def main() -> None:

@@ -1,4 +1,4 @@
-"""A worker or coordinator for bench/queue.py, whose jobs do nothing."""
+"""A worker or coordinator for bench/farm_queue.py, whose jobs do nothing."""
 
 import sys
 from pathlib import Path
@@ -20,7 +20,7 @@ if __name__ == "__main__":
             queues=(GPU,) if kind == "worker" else (DRIVER, SUBJECTS),
             logs=Path(folder) / "logs",
             names=(name,),
-            steps={"nothing": Step(function="bench.queue_process:nothing")} if kind == "worker" else {},
+            steps={"nothing": Step(function="bench.support.farm_queue_process:nothing")} if kind == "worker" else {},
             flows=FLOWS if kind == "coordinator" else {},
         )
     )

@@ -1,10 +1,10 @@
 """Self-intersection: what the penalty costs, how right it is, what comes apart again, what a model does by itself.
 
-    python -m bench.anatomy --model MODEL.npz [--samples FILE.npz]
+    python -m bench.self_intersection --model MODEL.npz [--samples FILE.npz]
 
 `--samples` has faces to look at beside random ones: arrays `identity_deltas` and `expression_deltas` (N, V, 3), metres,
 with `identity_names` and `expression_names`. Depths in crossed parts are measured apart from the penalty, by winding
-numbers and closest points (`tests/losses/crossing.py`), and told as an excess over the template's own.
+numbers and closest points (`bench/support/crossed_parts.py`), and told as an excess over the template's own.
 """
 
 import argparse
@@ -19,10 +19,10 @@ from rich.console import Console
 from rich.table import Table
 from torch import Tensor
 
+from bench.support import crossed_parts
 from registration.losses.anatomy import SelfIntersection
 from registration.model import gnm_npz, regions
 from registration.model.gnm_npz import GNMData
-from tests.losses import crossing
 
 REPEATS = 15
 PUSHES_MM = (1.0, 2.0, 3.0, 4.0, 5.0)
@@ -39,7 +39,7 @@ def cost(data: GNMData) -> Table:
     penalty = SelfIntersection(data, torch.device("cpu"))
     built = 1e3 * (time.perf_counter() - begun)
     template = torch.as_tensor(data.template_vertex_positions)
-    for name, vertices in {"template": template, "crossed lips": crossing.raised_lower_lip(data, 2.0)}.items():
+    for name, vertices in {"template": template, "crossed lips": crossed_parts.raised_lower_lip(data, 2.0)}.items():
         vertices = vertices.clone().requires_grad_(True)
 
         def backward(vertices: Tensor = vertices) -> None:
@@ -63,14 +63,14 @@ def median_ms(work: Callable[[], object]) -> float:
 def pushed_tongue(data: GNMData, penalty: SelfIntersection) -> Table:
     """The tongue's vertices pushed into the teeth."""
     table = Table("tongue pushed", "by, mm", "vertices inside", "deepest, mm", "largest error, mm")
-    tongue, teeth = regions.tongue(data), crossing.teeth_of(data)
+    tongue, teeth = regions.tongue(data), crossed_parts.teeth_of(data)
     for name, direction in DIRECTIONS.items():
         for push in PUSHES_MM:
-            vertices = crossing.moved(data, tongue, tuple(push * axis for axis in direction))
+            vertices = crossed_parts.moved(data, tongue, tuple(push * axis for axis in direction))
             penalty.refresh(vertices)
             found = penalty.excess_mm(vertices)["tongue-teeth"].numpy()[tongue]
             points = vertices.numpy().astype(np.float64)
-            truth = crossing.tooth_depths_mm(points[tongue], points, teeth)
+            truth = crossed_parts.tooth_depths_mm(points[tongue], points, teeth)
             error = np.abs(found - np.maximum(truth - MARGIN_MM, 0)).max()
             table.add_row(name, f"{push:g}", f"{(truth > 0).sum()}", f"{truth.max():.2f}", f"{error:.3f}")
     return table
@@ -81,16 +81,16 @@ def recovered(data: GNMData) -> Table:
     table = Table("crossed", "by, mm", "too deep, mm", "after", "cheeks moved, mm", "skin moved, mm", "seconds")
     template = torch.as_tensor(data.template_vertex_positions)
     for name, cross, measure, rate in (  # the rate is per mm of what is to be undone
-        ("lips", crossing.raised_lower_lip, crossing.lip_depths_mm, 1e-4),
-        ("upper lid", crossing.pressed_lid, crossing.eyeball_depths_mm, 4e-5),
+        ("lips", crossed_parts.raised_lower_lip, crossed_parts.lip_depths_mm, 1e-4),
+        ("upper lid", crossed_parts.pressed_lid, crossed_parts.eyeball_depths_mm, 4e-5),
     ):
         rest = measure(data, template)
         for by_mm in (1.0, 2.0, 3.0):
             begun = time.perf_counter()
-            found = crossing.recover(data, cross(data, by_mm), steps=100, rate=rate * by_mm)
+            found = crossed_parts.recover(data, cross(data, by_mm), steps=100, rate=rate * by_mm)
             seconds = time.perf_counter() - begun
             before, after = ((measure(data, head) - rest).max() for head in (found.before, found.after))
-            motion = (found.moved_mm(crossing.cheeks(data)), found.moved_mm(regions.exterior(data)))
+            motion = (found.moved_mm(crossed_parts.cheeks(data)), found.moved_mm(regions.exterior(data)))
             numbers = (before, after, *motion, seconds)
             table.add_row(name, f"{by_mm:g}", *(f"{number:.2f}" for number in numbers))
     return table

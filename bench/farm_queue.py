@@ -1,6 +1,6 @@
 """The queue with 20,000 captures that need no work: what filling, asking, coordinating and storing it costs.
 
-    python -m bench.queue [--captures 20000] [--db URL] [--seconds 60]
+    python -m bench.farm_queue [--captures 20000] [--db URL] [--seconds 60] [--settle 15]
 
 Workers run for some seconds only: with one job at a time they are bound by their asking the queue, four times a second.
 """
@@ -16,15 +16,12 @@ from typing import Any
 
 import sqlalchemy as sa
 
-# As a file, this folder comes first on the path, and `import queue` anywhere would find this file.
-sys.path[:] = [str(Path(__file__).resolve().parents[1]), *(p for p in sys.path if Path(p).name != "bench")]
-
-from tests.workflows.farm.postgres import server  # noqa: E402
-from workflows.engine.control import Queue  # noqa: E402
-from workflows.engine.database import checked_url, default_url, engine, is_sqlite, sqlite_file  # noqa: E402
-from workflows.engine.durable import migrate  # noqa: E402
-from workflows.engine.reads import Reader, ended  # noqa: E402
-from workflows.jobs import DRIVER, FlowJob, Job  # noqa: E402
+from bench.support.postgres_server import server
+from workflows.engine.control import Queue
+from workflows.engine.database import checked_url, default_url, engine, is_sqlite, sqlite_file
+from workflows.engine.durable import migrate
+from workflows.engine.reads import Reader, ended
+from workflows.jobs import DRIVER, FlowJob, Job
 
 MB = 2**20
 
@@ -34,17 +31,19 @@ def main() -> None:
     parser.add_argument("--captures", type=int, default=20_000)
     parser.add_argument("--db", default="sqlite", help="sqlite, postgres (a server is started), or a URL")
     parser.add_argument("--seconds", type=float, default=60.0, help="how long two workers run")
-    told = parser.parse_args()
+    parser.add_argument("--settle", type=float, default=15.0, help="seconds before the coordinator's memory is read")
+    options = parser.parse_args()
     with tempfile.TemporaryDirectory(prefix="gnmreg-queue-") as name:
-        if told.db == "postgres":
+        if options.db == "postgres":
             with server() as made:
-                _measure(made.url, Path(name), told.captures, told.seconds)
+                _measure(made.url, Path(name), options)
         else:
-            url = default_url(Path(name)) if told.db == "sqlite" else told.db
-            _measure(url, Path(name), told.captures, told.seconds)
+            url = default_url(Path(name)) if options.db == "sqlite" else options.db
+            _measure(url, Path(name), options)
 
 
-def _measure(url: str, folder: Path, captures: int, seconds: float) -> None:
+def _measure(url: str, folder: Path, options: argparse.Namespace) -> None:
+    captures: int = options.captures
     migrate(url)
     empty = _size_mb(url)
     queue, reader = Queue(url), Reader(url)
@@ -59,14 +58,14 @@ def _measure(url: str, folder: Path, captures: int, seconds: float) -> None:
     _row("database", f"{(full - empty) * 10_000 / captures:.1f} MB per 10,000 jobs that wait")
     _row("status, all waiting", f"{_asked(reader):.3f} s; as a command {_command(url, folder):.2f} s")
     processes = {kind: _started(kind, url, folder, kind) for kind in ("coordinator",)}
-    time.sleep(15.0)
+    time.sleep(options.settle)
     _row("coordinator", f"{_rss_mb(processes['coordinator'].pid):.0f} MB while {captures:,} jobs wait")
     for number in (0, 1):
         processes[f"worker{number}"] = _started("worker", url, folder, f"worker{number}")
     while not ended(reader.counts("bench")):
         time.sleep(0.2)
     first, begun = ended(reader.counts("bench")), time.perf_counter()
-    time.sleep(seconds)
+    time.sleep(options.seconds)
     done = ended(reader.counts("bench"))
     took = time.perf_counter() - begun
     _row("complete, 2 workers", f"{(done - first) / took:.1f} jobs/s, {(done - first) / took * 86_400:,.0f} a day")
@@ -81,7 +80,7 @@ def _measure(url: str, folder: Path, captures: int, seconds: float) -> None:
 
 
 def _started(kind: str, url: str, folder: Path, name: str) -> "subprocess.Popen[bytes]":
-    command = [sys.executable, "-m", "bench.queue_process", kind, url, str(folder), name]
+    command = [sys.executable, "-m", "bench.support.farm_queue_process", kind, url, str(folder), name]
     return subprocess.Popen(command, cwd=Path(__file__).parents[1], stdout=subprocess.DEVNULL)
 
 

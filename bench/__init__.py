@@ -1,0 +1,1 @@
+"""Benchmarks, one module each: `python -m bench.NAME --help`. Their synthetic problems are in `bench.support`."""

@@ -1,0 +1,64 @@
+"""Every benchmark starts as `python -m bench.NAME`, and the quickest run a tiny case to the end."""
+
+import ast
+import os
+import subprocess
+import sys
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import pytest
+
+from tests.conftest import SHARED, needs_shared
+
+ROOT = Path(__file__).resolve().parents[2]
+NAMES = sorted(file.stem for file in (ROOT / "bench").glob("*.py") if file.stem != "__init__")
+GNM = SHARED / "data" / "gnm"
+
+
+def run(name: str, *arguments: str) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-m", f"bench.{name}", *arguments]
+    return subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=300)
+
+
+def test_every_benchmark_starts():
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
+        runs = dict(zip(NAMES, pool.map(lambda name: run(name, "--help"), NAMES), strict=True))
+    assert len(runs) >= 14
+    assert {name: done.stderr[-500:] for name, done in runs.items() if done.returncode} == {}
+    assert [name for name, done in runs.items() if f"python -m bench.{name}" not in done.stdout] == []
+
+
+def test_no_module_has_the_name_of_a_standard_library_module_and_no_benchmark_imports_tests():
+    files = [file for folder in ("bench", "tests") for file in (ROOT / folder).rglob("*.py")]
+    assert [str(file) for file in files if file.stem in sys.stdlib_module_names] == []
+    imported = {
+        node.module or ""
+        for file in (ROOT / "bench").rglob("*.py")
+        for node in ast.walk(ast.parse(file.read_text("utf-8")))
+        if isinstance(node, ast.ImportFrom)
+    }
+    assert {module for module in imported if module.split(".")[0] == "tests"} == set()
+
+
+@pytest.mark.parametrize(
+    ("name", "arguments", "figure"),
+    [
+        ("farm_queue", ("--captures", "5", "--seconds", "1", "--settle", "0"), "complete, 2 workers"),
+        ("model_building", ("--samples", "60", "--components", "5"), "peak_gb"),
+        ("renderer", ("--case", "2x48", "--stock"), "stock 2x256"),
+    ],
+)
+def test_a_tiny_case_runs_to_its_figures(name, arguments, figure):
+    done = run(name, *arguments)
+    assert done.returncode == 0, done.stderr[-2000:]
+    assert figure in done.stdout
+
+
+@needs_shared
+def test_without_identity_writes_a_model(tmp_path):
+    out = tmp_path / "model.npz"
+    files = (GNM / "gnm_head_reconstructed.npz", GNM / "gnm_real_samples.npz", out)
+    done = run("without_identity", *map(str, files))
+    assert done.returncode == 0, done.stderr[-2000:]
+    assert out.is_file()
