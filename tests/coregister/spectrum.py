@@ -2,7 +2,6 @@
 head's skin, with standard deviations chosen here. Made from the small fixture's mesh and groups."""
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float
@@ -10,8 +9,9 @@ from jaxtyping import Float
 from registration.geometry.rigid import motion_fields
 from registration.model import gnm_npz, regions
 from registration.model.gnm_npz import GNMData
+from tests.conftest import FIXTURES
 
-TINY = Path(__file__).resolve().parents[1] / "fixtures" / "tiny_gnm.npz"
+TINY = FIXTURES / "tiny_gnm.npz"
 DEVIATIONS_MM = 0.5 * 0.7 ** np.arange(12)  # rms over the head's skin
 
 

@@ -24,8 +24,8 @@ from registration.model.gnm_numpy import evaluate
 from registration.model.landmarks import read_scheme
 from registration.model.regions import exterior, group, vertex_classes
 from registration.render.studio.shoot import Quality, Sensor
+from tests.conftest import FIXTURES
 
-FIXTURES = Path(__file__).resolve().parents[1] / "fixtures"
 TINY = gnm_npz.read(FIXTURES / "tiny_gnm.npz")
 SCHEMES = {"68": read_scheme(FIXTURES / "head_sparse_68.txt", len(TINY.template_vertex_positions))}
 SMALL = Studio(

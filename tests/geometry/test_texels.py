@@ -1,7 +1,5 @@
 """Texels of an atlas: where their centres lie, which chart they are of, and the points of the surface they name."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 import torch
@@ -9,8 +7,9 @@ import torch
 from registration.geometry.texels import SurfacePoints, charts, eroded, single_chart, texels
 from registration.model import gnm_npz
 from registration.model.atlas import texture_atlas
+from tests.conftest import FIXTURES
 
-TINY = gnm_npz.read(Path(__file__).resolve().parents[1] / "fixtures" / "tiny_gnm.npz")
+TINY = gnm_npz.read(FIXTURES / "tiny_gnm.npz")
 SQUARE = np.array([[0, 1, 2], [0, 2, 3]])
 SQUARE_UVS = np.array([[[0, 0], [1, 0], [1, 1]], [[0, 0], [1, 1], [0, 1]]], np.float32)
 

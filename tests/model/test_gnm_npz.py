@@ -8,10 +8,10 @@ import pytest
 
 from registration.errors import InputError
 from registration.model import gnm_npz
-from tests.conftest import SHARED, needs_shared
+from tests.conftest import FIXTURES, SHARED, needs_shared
 from tests.fixtures.make_fixtures import tiny_model
 
-TINY = Path(__file__).parents[1] / "fixtures" / "tiny_gnm.npz"
+TINY = FIXTURES / "tiny_gnm.npz"
 
 
 @pytest.fixture

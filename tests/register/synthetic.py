@@ -26,8 +26,8 @@ from registration.model.regions import CLASSES, group, neck_other, vertex_classe
 from registration.render import backend
 from registration.render.renderer import Renderer
 from registration.types import Camera, Parameters, Pixels
+from tests.conftest import FIXTURES
 
-FIXTURES = Path(__file__).parents[1] / "fixtures"
 MODEL = FIXTURES / "tiny_gnm.npz"
 LABELS = ("background", *CLASSES, "neck_other")
 WORLD = Rotation.from_rotvec([0.5, -0.8, 0.3])  # the capture's world is no upright one

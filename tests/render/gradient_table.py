@@ -19,6 +19,7 @@ from registration.model.atlas import texture_atlas
 from registration.model.regions import crossing_parts, vertex_classes
 from registration.render.renderer import Renderer
 from registration.types import Camera, Pixels, Rendered
+from tests.conftest import FIXTURES, SHARED
 
 SIZE_PX = 160
 PIXEL_SAMPLES = 64  # of the differences
@@ -32,8 +33,8 @@ CHANNELS: dict[str, Callable[[Rendered], torch.Tensor]] = {
     "class": lambda image: image.classes,
     "mask": lambda image: image.mask,
 }
-TINY = Path(__file__).resolve().parents[1] / "fixtures" / "tiny_gnm.npz"
-REAL = Path(__file__).resolve().parents[3] / "shared" / "data" / "gnm" / "gnm_head_reconstructed.npz"
+TINY = FIXTURES / "tiny_gnm.npz"
+REAL = SHARED / "data" / "gnm" / "gnm_head_reconstructed.npz"
 
 
 @dataclass(frozen=True, kw_only=True)

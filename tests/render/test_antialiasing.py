@@ -1,7 +1,5 @@
 """What several rays per pixel are worth: a mask that does not flicker when the mesh moves by less than a pixel."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 import torch
@@ -10,8 +8,9 @@ from registration.model import gnm_npz
 from registration.render import backend
 from registration.render.renderer import Renderer
 from registration.types import Camera, Pixels
+from tests.conftest import FIXTURES
 
-TINY = gnm_npz.read(Path(__file__).resolve().parents[1] / "fixtures" / "tiny_gnm.npz")
+TINY = gnm_npz.read(FIXTURES / "tiny_gnm.npz")
 SAMPLES = 4
 SHARE_OF_HEIGHT = 0.7  # of the image, that the mesh fills
 RADIUS = 0.08  # metres, of the disc

@@ -23,8 +23,9 @@ from registration.render import backend
 from registration.render.renderer import Renderer
 from registration.render.shading import Footprint
 from registration.types import Camera, Pixels, Rendered
+from tests.conftest import FIXTURES
 
-TINY = gnm_npz.read(Path(__file__).resolve().parents[1] / "fixtures" / "tiny_gnm.npz")
+TINY = gnm_npz.read(FIXTURES / "tiny_gnm.npz")
 SQUARE = np.array([[0.0, 0, 0], [0.1, 0, 0], [0.1, 0.1, 0], [0, 0.1, 0]], np.float32)
 SQUARE_TRIANGLES = np.array([[0, 1, 2], [0, 2, 3]])
 SQUARE_UVS = np.array([[[0, 0], [1, 0], [1, 1]], [[0, 0], [1, 1], [0, 1]]], np.float32)

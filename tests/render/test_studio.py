@@ -3,7 +3,6 @@
 import subprocess
 import sys
 from dataclasses import replace
-from pathlib import Path
 
 import cv2
 import numpy as np
@@ -27,8 +26,9 @@ from registration.render.studio.scene import StudioScene, StudioSurface, subdivi
 from registration.render.studio.shoot import HIDDEN, Quality, Sensor, distorted_pixels, shoot
 from registration.render.studio.skin import Look, paint, scalp
 from registration.types import Camera
+from tests.conftest import FIXTURES
 
-TINY = gnm_npz.read(Path(__file__).resolve().parents[1] / "fixtures" / "tiny_gnm.npz")
+TINY = gnm_npz.read(FIXTURES / "tiny_gnm.npz")
 HEAD_CENTRE = np.array([0.0, 0.27, 0.03])
 WHITE = np.ones((4, 4, 3), np.float32)
 

@@ -11,7 +11,7 @@ from tests.capture.small import make
 from workflows.cli import main
 from workflows.subject_folder import Row, Subject
 
-TINY_MODEL = Path(__file__).parents[1] / "fixtures" / "tiny_gnm.npz"
+TINY_MODEL = FIXTURES / "tiny_gnm.npz"
 HEAVY = {"torch", "mitsuba", "drjit", "numpy", "scipy", "cv2", "pycolmap", "kornia", "trimesh", "matplotlib", "viser"}
 
 
@@ -46,6 +46,7 @@ def test_every_command_explains_itself(command: str, capsys: pytest.CaptureFixtu
 def test_help_imports_nothing_heavy() -> None:
     code = """
 import sys
+from tests.conftest import FIXTURES
 from workflows.cli import main
 try:
     main(["register", "--help"])

@@ -11,11 +11,11 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+from tests.conftest import ROOT
 from workflows.engine.control import Queue
 from workflows.engine.durable import migrate
 from workflows.engine.reads import Reader
 
-ROOT = Path(__file__).parents[3]
 QUICK = {"look_s": 0.3, "free_s": 1.0, "up_s": 0.0}
 
 

@@ -21,11 +21,12 @@ import pytest
 
 from registration.errors import InputError
 from tests.capture import small
+from tests.conftest import FIXTURES
 from workflows.jobs import MAX_BYTES, STEPS, checked, resolved_roots
 from workflows.slot import Slot
 from workflows.store import MANIFEST, Store
 
-MODEL = Path(__file__).parents[2] / "fixtures" / "tiny_gnm.npz"
+MODEL = FIXTURES / "tiny_gnm.npz"
 
 
 class Trap:
