@@ -17,13 +17,13 @@ from typing import Any
 from rich.console import Console
 from rich.table import Table
 
-from registration.artifacts import load_registration
 from registration.capture.native import read
 from registration.evaluate.audit import BEYOND
 from registration.evaluate.evaluation import evaluate
+from registration.fit.recipes import Recipe, Stage, draft
 from registration.progress import shown
 from registration.register import register
-from registration.stages import Recipe, Stage, draft
+from registration.storage.registration_folder import load_registration
 from registration.types import Registration
 
 

@@ -20,7 +20,7 @@ from rich.table import Table
 from torch import Tensor
 
 from bench.support import crossed_parts
-from registration.losses.anatomy import SelfIntersection
+from registration.losses.self_intersection import SelfIntersection
 from registration.model import gnm_npz, regions
 from registration.model.gnm_npz import GNMData
 

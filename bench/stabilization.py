@@ -27,14 +27,14 @@ from registration.model import gnm_npz
 from registration.model.gnm_npz import GNMData
 from registration.stabilize.automatic import stabilize_subject
 from registration.stabilize.components import Head
-from registration.stabilize.dataset import (
+from registration.stabilize.pipeline import (
     Stabilization,
     StabilizedSubject,
     automatic_stage,
     corrected,
     regional_stage,
 )
-from registration.stabilize.meshes import SkullSkin, SubjectMeshes
+from registration.stabilize.subject_meshes import SkullSkin, SubjectMeshes
 from workflows.stabilize_folder import read_run
 
 DRAWS = 5

@@ -1,4 +1,4 @@
-"""How well the term against sliding (`losses/texture.py`) puts vertices back, what disturbs it, and what it costs.
+"""How well the term against sliding (`losses/uv_ssim.py`) puts vertices back, what disturbs it, and what it costs.
 
     python -m bench.uv_ssim [--model NPZ] [--head-px 256] [--photo] [--captures NEUTRAL EXPRESSION]
 

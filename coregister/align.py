@@ -13,7 +13,7 @@ from registration.geometry.large_steps import normalised_laplacian
 from registration.geometry.rigid import align
 from registration.model import regions
 from registration.model.gnm_npz import GNMData
-from registration.stabilize.meshes import SkullSkin
+from registration.stabilize.subject_meshes import SkullSkin
 
 _NONE = 1e-300  # a weight that nothing has
 LEAST_TO_COMPARE = 5  # heads; among fewer nobody can tell which one is spoiled

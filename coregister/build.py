@@ -27,7 +27,7 @@ from coregister.unseen import Completion, Unseen
 from registration.frames import transform_points
 from registration.geometry.rigid import align
 from registration.model.gnm_npz import GNMData
-from registration.stabilize.meshes import SkullSkin
+from registration.stabilize.subject_meshes import SkullSkin
 
 
 @dataclass(frozen=True, kw_only=True)

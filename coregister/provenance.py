@@ -15,11 +15,11 @@ from coregister.align import Aligned, Rejected
 from coregister.expression import Coefficients, Region
 from coregister.identity import HeadIdentity
 from coregister.samples import Survey
-from registration import hashes
 from registration.frames import MM_PER_M
 from registration.model import gnm_npz, landmarks
 from registration.model.gnm_npz import GNMData
-from registration.stabilize.meshes import SkullSkin
+from registration.stabilize.subject_meshes import SkullSkin
+from registration.storage import hashing
 
 KIND = "gnm-model"
 SCHEMA = 1
@@ -46,7 +46,7 @@ def manifest(
     """JSON values; its entries are described in docs/formats.md."""
     found, head, aligned = origin.found, origin.head, origin.aligned
     inputs = {**found.digests, "previous": gnm_npz.content_hash(previous)}
-    settings = hashes.plain(config)
+    settings = hashing.plain(config)
     used = np.flatnonzero(origin.expression_weights > 0).tolist()
     labels = [origin.expression_labels[k] for k in used]
     counted = Counter(origin.expression_subjects[k] for k in used)
@@ -66,10 +66,10 @@ def manifest(
         "kind": KIND,
         "schema": SCHEMA,
         "content_id": gnm_npz.content_hash(data),
-        "input_hash": hashes.input_hash(inputs, settings),
+        "input_hash": hashing.input_hash(inputs, settings),
         "inputs": inputs,
         "config": settings,
-        "versions": hashes.versions(),
+        "versions": hashing.versions(),
         "subjects": subjects,
         "rejected": [vars(one) for one in origin.rejected],
         "filled": origin.filled,
@@ -87,7 +87,7 @@ def manifest(
         "demographics": _demographics([found.tags[k] for k in aligned.kept]),
         "figures": _figures(head, previous, data),
     }
-    plain: dict[str, Any] = hashes.plain(told)
+    plain: dict[str, Any] = hashing.plain(told)
     return plain
 
 

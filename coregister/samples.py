@@ -10,9 +10,9 @@ from jaxtyping import Float, Int
 
 from registration.errors import InputError
 from registration.geometry.rigid import align
-from registration.hashes import content_of
 from registration.model.gnm import GNM
 from registration.model.gnm_npz import GNMData, topology_hash
+from registration.storage.hashing import content_of
 from registration.types import Parameters, Registration
 
 NEUTRAL = "neutral"  # the label of neutrals

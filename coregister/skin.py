@@ -11,7 +11,7 @@ from scipy.spatial import cKDTree
 
 from coregister.makehuman import MakeHuman
 from coregister.parts import Part
-from registration.geometry.flat_map import flat_map
+from registration.geometry.parameterization import flat_map
 from registration.geometry.quads import Subdivision, beyond_loop, boundary_loops, edge_loop, edges_of, pieces, subdivide
 
 # Vertices of MakeHuman's base mesh: an edge of the loop around the neck's foot, and one vertex of the scalp.

@@ -13,7 +13,7 @@ import torch
 from jaxtyping import Bool, Float, Int, UInt8
 
 from coregister import anatomy, eyes, makehuman, population
-from registration.geometry.raster import rasterize
+from registration.geometry.rasterizer import rasterize
 from registration.geometry.topology import vertex_normals
 from registration.model import gnm_npz
 from registration.model.gnm_npz import GNMData

@@ -8,14 +8,14 @@ import numpy as np
 import torch
 from jaxtyping import Float
 
-from registration.artifacts import load_registration
 from registration.capture import native
 from registration.capture.scan import read_scan
 from registration.evaluate.distances import Surface, distances_mm
 from registration.frames import linear_to_srgb
-from registration.geometry.raster import rasterize
+from registration.geometry.rasterizer import rasterize
 from registration.geometry.topology import vertex_normals
 from registration.report.pictures import PAPER, scale_colours
+from registration.storage.registration_folder import load_registration
 from registration.types import Registration, View
 
 HEIGHT_PX = 430  # of a panel; each is drawn twice as large

@@ -19,7 +19,7 @@ from coregister import bootstrap, makehuman, population
 from registration.geometry.rigid import motion_fields
 from registration.model import gnm_npz
 from registration.stabilize.components import Head, regional_components
-from registration.stabilize.folder import StoredComponents
+from registration.stabilize.stabilized_folder import StoredComponents
 from tests.workflows.test_review import CHROMIUM, FLAGS
 from workflows.stabilize_run import along
 from workflows.web.decide import Review

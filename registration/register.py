@@ -10,15 +10,17 @@ import numpy as np
 import torch
 from jaxtyping import Float
 
-from registration import hashes
-from registration.artifacts import check_out, find_same, load_registration, save_registration
 from registration.capture.doctor import validate
-from registration.capture.landmarks3d import triangulate
 from registration.capture.native import read
+from registration.capture.triangulation import triangulate
 from registration.errors import InputError
 from registration.evaluate.audit import audit
 from registration.evaluate.evaluation import Evaluation, evaluate
-from registration.fit import Fit, Outcome
+from registration.fit.initialization import LEAST_LANDMARKS, LEAST_OVERLAP, from_landmarks, from_masks, spread_views
+from registration.fit.problem import Fit, Outcome
+from registration.fit.recipes import Recipe, Stage, expression_of, recipe_named
+from registration.fit.variables import Start, pivot, start_of
+from registration.fit.view_weights import ViewErrors
 from registration.geometry.topology import edges
 from registration.model import gnm_npz
 from registration.model.atlas import texture_atlas
@@ -29,14 +31,12 @@ from registration.progress import Progress, Silent
 from registration.render import backend
 from registration.report.inputs import ReportInputs, heat_map, report_views
 from registration.report.page import write_report
-from registration.report.stages import write_stage
-from registration.stages import Recipe, Stage, expression_of, recipe_named
-from registration.start import LEAST_LANDMARKS, LEAST_OVERLAP, from_landmarks, from_masks, spread_views
+from registration.report.stage_snapshots import write_stage
+from registration.storage import hashing
+from registration.storage.registration_folder import check_out, find_same, load_registration, save_registration
 from registration.targets.classes import BACKGROUND, class_map
 from registration.targets.pyramid import build_pyramid
-from registration.trust import ViewErrors
 from registration.types import Capture, Parameters, Registration, Status
-from registration.unknowns import Start, pivot, start_of
 
 SETTLED_MM = 0.05  # 95th percentile of vertex motion over the last tenth of the last stage
 LANDMARK_PX = 3.0  # median residual at 512 px of head height
@@ -110,7 +110,7 @@ def register(
         {name: Path(file) for name, file in (landmark_files or {}).items()},
         {"seed": seed, "deterministic": deterministic, "variant": variant},
     )
-    digest = hashes.input_hash(inputs.digests, inputs.config)
+    digest = hashing.input_hash(inputs.digests, inputs.config)
     if not force and (same := find_same(out, digest)) is not None:
         progress.note(f"{out} already holds the registration of these inputs")
         return same
@@ -150,11 +150,11 @@ def _read_inputs(
     schemes |= {name: read_scheme(file, count, name) for name, file in landmark_files.items()}
     landmarks = _landmarks(capture, schemes)
     _check_start(capture, landmarks)
-    digests = {"capture": hashes.hash_capture(capture), "model": gnm_npz.content_hash(data)}
-    digests |= {f"landmarks {name}": hashes.content_of(s.indices, s.weights) for name, s in schemes.items()}
+    digests = {"capture": hashing.hash_capture(capture), "model": gnm_npz.content_hash(data)}
+    digests |= {f"landmarks {name}": hashing.content_of(s.indices, s.weights) for name, s in schemes.items()}
     if neutral is not None:
-        digests["neutral"] = hashes.content_of(neutral.identity, neutral.offsets, neutral.vertices, neutral.texture)
-    config = {"recipe": hashes.plain(recipe), "views": [view.name for view in capture.views], **settings}
+        digests["neutral"] = hashing.content_of(neutral.identity, neutral.offsets, neutral.vertices, neutral.texture)
+    config = {"recipe": hashing.plain(recipe), "views": [view.name for view in capture.views], **settings}
     return Inputs(
         capture=capture,
         data=data,
@@ -396,7 +396,7 @@ def _judge(inputs: Inputs, fit: Fit, registration: Registration, progress: Progr
             views=report_views(batch, rendered),
             class_names=batch.class_names,
             heat_map=None if evaluation is None else heat_map(registration, evaluation.vertex_distance_mm),
-            versions=hashes.versions(),
+            versions=hashing.versions(),
         )
     )
     return registration, page

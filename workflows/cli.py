@@ -301,7 +301,7 @@ def spoil_capture(
         breaks: Break a view, which is not dropped then: shifted (by 30 px), black, or exposure (2.5 times the light).
     """
     broken = _broken_views(breaks)
-    from registration.capture.spoil import PRESETS, spoil
+    from registration.capture.degrade import PRESETS, spoil
 
     print(spoil(source, target, preset=PRESETS[preset], seed=seed, breaks=broken))
     return 0

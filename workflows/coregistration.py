@@ -13,11 +13,11 @@ from typing import Any
 
 from coregister.decide import Rule
 from coregister.generalization import identity_part
-from registration.artifacts import refuse_foreign, swap_in
 from registration.errors import InputError
-from registration.hashes import plain, versions
+from registration.fit.recipes import recipe_named
 from registration.model import gnm_npz
-from registration.stages import recipe_named
+from registration.storage.hashing import plain, versions
+from registration.storage.registration_folder import refuse_foreign, swap_in
 from workflows import steps
 from workflows.coregistration_page import write_coregistration_page
 from workflows.dataset import Split, read_dataset, split

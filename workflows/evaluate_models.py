@@ -8,12 +8,12 @@ from typing import Any
 import numpy as np
 
 from coregister.evaluate import Evaluation, Settings, check, evaluate
-from registration.artifacts import fresh_folder, manifest_of_kind, refuse_foreign
 from registration.errors import InputError
-from registration.hashes import input_hash, plain, versions
 from registration.model import gnm_npz
 from registration.model.gnm_npz import GNMData
 from registration.progress import Progress
+from registration.storage.hashing import input_hash, plain, versions
+from registration.storage.registration_folder import fresh_folder, manifest_of_kind, refuse_foreign
 from workflows.evaluate_page import write_evaluate_page
 from workflows.held_out import read_held_out
 

@@ -7,16 +7,16 @@ from pathlib import Path
 from typing import Any
 
 from coregister.decide import Rule
-from registration import hashes
-from registration.artifacts import read_manifest, swap_in
 from registration.capture.native import read
 from registration.errors import InputError
+from registration.fit.recipes import recipe_named
 from registration.model import gnm_npz
 from registration.model.landmarks import schemes_beside
 from registration.progress import Progress
 from registration.register import register
 from registration.render.backend import Variant
-from registration.stages import recipe_named
+from registration.storage import hashing
+from registration.storage.registration_folder import read_manifest, swap_in
 from workflows.coregistration import FIRST, Plan, State, decided, save
 from workflows.dataset import Split, read_dataset
 from workflows.jobs import Unusable
@@ -51,11 +51,11 @@ def register_stored(
     file = model_here(model)
     data = gnm_npz.read(file)
     schemes = schemes_beside(file, len(data.template_vertex_positions))
-    inputs = {f"landmarks {name}": hashes.content_of(one.indices, one.weights) for name, one in schemes.items()}
+    inputs = {f"landmarks {name}": hashing.content_of(one.indices, one.weights) for name, one in schemes.items()}
     inputs["model"] = gnm_npz.content_hash(data)
     with capture_here(capture) as folder:
-        inputs["capture"] = hashes.hash_capture(read(folder))
-        settings = {"recipe": hashes.plain(resolved), "views": views, "seed": seed, "variant": variant}
+        inputs["capture"] = hashing.hash_capture(read(folder))
+        settings = {"recipe": hashing.plain(resolved), "views": views, "seed": seed, "variant": variant}
 
         def make(attempt: Path) -> dict[str, Any]:
             result = register(
@@ -69,9 +69,9 @@ def register_stored(
                 progress=progress,
             )
             scan = result.figures.get("scan_to_mesh", {}).get("face")
-            return hashes.plain({"status": result.status, "reason": result.reason, "scan_to_mesh_face": scan})
+            return hashing.plain({"status": result.status, "reason": result.reason, "scan_to_mesh_face": scan})
 
-        made = Store(store).produce(key, wanted=hashes.input_hash(inputs, settings), make=make)
+        made = Store(store).produce(key, wanted=hashing.input_hash(inputs, settings), make=make)
     if made.about.get("status") == "failed":
         raise Unusable(f"registration failed: {made.about.get('reason')}")
     return {**made.brief(), "attempt": made.attempt}
@@ -124,7 +124,7 @@ def write_plan(plan: Plan, file: Path) -> None:
     captures = {name: [one.root.name for one in found.subjects[name].captures] for name in names}
     told = {**asdict(plan), "captures": captures, "bare": bare}  # of each subject the neutral first
     file.parent.mkdir(parents=True, exist_ok=True)
-    swap_in(file, json.dumps(hashes.plain(told), indent=1, allow_nan=False) + "\n")
+    swap_in(file, json.dumps(hashing.plain(told), indent=1, allow_nan=False) + "\n")
 
 
 def read_plan(file: Path) -> dict[str, Any]:

@@ -10,14 +10,14 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from coregister.evaluate import NEUTRAL, HeldOut
-from registration.artifacts import load_registration
 from registration.capture.native import natural_key, read
 from registration.capture.scan import read_scan
 from registration.errors import InputError
 from registration.evaluate.evaluation import CLOUD_TOLERANCE
 from registration.evaluate.face import face_ball, seen
-from registration.hashes import content_of, hash_capture
-from registration.stabilize import folder as stabilized
+from registration.stabilize import stabilized_folder as stabilized
+from registration.storage.hashing import content_of, hash_capture
+from registration.storage.registration_folder import load_registration
 from registration.types import Registration
 from workflows.stabilize_run import OUT as STABILIZED
 from workflows.subject_folder import MANIFEST, USABLE

@@ -10,7 +10,7 @@ from registration.frames import MM_PER_M
 from registration.model import regions
 from registration.model.gnm_npz import GNMData
 from registration.report.charts import Line, number_curves
-from registration.report.heat import heat_pictures, scale_limit_mm
+from registration.report.heat_map import heat_pictures, scale_limit_mm
 from registration.report.inputs import HeatMap
 from registration.report.pictures import SCALE, data_uri
 from registration.report.style import document, sectioned

@@ -12,13 +12,13 @@ from jaxtyping import Float
 
 from coregister.evaluate import HeldOut
 from coregister.samples import NEUTRAL, Mesh, Subject, onto_unposed, unposed
-from registration.artifacts import load_registration, read_manifest
 from registration.capture.scan import read_truth
 from registration.model.gnm import GNM
 from registration.model.gnm_npz import GNMData
-from registration.stabilize import folder as stabilized
+from registration.stabilize import stabilized_folder as stabilized
 from registration.stabilize.automatic import stabilize_subject
-from registration.stabilize.meshes import SkullSkin, SubjectMeshes, subject_meshes
+from registration.stabilize.subject_meshes import SkullSkin, SubjectMeshes, subject_meshes
+from registration.storage.registration_folder import load_registration, read_manifest
 from workflows.held_out import TAG
 from workflows.subject_folder import Captures, Usable, read_usable
 

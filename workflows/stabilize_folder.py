@@ -10,14 +10,14 @@ from typing import Any
 
 import numpy as np
 
-from registration.artifacts import load_registration, manifest_of_kind, read_manifest, swap_in
 from registration.capture.native import natural_key
 from registration.errors import InputError
 from registration.model import gnm_npz
 from registration.model.fetch import cache_folder, cached_path
 from registration.model.gnm_npz import GNMData
 from registration.stabilize.decisions import ACTIONS, Decision
-from registration.stabilize.meshes import SkullSkin, SubjectMeshes, subject_meshes
+from registration.stabilize.subject_meshes import SkullSkin, SubjectMeshes, subject_meshes
+from registration.storage.registration_folder import load_registration, manifest_of_kind, read_manifest, swap_in
 from workflows.subject_folder import KIND, MANIFEST, USABLE
 
 

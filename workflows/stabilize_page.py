@@ -7,12 +7,12 @@ from typing import Any
 import numpy as np
 
 from registration.report.charts import loss_curves
-from registration.report.heat import UNMEASURED, heat_pictures
+from registration.report.heat_map import UNMEASURED, heat_pictures
 from registration.report.inputs import HeatMap
 from registration.report.pictures import SCALE, data_uri
 from registration.report.style import document
 from registration.stabilize.components import Components, Head
-from registration.stabilize.dataset import StabilizedSubject
+from registration.stabilize.pipeline import StabilizedSubject
 
 LIMIT_MM = 2.0  # at the end of the map's colours
 _PICTURED = 12  # subjects; a page of hundreds would not open

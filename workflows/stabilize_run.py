@@ -8,13 +8,13 @@ from typing import Any
 import numpy as np
 
 from registration.errors import InputError
-from registration.hashes import input_hash, plain, versions
 from registration.model import gnm_npz
 from registration.model.gnm_npz import GNMData
 from registration.progress import Progress, Silent
-from registration.stabilize import folder as disk
+from registration.stabilize import stabilized_folder as disk
 from registration.stabilize.components import LEAST_SAMPLES, Components, Head
-from registration.stabilize.dataset import (
+from registration.stabilize.decisions import Change, Decision, change
+from registration.stabilize.pipeline import (
     Displacements,
     Stabilization,
     StabilizedSubject,
@@ -22,8 +22,8 @@ from registration.stabilize.dataset import (
     corrected,
     regional_stage,
 )
-from registration.stabilize.decisions import Change, Decision, change
-from registration.stabilize.folder import StoredComponents
+from registration.stabilize.stabilized_folder import StoredComponents
+from registration.storage.hashing import input_hash, plain, versions
 from workflows.stabilize_folder import Run, read_decisions, read_run
 from workflows.stabilize_page import write_stabilize_page
 

@@ -17,16 +17,16 @@ from coregister.build import build as build_model
 from coregister.evaluate import Settings
 from coregister.generalization import identity_part
 from coregister.identity import Identity
-from registration import hashes
-from registration.artifacts import fresh_folder, read_manifest, swap_in
 from registration.errors import InputError
+from registration.fit.recipes import recipe_named
 from registration.model import gnm_npz
 from registration.model.landmarks import schemes_beside
 from registration.progress import Progress, Silent
-from registration.stabilize import folder as stabilized
+from registration.stabilize import stabilized_folder as stabilized
 from registration.stabilize.components import LEAST_SAMPLES
-from registration.stabilize.meshes import SkullSkin
-from registration.stages import recipe_named
+from registration.stabilize.subject_meshes import SkullSkin
+from registration.storage import hashing
+from registration.storage.registration_folder import fresh_folder, read_manifest, swap_in
 from workflows import subject
 from workflows.dataset import Dataset, read_dataset
 from workflows.evaluate_models import evaluate_models
@@ -64,11 +64,11 @@ def register_subject(
     captures = read_captures(Path(subject_dir))
     data = gnm_npz.read(Path(model))
     schemes = schemes_beside(Path(model), len(data.template_vertex_positions))
-    inputs = {f"capture {capture.root.name}": hashes.hash_capture(capture) for capture in captures.captures}
+    inputs = {f"capture {capture.root.name}": hashing.hash_capture(capture) for capture in captures.captures}
     inputs |= {f"capture {name}": error.line for name, error in captures.broken.items()}
-    inputs |= {f"landmarks {name}": hashes.content_of(one.indices, one.weights) for name, one in schemes.items()}
+    inputs |= {f"landmarks {name}": hashing.content_of(one.indices, one.weights) for name, one in schemes.items()}
     inputs |= {"subject": captures.subject, "model": gnm_npz.content_hash(data)}
-    wanted = hashes.input_hash(inputs, {"recipe": hashes.plain(recipe_named(recipe)), "views": views, "seed": seed})
+    wanted = hashing.input_hash(inputs, {"recipe": hashing.plain(recipe_named(recipe)), "views": views, "seed": seed})
     place = Path(out)
     if (known := _known(place, wanted)) is not None and _contents(place, known["contents"]) == known["contents"]:
         return {**known, "out": out}
@@ -102,8 +102,8 @@ def hold_out(
     true = [name for name in names if has_truths(found.subjects[name], data)]
     inputs = {"topology": gnm_npz.topology_hash(data.triangles)}
     for name in names:
-        inputs[name] = hashes.input_hash(_sources(found, Path(registrations), name, name in true), found.tags(name))
-    wanted = hashes.input_hash(inputs, {"categories": found.categories})
+        inputs[name] = hashing.input_hash(_sources(found, Path(registrations), name, name in true), found.tags(name))
+    wanted = hashing.input_hash(inputs, {"categories": found.categories})
     place = Path(out)
     if (known := _known(place, wanted)) is not None and (place / PEOPLE).is_file():
         return {**known, "people": str(place / PEOPLE)}
@@ -136,7 +136,7 @@ def stabilize(*, run: str, names: Sequence[str], model: str, out: str, progress:
     )
     manifest = stabilized.read_manifest(outcome.out)
     told = {name: manifest[name] for name in ("content_id", "input_hash")}
-    return {"out": out, **told, "figures": hashes.plain(outcome.figures)}
+    return {"out": out, **told, "figures": hashing.plain(outcome.figures)}
 
 
 def build(
@@ -159,7 +159,7 @@ def build(
     subjects = Registered(run=Path(run), names=names, model=data, steady=place, tags=tags)
     settings = builder(found.categories)
     inputs = {**subjects.inputs, "previous": gnm_npz.content_hash(data)}
-    wanted = hashes.input_hash(inputs, {"settings": hashes.plain(settings), "tags": tags})
+    wanted = hashing.input_hash(inputs, {"settings": hashing.plain(settings), "tags": tags})
     known = _known(Path(out), wanted)
     if known is not None and _is_model(Path(out) / MODEL, known["content_id"]):
         return {**known, "model": str(Path(out) / MODEL)}
@@ -228,7 +228,7 @@ def _sources(found: Dataset, registrations: Path, name: str, true: bool) -> dict
     """Digests of what a held-out subject is read from."""
     if true:
         truths = [(c.root.name, c.expression, c.ground_truth) for c in found.subjects[name].captures]
-        return {f"{folder} {label}": hashes.hash_file(file) for folder, label, file in truths if file is not None}
+        return {f"{folder} {label}": hashing.hash_file(file) for folder, label, file in truths if file is not None}
     one = read_usable(registrations / name)
     folders = () if one is None else (one.neutral, *one.expressions)
     return {folder: str(read_manifest(registrations / name / folder)["content_id"]) for folder in folders}
@@ -262,4 +262,4 @@ def _known(place: Path, wanted: str) -> Told | None:
 
 
 def _text(value: Any) -> str:
-    return json.dumps(hashes.plain(value), indent=1, allow_nan=False) + "\n"
+    return json.dumps(hashing.plain(value), indent=1, allow_nan=False) + "\n"

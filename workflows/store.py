@@ -22,8 +22,8 @@ from typing import Any
 
 import fsspec
 
-from registration.artifacts import swap_in
 from registration.errors import InputError
+from registration.storage.registration_folder import swap_in
 from workflows.jobs import check_id, redacted
 
 SCHEMA = 1

@@ -9,16 +9,16 @@ from typing import TypeVar
 
 import numpy as np
 
-from registration.artifacts import update_figures
 from registration.capture.scan import read_truth
 from registration.errors import InputError
 from registration.evaluate.evaluation import evaluate
+from registration.fit.recipes import recipe_named
 from registration.model import gnm_npz
 from registration.model.landmarks import read_scheme
 from registration.progress import Named, Progress, Silent
 from registration.register import register
 from registration.render.backend import Variant
-from registration.stages import recipe_named
+from registration.storage.registration_folder import update_figures
 from registration.types import Capture, Registration
 from workflows.subject_folder import MANIFEST, Captures, Row, Subject, check_subject_out, read_captures, save_subject
 from workflows.subject_page import thumbnail, write_subject_page

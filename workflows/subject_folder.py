@@ -7,10 +7,10 @@ from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any, Literal
 
-from registration.artifacts import check_out, manifest_of_kind, swap_in
 from registration.capture.native import natural_key, read
 from registration.errors import InputError
-from registration.hashes import plain
+from registration.storage.hashing import plain
+from registration.storage.registration_folder import check_out, manifest_of_kind, swap_in
 from registration.types import Capture
 
 SCHEMA = 1

@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Float
 
 from registration.frames import axis_angle_to_matrix, linear_to_srgb
-from registration.geometry.raster import rasterize
+from registration.geometry.rasterizer import rasterize
 from registration.report.pictures import PAPER, data_uri
 from registration.report.style import document
 from registration.types import Camera, Registration

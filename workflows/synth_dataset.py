@@ -8,10 +8,10 @@ from typing import Any
 
 from coregister import expressions, subjects
 from coregister.synth import Studio, check
-from registration.artifacts import swap_in
 from registration.errors import InputError
-from registration.hashes import plain, versions
 from registration.progress import Progress, Silent
+from registration.storage.hashing import plain, versions
+from registration.storage.registration_folder import swap_in
 from workflows.children import side_by_side
 from workflows.dataset import HELD_OUT, KIND, MANIFEST, SCHEMA
 from workflows.subject_folder import NEUTRAL

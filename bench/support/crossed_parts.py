@@ -13,15 +13,15 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 from torch import Tensor
 
+from registration.fit.optimizer import AdamUniformBlock, Rate, minimise
+from registration.fit.variables import skin_topology, skin_vertices
 from registration.frames import MM_PER_M
 from registration.geometry.closest_point import closest_points
 from registration.geometry.large_steps import LargeSteps
 from registration.geometry.topology import vertex_normals
-from registration.losses.anatomy import SelfIntersection
+from registration.losses.self_intersection import SelfIntersection
 from registration.model import regions
 from registration.model.gnm_npz import GNMData
-from registration.optimize import AdamUniformBlock, Rate, minimise
-from registration.unknowns import skin_topology, skin_vertices
 
 _REFRESH_EVERY = 10
 _SMOOTHING_M = 4e-3

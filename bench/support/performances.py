@@ -12,7 +12,7 @@ from coregister.anatomy import Anatomy
 from coregister.expressions import EXPRESSIONS, Expression
 from registration.frames import transform_points
 from registration.model.gnm_npz import GNMData
-from registration.stabilize.meshes import SubjectMeshes
+from registration.stabilize.subject_meshes import SubjectMeshes
 
 # Twenty of the capture protocol, in every category that moves the skin.
 NAMES = (

@@ -12,18 +12,18 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from registration.fit.optimizer import AdamUniformBlock, Rate, minimise
 from registration.frames import MM_PER_M
 from registration.geometry.closest_point import barycentric_points, closest_points
 from registration.geometry.large_steps import LargeSteps
-from registration.geometry.raster import visible
+from registration.geometry.rasterizer import visible
 from registration.geometry.texels import texels
 from registration.geometry.topology import edges, vertex_normals
-from registration.losses.texture import SurfaceTexture, trusted
+from registration.losses.uv_ssim import SurfaceTexture, trusted
 from registration.model.atlas import texture_atlas
 from registration.model.gnm import GNM
 from registration.model.gnm_npz import GNMData
 from registration.model.regions import blush, exterior, group, inner_lips, lids, vertex_classes
-from registration.optimize import AdamUniformBlock, Rate, minimise
 from registration.render import backend
 from registration.render.renderer import Renderer
 from registration.types import Camera, Pixels, Targets

@@ -11,8 +11,8 @@ from registration.geometry.rigid import angle_deg, motion_fields
 from registration.model.gnm_npz import GNMData
 from registration.model.regions import group
 from registration.stabilize.components import Components, Head, regional_components
-from registration.stabilize.dataset import StabilizedSubject
 from registration.stabilize.decisions import corrections, default_actions
+from registration.stabilize.pipeline import StabilizedSubject
 
 
 def face(data: GNMData) -> np.ndarray:

@@ -14,9 +14,9 @@ from rich.table import Table
 from rich.text import Text
 from scipy.spatial import cKDTree
 
-from registration.capture import headers, landmarks3d, native, pixels
+from registration.capture import headers, native, pixels, triangulation
+from registration.capture.contact_sheet import draw
 from registration.capture.scan import Scan, read_scan, read_truth
-from registration.capture.sheet import draw
 from registration.errors import InputError
 from registration.frames import MM_PER_M, opencv_intrinsics
 from registration.geometry.meshlab import scan_topology
@@ -114,7 +114,7 @@ def _check_landmarks(capture: Capture) -> None:
             got=", ".join(map(str, sorted(counts))),
             fix="give another scheme another name",
         )
-    points = landmarks3d.triangulate(capture, "68")[0]
+    points = triangulation.triangulate(capture, "68")[0]
     distance = eye_distance(points)
     if distance is not None and not EYE_DISTANCE_M[0] <= distance <= EYE_DISTANCE_M[1]:
         factor = 10.0 ** round(np.log10(0.09 / max(distance, 1e-12)))
@@ -250,7 +250,7 @@ def check(path: Path, sheet: Path | None = None) -> Report:
     validate(capture)
     scan = None if capture.scan is None else read_scan(capture.scan)
     names = sorted({name for view in capture.views for name in view.landmarks})
-    solved = {name: landmarks3d.triangulate(capture, name)[0] for name in names}
+    solved = {name: triangulation.triangulate(capture, name)[0] for name in names}
     main = "68" if "68" in solved else next(iter(solved), None)
     points = solved[main] if main is not None else np.zeros((0, 3))
     views = tuple(_view_report(view, main, points) for view in capture.views)
@@ -272,8 +272,8 @@ def _view_report(view: View, scheme: str | None, points: Float[np.ndarray, "L 3"
     camera = view.camera
     errors, used = np.zeros(0), 0
     if scheme is not None and scheme in view.landmarks:
-        errors = landmarks3d.residuals(view, scheme, points)
-        used = int((view.landmarks[scheme][:, 2] > landmarks3d.MIN_CONFIDENCE).sum())
+        errors = triangulation.residuals(view, scheme, points)
+        used = int((view.landmarks[scheme][:, 2] > triangulation.MIN_CONFIDENCE).sum())
     known = errors[np.isfinite(errors)]
     return ViewReport(
         name=view.name,
@@ -283,7 +283,7 @@ def _view_report(view: View, scheme: str | None, points: Float[np.ndarray, "L 3"
         labels=view.segmentation is not None,
         landmarks=used,
         residual_px=float(np.median(known)) if len(known) else float("nan"),
-        outliers=tuple(np.flatnonzero(errors > landmarks3d.inlier_limit_px(camera)).tolist()),
+        outliers=tuple(np.flatnonzero(errors > triangulation.inlier_limit_px(camera)).tolist()),
     )
 
 
@@ -308,7 +308,7 @@ def _warnings(
         if lost := np.flatnonzero(~np.isfinite(points).all(-1)).tolist():
             warnings.append(f"landmarks {scheme}: no two views agree on {_listed(lost)}")
     points = solved.get("68", np.zeros((0, 3)))
-    if len(points) == 68 and (jaw := landmarks3d.jaw_disorder(points)):
+    if len(points) == 68 and (jaw := triangulation.jaw_disorder(points)):
         warnings.append(
             f"landmarks 68: {_listed(jaw)} go backwards; the jaw must run from the right ear over the chin to the left"
         )

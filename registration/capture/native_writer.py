@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 from registration.capture.scan import Scan
 from registration.errors import InputError
 from registration.frames import linear_to_srgb
-from registration.mesh_files import write_ply
+from registration.storage.mesh import write_ply
 from registration.types import Camera
 
 _MODELS = {0: "PINHOLE", 4: "OPENCV", 5: "FULL_OPENCV", 8: "FULL_OPENCV"}  # by number of distortion coefficients

@@ -9,7 +9,7 @@ import trimesh
 from jaxtyping import Float, Int
 
 from registration.errors import InputError
-from registration.npz_files import check_unpacked
+from registration.storage.npz import check_unpacked
 
 MAX_TRUTH_BYTES = 2**30  # 40 million vertices
 

@@ -14,9 +14,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from registration.artifacts import load_registration, update_figures
 from registration.errors import InputError
-from registration.evaluate.table import print_audit
+from registration.evaluate.console_table import print_audit
 from registration.frames import MM_PER_M
 from registration.geometry.closest_point import closest_points
 from registration.geometry.self_overlap import SelfOverlap
@@ -24,6 +23,7 @@ from registration.geometry.topology import connected_parts
 from registration.geometry.winding import Winding, closed
 from registration.model import gnm_npz, regions
 from registration.model.gnm_npz import GNMData
+from registration.storage.registration_folder import load_registration, update_figures
 
 TOLERANCE_MM = 0.3
 BEYOND = f"vertices_beyond_{TOLERANCE_MM}mm"

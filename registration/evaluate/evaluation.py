@@ -8,15 +8,15 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float
 
-from registration.artifacts import load_registration, update_figures
 from registration.capture.native import read
 from registration.capture.scan import Scan, read_scan, read_truth
 from registration.errors import InputError
+from registration.evaluate.console_table import print_figures
 from registration.evaluate.distances import Surface, area_uniform, distances_mm, summary
 from registration.evaluate.face import FaceBall, face_ball, seen
-from registration.evaluate.table import print_figures
 from registration.evaluate.truth import drift, face_vertices, require_same_topology, vertex_error
 from registration.frames import MM_PER_M
+from registration.storage.registration_folder import load_registration, update_figures
 from registration.types import Capture, Registration
 
 CLOUD_TOLERANCE = 5e-3  # m; a point cloud hides nothing itself, so the registered surface must, however well it fits

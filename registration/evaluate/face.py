@@ -6,9 +6,9 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from registration.capture.landmarks3d import triangulate
+from registration.capture.triangulation import triangulate
 from registration.errors import InputError
-from registration.geometry.raster import visible
+from registration.geometry.rasterizer import visible
 from registration.types import Camera, Capture, Registration
 
 SCHEME = "68"

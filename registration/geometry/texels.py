@@ -11,7 +11,7 @@ from scipy.ndimage import binary_erosion, maximum_filter, minimum_filter
 from scipy.sparse import csr_matrix
 from torch import Tensor
 
-from registration.geometry.raster import rasterize
+from registration.geometry.rasterizer import rasterize
 from registration.geometry.topology import connected_parts
 from registration.types import Camera
 

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float, Integer, Shaped
 
 from registration.errors import InputError
-from registration.npz_files import check_unpacked
+from registration.storage.npz import check_unpacked
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

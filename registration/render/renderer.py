@@ -19,7 +19,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from registration.geometry.topology import connected_parts, edges
-from registration.render import crossings, interior, normals, silhouette
+from registration.render import interior, intersection_curves, normals, silhouette
 from registration.render.adjoint import Adjoint, RowSum, unit_of
 from registration.render.cameras import PixelList, upload
 from registration.render.scene import TriangleScene
@@ -231,7 +231,7 @@ class Renderer:
     def _crossing_gradients(self, drawn: Drawn, adjoint: Adjoint, vertices: RowSum) -> None:
         """Add what parts that run through one another give."""
         if self._parts is not None:
-            crossings.backward(self._scene, drawn, self._parts, adjoint, vertices)
+            intersection_curves.backward(self._scene, drawn, self._parts, adjoint, vertices)
 
 
 class _Draw(torch.autograd.Function):

@@ -5,12 +5,12 @@ from collections.abc import Iterable, Mapping
 from html import escape
 from typing import Any
 
-from registration.hashes import plain
 from registration.report.charts import loss_curves
-from registration.report.heat import UNMEASURED, heat_pictures, scale_limit_mm
+from registration.report.heat_map import UNMEASURED, heat_pictures, scale_limit_mm
 from registration.report.inputs import HeatMap, ReportInputs
 from registration.report.pictures import CLASS_COLOURS, SCALE, Picture, ViewPictures, data_uri, view_pictures
 from registration.report.style import document, sectioned
+from registration.storage.hashing import plain
 from registration.types import Registration
 
 FIGURES = {

@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float
 
 from registration.frames import MM_PER_M, transform_points
 from registration.geometry.rigid import align
-from registration.stabilize.meshes import SkullSkin, SubjectMeshes
+from registration.stabilize.subject_meshes import SkullSkin, SubjectMeshes
 
 
 @dataclass(frozen=True, kw_only=True)

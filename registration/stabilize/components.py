@@ -14,7 +14,7 @@ from registration.geometry.rigid import align, fit_twists, motion_fields
 from registration.geometry.topology import vertex_areas
 from registration.model import regions
 from registration.model.gnm_npz import GNMData
-from registration.stabilize.meshes import SkullSkin
+from registration.stabilize.subject_meshes import SkullSkin
 
 LEAST_SAMPLES = 2
 

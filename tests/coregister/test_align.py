@@ -6,7 +6,7 @@ import pytest
 from coregister.align import align_neutrals
 from registration.frames import transform_points
 from registration.model.gnm_npz import GNMData
-from registration.stabilize.meshes import SkullSkin
+from registration.stabilize.subject_meshes import SkullSkin
 from tests.coregister import known
 
 COUNT = 12

@@ -10,7 +10,7 @@ from coregister import eyes
 from coregister.population import any_person
 from registration.frames import axis_angle_to_matrix
 from registration.geometry.quads import boundary_loops, triangles_of
-from registration.geometry.raster import rasterize
+from registration.geometry.rasterizer import rasterize
 from registration.model import regions
 from registration.model.gnm import GNM
 from registration.model.gnm_numpy import evaluate

@@ -13,11 +13,11 @@ import pytest
 from coregister import bootstrap, makehuman
 from registration.errors import InputError
 from registration.geometry.quads import boundary_loops, corner_triangles, edges_of, pieces, triangles_of
-from registration.geometry.raster import rasterize
-from registration.hashes import hash_file
+from registration.geometry.rasterizer import rasterize
 from registration.model import gnm_npz, regions
 from registration.model.gnm import GNM
 from registration.model.landmarks import LandmarkScheme, schemes_beside
+from registration.storage.hashing import hash_file
 from registration.types import Camera, Parameters
 from tests.conftest import SHARED, needs_shared
 from tests.fixtures.make_fixtures import HERE

@@ -11,8 +11,8 @@ from coregister import evaluate as whole
 from coregister import expressions, population
 from coregister.evaluate import HeldOut, Settings, evaluate
 from registration.errors import InputError
-from registration.hashes import plain
 from registration.model import gnm_npz, regions
+from registration.storage.hashing import plain
 from tests.conftest import SHARED, needs_shared
 from tests.coregister.spectrum import DEVIATIONS_MM, heads, spectrum_model, with_identity
 

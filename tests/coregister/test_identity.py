@@ -13,7 +13,7 @@ from registration.geometry.rigid import fit_twists, motion_fields
 from registration.geometry.topology import vertex_areas
 from registration.model import regions
 from registration.model.gnm_npz import GNMData
-from registration.stabilize.meshes import SkullSkin
+from registration.stabilize.subject_meshes import SkullSkin
 from tests.coregister import known
 
 RAW = Identity(share=1.0, previous=0.0, mirrored=False, lids_rest=False)

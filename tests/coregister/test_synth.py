@@ -11,13 +11,13 @@ from scipy.spatial.transform import Rotation
 
 from coregister import synth
 from coregister.synth import LABELS, Studio, write_capture
-from registration.capture import landmarks3d, native
+from registration.capture import native, triangulation
 from registration.capture.doctor import check
 from registration.capture.pixels import read_colour, read_labels, read_mask, read_normals
 from registration.capture.scan import read_scan, read_truth
 from registration.errors import InputError
 from registration.geometry.closest_point import closest_points
-from registration.geometry.raster import visible
+from registration.geometry.rasterizer import visible
 from registration.geometry.topology import vertex_normals
 from registration.model import gnm_npz
 from registration.model.gnm_numpy import evaluate
@@ -189,7 +189,7 @@ def test_normals_face_the_camera_and_follow_the_mesh(capture) -> None:
 
 
 def test_landmarks_come_back(capture) -> None:
-    points, used, residuals = landmarks3d.triangulate(capture, "68")
+    points, used, residuals = triangulation.triangulate(capture, "68")
     truth = SCHEMES["68"].points(vertices())
     assert (used >= 2).all()
     assert np.linalg.norm(points - truth, axis=1).max() < 1e-4 and residuals.max() < 0.01

@@ -10,11 +10,11 @@ import pytest
 import trimesh
 
 import workflows.subject
-from registration.artifacts import save_registration
+from registration.storage.registration_folder import save_registration
 from registration.types import Registration
-from tests.capture import small
-from tests.register import synthetic
-from tests.report.test_page import a_registration
+from tests.registration.capture import small
+from tests.registration.register import synthetic
+from tests.registration.report.test_page import a_registration
 
 MODEL = synthetic.MODEL
 

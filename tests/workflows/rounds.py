@@ -8,16 +8,16 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from registration.artifacts import find_same, save_registration
 from registration.capture.native import read
 from registration.capture.scan import read_truth
-from registration.hashes import hash_capture, input_hash
 from registration.model import gnm_npz
 from registration.model.gnm_npz import GNMData
+from registration.storage.hashing import hash_capture, input_hash
+from registration.storage.registration_folder import find_same, save_registration
 from registration.types import Registration
-from tests.capture import small
-from tests.register import synthetic
-from tests.report.test_page import a_registration
+from tests.registration.capture import small
+from tests.registration.register import synthetic
+from tests.registration.report.test_page import a_registration
 
 MODEL = synthetic.MODEL
 ACTS = {"smile": 3, "jaw": 4}  # -> the component of the tiny model that it moves

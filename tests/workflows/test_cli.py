@@ -7,7 +7,7 @@ import pytest
 
 import registration.register
 import workflows.subject
-from tests.capture.small import make
+from tests.registration.capture.small import make
 from workflows.cli import main
 from workflows.subject_folder import Row, Subject
 

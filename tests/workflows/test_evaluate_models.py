@@ -10,11 +10,11 @@ import workflows.evaluate_models
 from coregister.evaluate import Settings
 from registration.errors import InputError
 from registration.model import gnm_npz
-from registration.stabilize import folder as stabilized
-from registration.stabilize.dataset import StabilizedSubject
-from tests.capture import small
+from registration.stabilize import stabilized_folder as stabilized
+from registration.stabilize.pipeline import StabilizedSubject
 from tests.coregister.spectrum import heads, spectrum_model, with_identity
-from tests.stabilize.runs import write_subject
+from tests.registration.capture import small
+from tests.registration.stabilize.runs import write_subject
 from workflows.cli import main
 from workflows.evaluate_models import evaluate_models
 from workflows.held_out import read_held_out

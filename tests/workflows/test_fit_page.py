@@ -9,10 +9,10 @@ import pytest
 
 from registration.capture.native import read
 from registration.errors import InputError
-from registration.report.stages import write_stage
+from registration.report.stage_snapshots import write_stage
 from registration.types import Capture
-from tests.capture import small
-from tests.report.test_pictures import a_view
+from tests.registration.capture import small
+from tests.registration.report.test_pictures import a_view
 from tests.workflows.browser import CHROMIUM, FLAGS, needs_browser
 from workflows.web.fit_page import MOVED, PLAIN, TO_SCAN, FitPage
 

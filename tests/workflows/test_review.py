@@ -8,11 +8,11 @@ import pytest
 
 from bench.support import performances
 from registration.errors import InputError
-from registration.stabilize import folder as disk
-from registration.stabilize.dataset import stabilize
+from registration.stabilize import stabilized_folder as disk
 from registration.stabilize.decisions import Decision
+from registration.stabilize.pipeline import stabilize
 from tests.coregister.conftest import anatomy, model, model_file, source, wheel  # noqa: F401  fixtures
-from tests.stabilize import runs
+from tests.registration.stabilize import runs
 from tests.workflows.browser import CHROMIUM, FLAGS, needs_browser
 from workflows.stabilize_folder import read_decisions, read_run
 from workflows.stabilize_run import stabilize_run

@@ -10,11 +10,11 @@ import pytest
 from bench.support import performances
 from registration.errors import InputError
 from registration.model import gnm_npz
-from registration.stabilize import folder as disk
-from registration.stabilize.dataset import stabilize
+from registration.stabilize import stabilized_folder as disk
 from registration.stabilize.decisions import Decision
+from registration.stabilize.pipeline import stabilize
 from tests.coregister.conftest import anatomy, model, model_file, source, wheel  # noqa: F401  fixtures
-from tests.stabilize import runs
+from tests.registration.stabilize import runs
 from workflows.cli import main
 from workflows.stabilize_folder import append_decisions, read_decisions, read_run
 from workflows.stabilize_run import stabilize_run

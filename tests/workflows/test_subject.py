@@ -12,13 +12,13 @@ import pytest
 import torch
 
 import workflows.subject
-from registration.artifacts import AXES, load_registration, read_manifest
 from registration.errors import InputError
 from registration.evaluate.evaluation import evaluate_folder
+from registration.fit.recipes import RECIPES, Recipe, draft
 from registration.register import register
 from registration.render import backend
-from registration.stages import RECIPES, Recipe, draft
-from tests.register import synthetic
+from registration.storage.registration_folder import AXES, load_registration, read_manifest
+from tests.registration.register import synthetic
 from tests.workflows.conftest import MODEL, FakeRegister, Notes, add_truths, change, manifest, statuses
 from workflows.subject import register_subject
 from workflows.subject_folder import Subject

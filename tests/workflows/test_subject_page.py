@@ -6,7 +6,7 @@ import re
 import cv2
 import numpy as np
 
-from tests.report.test_page import a_registration
+from tests.registration.report.test_page import a_registration
 from workflows.subject_folder import Row, Subject
 from workflows.subject_page import thumbnail, write_subject_page
 

@@ -12,7 +12,7 @@ import workflows.synth_dataset
 from coregister import subjects
 from coregister.synth import Studio
 from registration.errors import InputError
-from registration.hashes import hash_file
+from registration.storage.hashing import hash_file
 from workflows.children import side_by_side
 from workflows.cli import main
 from workflows.dataset import read_dataset, split

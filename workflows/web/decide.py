@@ -17,7 +17,7 @@ from registration.stabilize.decisions import (
     corrections,
     decided_actions,
 )
-from registration.stabilize.folder import StoredComponents
+from registration.stabilize.stabilized_folder import StoredComponents
 from workflows.stabilize_folder import append_decisions
 
 

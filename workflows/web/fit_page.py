@@ -1,6 +1,6 @@
 """`gnmreg debug --view`: a fit in three dimensions, stage after stage, with the capture's scan and cameras.
 
-The page reads what `registration.report.stages.write_stage` leaves, and shows a stage as soon as it is there.
+The page reads what `registration.report.stage_snapshots.write_stage` leaves, and shows a stage as soon as it is there.
 """
 
 import threading
@@ -20,7 +20,7 @@ from registration.capture.pixels import read_view
 from registration.capture.scan import Scan, read_scan
 from registration.frames import MM_PER_M, linear_to_srgb
 from registration.geometry.closest_point import Searched
-from registration.report.heat import scale_limit_mm
+from registration.report.heat_map import scale_limit_mm
 from registration.report.pictures import scale_colours
 from registration.types import Camera, Capture
 from workflows.web import panels

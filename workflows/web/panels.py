@@ -9,7 +9,7 @@ from jaxtyping import Float
 from registration.report.pictures import SCALE
 from registration.stabilize.components import Components, Head
 from registration.stabilize.decisions import Change
-from registration.stabilize.folder import StoredComponents
+from registration.stabilize.stabilized_folder import StoredComponents
 
 _BINS, _REACH = 24, 3.0  # of a histogram: bars, and standard deviations either way
 _MOST_LABELS = 24

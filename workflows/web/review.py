@@ -10,9 +10,9 @@ import numpy as np
 from registration.errors import InputError
 from registration.model import gnm_npz, regions
 from registration.progress import Progress
-from registration.report.heat import scale_limit_mm
+from registration.report.heat_map import scale_limit_mm
 from registration.report.pictures import scale_colours
-from registration.stabilize import folder as disk
+from registration.stabilize import stabilized_folder as disk
 from registration.stabilize.components import Components, Head
 from registration.stabilize.decisions import ACTIONS
 from workflows.stabilize_folder import read_decisions

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from registration.geometry.raster import rasterize
+from registration.geometry.rasterizer import rasterize
 from registration.geometry.topology import edges
 from registration.model.atlas import texture_atlas
 from registration.model.gnm_npz import GNMData

@@ -9,9 +9,9 @@ import pytest
 import registration.register
 from registration.errors import InputError
 from registration.progress import Silent
-from tests.capture import small
-from tests.register import synthetic
-from tests.report.test_page import a_registration
+from tests.registration.capture import small
+from tests.registration.register import synthetic
+from tests.registration.report.test_page import a_registration
 from workflows.debug import debug
 from workflows.engine.reads import Row
 

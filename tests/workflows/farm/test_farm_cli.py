@@ -10,8 +10,8 @@ from pathlib import Path
 
 import pytest
 
-from tests.capture import small
-from tests.register import synthetic
+from tests.registration.capture import small
+from tests.registration.register import synthetic
 from tests.workflows.farm.harness import ROOT, alive, interruptible
 from workflows.batch import batch_jobs, put_batch
 from workflows.cli import main

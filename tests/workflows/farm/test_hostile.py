@@ -20,8 +20,8 @@ import numpy as np
 import pytest
 
 from registration.errors import InputError
-from tests.capture import small
 from tests.conftest import FIXTURES
+from tests.registration.capture import small
 from workflows.jobs import MAX_BYTES, STEPS, checked, resolved_roots
 from workflows.slot import Slot
 from workflows.store import MANIFEST, Store

@@ -1,0 +1,202 @@
+"""Stages and recipes: which unknowns are free, what is compared, at which resolution, for how long.
+
+A recipe is a function that returns its stages; the resolved values are saved with every result.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+from registration.errors import InputError
+from registration.fit.optimizer import Rate
+
+
+@dataclass(frozen=True, kw_only=True)
+class Weights:
+    """How much each term counts; 0 leaves it out. Image terms are means over the subject's pixels."""
+
+    normals: float = 1.0
+    normal_truncation: float = 2.0  # length of a normal's error beyond which it is an outlier
+    rgb: float = 0.0
+    ssim: float = 0.0
+    mask: float = 0.5
+    classes: float = 0.2
+    eye_classes: float = 4.0  # times `classes`, for eyes: small, but lids depend on them
+    landmarks: float = 0.02
+    landmark_sigma_px: float = 3.0  # at 512 px of head height
+    identity: float = 2e-3
+    expression: float = 2e-3
+    rotations: float = 0.1  # joints other than the root, per rad^2
+    eyes: float = 1.0  # eyeballs moved out of the model's place, per m^2
+    eye_scale: float = 2e-3
+    offsets: float = 2e4  # per m^2: how hard images are taken to pull, which the lengths below are balanced against
+    contacts: float = 0.0  # per mm^2, summed over the vertices that lie too deep in another part
+    tongue: float = 1e-5  # the same of the tongue, which is mostly unseen: little more than its prior's pull
+    slide: float = 0.0  # dissimilarity of the neutral's texture and the images unwrapped; expressions only
+
+
+@dataclass(frozen=True, kw_only=True)
+class Lengths:
+    """How free offsets are, in mm (losses/regularization.py and geometry/large_steps.py say what each does)."""
+
+    smoothing_mm: float  # one step moves a patch of about this size: the way there, not where it ends
+    half_gain_mm: float  # of waves of this length the images keep one half, of shorter ones less
+    decay_mm: float = 25.0  # so far an offset reaches into what no image shows
+
+
+@dataclass(frozen=True, kw_only=True)
+class Region:
+    """A part of the skin where offsets have lengths and a step size of their own."""
+
+    name: str  # a key of regions.offset_regions
+    length: float = 1.0  # times a stage's lengths, the decay's excepted
+    pace: float = 1.0  # times a stage's rate, against the largest gradients in the region itself
+
+
+@dataclass(frozen=True, kw_only=True)
+class Stage:
+    """A run of steps with one set of free unknowns."""
+
+    name: str
+    steps: int
+    level: int  # of the pyramid: 0 is the finest, each next one half
+    views_per_step: int = 8
+    weights: Weights = Weights()
+    free: tuple[tuple[str, Rate], ...] = ()  # unknowns and their rates; all but `offsets` are updated by Adam
+    lengths: Lengths | None = None  # needed while `offsets` is free
+    texture: bool = False  # estimate texture and camera gains along the way
+
+    def frees(self, name: str) -> bool:
+        return any(name == unknown for unknown, _ in self.free)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Recipe:
+    name: str
+    stages: tuple[Stage, ...]
+    finest_head_px: int = 512  # resolution of level 0, as the head's height
+    levels: int = 3
+    texture_px: int = 1024
+    slide_px: int = 512  # of the textures compared for sliding
+    edge_samples: float = 1.0  # a pixel of silhouette; 0: silhouettes move nothing, as in renderers without edges
+    scale: bool = True  # free the overall size: a basis rebuilt from scale-free data holds none
+    regions: tuple[Region, ...] = (
+        Region(name="lips", length=0.6),
+        Region(name="lids", length=0.4),
+        Region(name="nostrils", length=0.5, pace=10.0),
+    )
+
+
+_POSE = (("root", 5e-3), ("joints", 5e-3), ("position", 1e-3), ("eyes", 1e-3))
+
+
+def _rates(*pairs: tuple[str, float], end: float = 0.05) -> tuple[tuple[str, Rate], ...]:
+    return tuple((name, Rate(start=rate, end=rate * end, hold=0.5)) for name, rate in pairs)
+
+
+def _model(steps: int) -> Stage:
+    return Stage(
+        name="model",
+        steps=steps,
+        level=2,
+        free=_rates(("identity", 0.1), ("expression", 0.03), ("scale", 3e-3), *_POSE),
+    )
+
+
+def _offsets(
+    smoothing_mm: float, half_gain_mm: float, steps: int, level: int, start: float, end: float, ssim: float = 0.06
+) -> Stage:
+    # Pose and expression stand still: offsets would make up for what they drift, and teeth would be left behind.
+    return Stage(
+        name=f"offsets {smoothing_mm:g} mm",
+        steps=steps,
+        level=level,
+        lengths=Lengths(smoothing_mm=smoothing_mm, half_gain_mm=half_gain_mm),
+        free=(("offsets", Rate(start=start, end=end)), ("eyes", Rate(start=start / 10, end=end / 10))),
+        weights=Weights(rgb=0.3, ssim=ssim, classes=0.1, landmarks=0.01, contacts=2e-4, slide=0.5),
+        texture=True,
+    )
+
+
+def draft(*, scale: bool = True) -> Recipe:
+    """A minute on a laptop: model, then offsets up to a head of about 512 px."""
+    stages = (
+        _model(100),
+        _offsets(20, 12, 30, level=2, start=4e-3, end=2e-3),
+        _offsets(5, 8, 40, level=1, start=1e-3, end=5e-4),
+        _offsets(2.5, 6, 30, level=1, start=4e-4, end=5e-5),
+        _offsets(1.5, 5, 40, level=0, start=2e-4, end=2e-5, ssim=0.0),
+    )
+    return Recipe(name="draft", stages=stages, scale=scale)
+
+
+def studio(*, scale: bool = True) -> Recipe:
+    """The full quality: more views at every step, longer, up to the images' own resolution."""
+    stages = (
+        _model(150),
+        _offsets(20, 12, 50, level=2, start=4e-3, end=2e-3),
+        _offsets(5, 8, 80, level=1, start=1e-3, end=5e-4),
+        _offsets(2.5, 6, 60, level=1, start=4e-4, end=5e-5),
+        _offsets(1.5, 4, 90, level=0, start=3e-4, end=1e-5, ssim=0.0),
+    )
+    wider = tuple(replace(stage, views_per_step=12) for stage in stages)
+    return Recipe(name="studio", stages=wider, scale=scale, finest_head_px=1024)
+
+
+def preview(*, scale: bool = True) -> Recipe:
+    """Seconds, for small images: half of draft's levels and steps, and nothing looks after parts that touch."""
+    stages = (
+        _model(70),
+        _offsets(20, 12, 20, level=1, start=4e-3, end=2e-3),
+        _offsets(5, 8, 25, level=0, start=1e-3, end=5e-4),
+        _offsets(1.5, 5, 25, level=0, start=2e-4, end=2e-5, ssim=0.0),
+    )
+    plain = (
+        replace(stage, level=min(stage.level, 1), weights=replace(stage.weights, contacts=0.0, tongue=0.0))
+        for stage in stages
+    )
+    return Recipe(name="preview", stages=tuple(plain), scale=scale, levels=2, texture_px=512)
+
+
+def in_model(*, scale: bool = True) -> Recipe:
+    """No offsets: the model's own parameters alone, as for testing how much a model can say."""
+    fine = replace(_model(60), name="model, finer", level=1)
+    slow = tuple((name, replace(rate, start=rate.start / 3, end=rate.end / 3)) for name, rate in fine.free)
+    return Recipe(name="in_model", stages=(_model(100), replace(fine, free=slow, texture=True)), scale=scale)
+
+
+def rigid(level: int) -> Stage:
+    """Pose and size alone, to judge a start."""
+    rates = (("root", 2e-2), ("position", 3e-3), ("scale", 1e-2))
+    free = tuple((name, Rate(start=rate, end=rate * 0.2)) for name, rate in rates)
+    return Stage(name="rigid", steps=30, level=level, free=free, weights=Weights(mask=1.0, landmarks=0.0, tongue=0.0))
+
+
+def expression_of(recipe: Recipe) -> Recipe:
+    """The same recipe for an expression that starts from its subject's neutral: identity and size stay."""
+    kept = ("identity", "scale")
+    stages = tuple(
+        replace(stage, free=tuple((name, rate) for name, rate in stage.free if name not in kept))
+        for stage in recipe.stages
+    )
+    return replace(recipe, stages=stages)
+
+
+RECIPES: dict[str, Callable[[], Recipe]] = {
+    "preview": preview,
+    "draft": draft,
+    "studio": studio,
+    "in_model": in_model,
+}
+
+
+def recipe_named(name: str) -> Recipe:
+    """Raises InputError for a name that no recipe has."""
+    if name not in RECIPES:
+        raise InputError(
+            "There is no such recipe",
+            where="recipe",
+            expected=" or ".join(RECIPES),
+            got=name,
+            fix="choose one of them",
+        )
+    return RECIPES[name]()

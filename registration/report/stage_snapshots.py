@@ -1,0 +1,39 @@
+"""Where a fit stands, to be looked at when a registration went wrong: a picture and the mesh after each stage."""
+
+import os
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float, Int
+from PIL import Image
+
+from registration.frames import linear_to_srgb
+from registration.report.inputs import ReportView
+from registration.storage.mesh import write_ply
+
+
+def write_stage(
+    folder: Path,
+    name: str,
+    views: tuple[ReportView, ...],
+    vertices: Float[np.ndarray, "V 3"],
+    triangles: Int[np.ndarray, "F 3"],
+) -> Path:
+    """NAME.png: a row for each view of the target, the rendering, where their colours differ (x 4), and its normals.
+
+    NAME.ply, which is returned: the mesh, metres, capture world. It appears last, and whole: whoever waits for it finds
+    both.
+    """
+    rows = []
+    for view in views:
+        target, drawn = linear_to_srgb(view.target_rgb), linear_to_srgb(view.rendered_rgb)
+        difference = np.abs(target - drawn) * view.compared[..., None] * 4
+        rows.append(np.concatenate([target, drawn, difference, 0.5 + 0.5 * view.rendered_normals], axis=1))
+    width = max(row.shape[1] for row in rows)
+    sheet = np.concatenate([np.pad(row, ((0, 0), (0, width - row.shape[1]), (0, 0))) for row in rows])
+    folder.mkdir(parents=True, exist_ok=True)
+    Image.fromarray((np.clip(np.nan_to_num(sheet), 0, 1) * 255).astype(np.uint8)).save(folder / f"{name}.png")
+    beside, mesh = folder / f".{name}.ply", folder / f"{name}.ply"
+    write_ply(beside, vertices, triangles)
+    os.replace(beside, mesh)
+    return mesh

@@ -1,0 +1,387 @@
+"""What a spoiled copy differs in, measured on its files."""
+
+import shutil
+import tomllib
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from registration.capture import native
+from registration.capture.degrade import PRESETS, Preset, spoil
+from registration.capture.doctor import check
+from registration.capture.native_writer import write
+from registration.capture.scan import read_scan
+from registration.errors import InputError
+from registration.types import Capture, View
+from tests.conftest import SHARED, needs_shared
+from tests.registration.capture.small import CLASSES, DISTORTIONS, ball, camera, distorted, landmarks_68, make, picture
+
+TURNS = (-1.2, -0.8, -0.3, 0.1, 0.4, 0.8, 1.1)
+MANY = 1000  # landmarks of a second scheme, for statistics
+FOLDERS = ("images", "masks", "normals", "segmentation", "landmarks")
+
+
+@pytest.fixture(scope="module")
+def source(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Seven views of the ball, 240 x 320, in one lens each; two in a subfolder."""
+    sphere = np.random.default_rng(0).standard_normal((MANY, 3))
+    sphere *= 0.09 / np.linalg.norm(sphere, axis=-1, keepdims=True)
+    views = []
+    for number, turn in enumerate(TURNS):
+        lens = DISTORTIONS["OPENCV"] if number == 2 else ()
+        cam = camera(turn, distortion=lens, width_px=240, height_px=320)
+        view = picture(f"left/cam{number}" if number < 2 else f"cam{number}", cam)
+        many = np.column_stack([distorted(cam, sphere), np.where(np.arange(MANY) % 2, 1.0, 0.2)])
+        views.append(replace(view, landmarks={**view.landmarks, "many": many}))
+    root = tmp_path_factory.mktemp("source") / "capture"
+    tags = {"age": 30, "notes": 'with "quotes"'}
+    scan, truth = ball(), landmarks_68()
+    write(root, views, subject="ball", expression="e", classes=CLASSES, tags=tags, points=truth, scan=scan, truth=truth)
+    return root
+
+
+@pytest.fixture(scope="module", params=["studio", "harsh"])
+def spoiled(request: pytest.FixtureRequest, source: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return spoil(source, tmp_path_factory.mktemp(request.param) / "capture", preset=PRESETS[request.param], seed=5)
+
+
+def amount(root: Path) -> int:
+    """How many times the figures of "studio" the copy should have."""
+    return 2 if "preset harsh" in native.read(root).tags["spoiled"] else 1
+
+
+def pairs(source: Path, target: Path) -> list[tuple[View, View]]:
+    before = {view.name: view for view in native.read(source).views}
+    return [(before[view.name], view) for view in native.read(target).views]
+
+
+def load(path: Path | None) -> np.ndarray:
+    """Pixels in the file's own depth, BGR or gray."""
+    pixels = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+    assert pixels is not None
+    return pixels
+
+
+def linear(path: Path) -> np.ndarray:
+    pixels = load(path)
+    value = pixels / np.iinfo(pixels.dtype).max
+    return np.where(value <= 0.04045, value / 12.92, ((value + 0.055) / 1.055) ** 2.4)
+
+
+def unit_normals(path: Path | None) -> np.ndarray:
+    return load(path)[..., ::-1].astype(np.float64) * 2 / 65535 - 1
+
+
+def files(root: Path) -> dict[str, bytes]:
+    return {str(path.relative_to(root)): path.read_bytes() for path in sorted(root.rglob("*")) if path.is_file()}
+
+
+def boundary_band(regions: np.ndarray, radius_px: int) -> np.ndarray:
+    """Pixels within about this distance of where a map of indices changes."""
+    size = 2 * radius_px + 1
+    disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (size, size))
+    return cv2.dilate(regions, disc) != cv2.erode(regions, disc)
+
+
+def test_cameras_are_off_by_what_the_preset_says(source: Path, spoiled: Path) -> None:
+    points = read_scan(source / "scan.ply").vertices
+    turns, moves, zooms = [], [], []
+    for before, after in pairs(source, spoiled):
+        old, new = before.camera, after.camera
+        plain = [distorted(replace(cam, distortion=()), points) for cam in (old, new)]
+        off_px = np.sqrt(((plain[1] - plain[0]) ** 2).sum(-1).mean())
+        assert off_px == pytest.approx(0.3 * amount(spoiled), rel=0.03)
+        assert new.distortion == pytest.approx(old.distortion)
+        assert (new.width_px, new.height_px) == (old.width_px, old.height_px)
+        np.testing.assert_array_equal(new.intrinsics[:2, 2], old.intrinsics[:2, 2])
+        zoom = new.intrinsics[[0, 1], [0, 1]] / old.intrinsics[[0, 1], [0, 1]]
+        assert zoom[0] == pytest.approx(zoom[1])
+        relative = new.T_cam_world[:3, :3] @ old.T_cam_world[:3, :3].T
+        turns.append(np.arccos(np.clip((np.trace(relative) - 1) / 2, -1, 1)))
+        moves.append(np.linalg.norm(new.centre - old.centre))
+        zooms.append(zoom[0] - 1)
+    # A pixel at this focal length is 2 mrad or 0.9 mm; a zoom of 1 % moves the ball's rim by less than a pixel.
+    assert 1e-5 < min(turns) and max(turns) < 5e-3
+    assert 1e-6 < min(moves) and max(moves) < 3e-3
+    assert 1e-6 < np.abs(zooms).max() < 1e-2 and np.std(zooms) > 1e-6
+
+
+def test_landmarks_tell_where_the_subject_is_without_a_scan(tmp_path: Path) -> None:
+    bare = make(tmp_path / "bare")
+    (bare / "scan.ply").unlink()
+    spoil(bare, tmp_path / "out", preset=Preset(name="cameras", camera_rms_px=1.0))
+    for before, after in pairs(bare, tmp_path / "out"):
+        moved = after.camera.project(landmarks_68())[0] - before.camera.project(landmarks_68())[0]
+        assert np.sqrt((moved**2).sum(-1).mean()) == pytest.approx(1.0, rel=0.02)
+
+
+def test_normals_turn_smoothly_and_some_are_wrong(source: Path, spoiled: Path) -> None:
+    times = amount(spoiled)
+    correlation_px = 8 * times
+    squares, wrong, count, products = 0.0, 0, 0, {lag: [] for lag in (1, correlation_px, 3 * correlation_px)}
+    for before, after in pairs(source, spoiled):
+        if after.normals is None:
+            continue
+        assert load(after.normals).dtype == np.uint16
+        old, new = unit_normals(before.normals), unit_normals(after.normals)
+        subject = load(before.normals).any(-1)
+        np.testing.assert_array_equal(load(after.normals).any(-1), subject)
+        assert np.abs(np.linalg.norm(new[subject], axis=-1) - 1).max() < 1e-3
+        angle = np.degrees(np.arctan2(np.linalg.norm(np.cross(old, new), axis=-1), (old * new).sum(-1)))
+        good = subject & (angle < 15 * times)  # of Rayleigh's distribution 1e-4 is above three times its rms
+        wrong += (subject & ~good).sum()
+        assert new[subject & ~good][:, 2].max() < 0  # towards the camera
+        count += subject.sum()
+        squares += (angle[good] ** 2).sum()
+        error = new - old
+        for lag, found in products.items():
+            both = good[:, lag:] & good[:, :-lag]
+            found.append((error[:, lag:] * error[:, :-lag]).sum(-1)[both].mean())
+    variance = squares / count * np.radians(1) ** 2
+    assert np.sqrt(squares / count) == pytest.approx(5 * times, rel=0.08)
+    # Of random directions towards the camera one in thirty, and with 30 degrees one in eight, lies near.
+    assert 0.75 * 0.02 * times < wrong / count < 0.02 * times
+    near, at, far = (np.mean(found) / variance for found in products.values())
+    assert near > 0.93 and 0.22 < at < 0.48 and abs(far) < 0.12
+
+
+def test_landmarks_have_noise_and_confident_outliers(source: Path, spoiled: Path) -> None:
+    times = amount(spoiled)
+    moved = []
+    for before, after in pairs(source, spoiled):
+        assert set(after.landmarks) == {"68", "many"}
+        for scheme, points in after.landmarks.items():
+            np.testing.assert_array_equal(points[:, 2], before.landmarks[scheme][:, 2])
+        moved.append((after.landmarks["many"] - before.landmarks["many"])[:, :2])
+    off = np.concatenate(moved)
+    distance = np.linalg.norm(off, axis=-1)
+    outlier = distance > 19.9
+    assert outlier.mean() == pytest.approx(0.05 * times, rel=0.25)
+    assert distance.max() < 80.001 and 45 < distance[outlier].mean() < 55
+    assert np.abs(off[outlier].mean(0)).max() < 12  # in all directions
+    np.testing.assert_allclose(off[~outlier].std(0), 2.0 * times, rtol=0.06)
+    np.testing.assert_allclose(off[~outlier].mean(0), 0, atol=0.2 * times)
+    assert abs(np.corrcoef(moved[0][:, 0], moved[1][:, 0])[0, 1]) < 0.15  # views by themselves
+
+
+def test_masks_grow_and_shrink(source: Path, spoiled: Path) -> None:
+    most_px = 2.0 * amount(spoiled)
+    grown = []
+    for before, after in pairs(source, spoiled):
+        old, new = load(before.mask), load(after.mask)
+        assert new.dtype == np.uint8 and new.max() == 255 and new.min() == 0
+        assert (old == new)[~boundary_band(old, int(most_px) + 1)].all()
+        areas = old.sum() / 255, new.sum() / 255
+        grown.append((areas[1] - areas[0]) / (2 * np.sqrt(np.pi * np.mean(areas))))  # over a circle's perimeter
+    assert np.abs(grown).max() < 1.1 * most_px  # the image of a ball at the side is an ellipse
+    assert np.abs(grown).max() > 0.3 * most_px and np.std(grown) > 0.2 * most_px
+
+
+def test_labels_move_by_class(source: Path, spoiled: Path) -> None:
+    most_px = 2 * amount(spoiled)
+    rim, middle = [], []
+    for before, after in pairs(source, spoiled):
+        old, new = load(before.segmentation), load(after.segmentation)
+        assert new.dtype == np.uint8 and set(np.unique(new)) == set(np.unique(old))
+        assert (old == new)[~boundary_band(old, most_px + 1)].all()
+        areas = [(labels > 0).sum() for labels in (old, new)]
+        rim.append((areas[1] - areas[0]) / (2 * np.sqrt(np.pi * np.mean(areas))))
+        inner = cv2.erode((old > 0).astype(np.uint8), np.ones((4 * most_px + 1,) * 2)) > 0
+        line_px = (np.diff((old == 2).astype(int), axis=1) != 0)[inner[:, 1:]].sum()
+        if line_px > 50:  # columns of right next to left
+            middle.append(((new == 2) & inner).sum() / line_px - ((old == 2) & inner).sum() / line_px)
+    for moved in (rim, middle):
+        assert 0.2 * most_px < np.abs(moved).max() < 1.15 * most_px
+    assert np.std(rim) > 0.15 * most_px
+
+
+def test_light_has_another_gain_and_noise(source: Path, spoiled: Path) -> None:
+    times = amount(spoiled)
+    gains = []
+    for before, after in pairs(source, spoiled):
+        assert load(after.image).dtype == np.uint8
+        old, new = linear(before.image), linear(after.image)
+        gain = new.mean((0, 1)) / old.mean((0, 1))
+        gains.append(gain)
+        noise = (new - gain * old) / np.sqrt(gain * old)
+        assert noise.std() == pytest.approx(0.02 * times, rel=0.05)
+        assert abs((noise[:, 1:] * noise[:, :-1]).mean()) < 0.05 * noise.var()
+    spread = np.array(gains)
+    common = spread.mean(-1, keepdims=True)
+    assert np.abs(common - 1).max() < 0.1 * times + 0.02
+    assert common.std() > 0.02 * times
+    assert 0.001 < np.abs(spread / common - 1).max() < 0.04 * times
+
+
+def test_views_are_dropped_whole(source: Path, spoiled: Path) -> None:
+    kept = {view.name for view in native.read(spoiled).views}
+    all_names = {view.name for view in native.read(source).views}
+    assert kept < all_names and len(kept) == len(all_names) - (1 if amount(spoiled) == 1 else 3)
+    normals = {str(path.relative_to(spoiled / "normals").with_suffix("")) for path in spoiled.glob("normals/**/*.png")}
+    for folder in FOLDERS:
+        names = {str(path.relative_to(spoiled / folder).with_suffix("")) for path in (spoiled / folder).rglob("*.*")}
+        assert names == (normals if folder == "normals" else kept)
+    assert len(kept) - len(normals) == (0 if amount(spoiled) == 1 else 1)
+    told = native.read(spoiled).tags["spoiled"]
+    assert all(name in told for name in all_names - kept)
+
+
+def test_the_truth_and_the_tags_stay_and_the_copy_is_sound(source: Path, spoiled: Path) -> None:
+    old, new = files(source), files(spoiled)
+    for name in ("scan.ply", "ground_truth.npz"):
+        assert new[name] == old[name]
+    settings = tomllib.loads(new["capture.toml"].decode())
+    assert settings.pop("spoiled").startswith("preset ")
+    assert settings == tomllib.loads(old["capture.toml"].decode())
+    report = check(spoiled)
+    assert report.eye_distance_mm == pytest.approx(90, abs=4)
+    assert [path.name for path in spoiled.parent.iterdir()] == ["capture"]
+
+
+@pytest.mark.parametrize("bits", [8, 16])
+def test_none_changes_nothing(bits: int, tmp_path: Path) -> None:
+    source = make(tmp_path / "source", distortion=DISTORTIONS["FULL_OPENCV"], bits=bits)
+    spoil(source, tmp_path / "copy", preset=PRESETS["none"], seed=3)
+    found = pairs(source, tmp_path / "copy")
+    assert len(found) == 5
+    for before, after in found:
+        for old, new in (
+            (before.image, after.image),
+            (before.mask, after.mask),
+            (before.normals, after.normals),
+            (before.segmentation, after.segmentation),
+        ):
+            assert load(new).dtype == load(old).dtype
+            np.testing.assert_array_equal(load(new), load(old))
+        np.testing.assert_array_equal(after.landmarks["68"], before.landmarks["68"])
+        np.testing.assert_allclose(after.camera.T_cam_world, before.camera.T_cam_world, rtol=0, atol=1e-14)
+        np.testing.assert_array_equal(after.camera.intrinsics, before.camera.intrinsics)
+        assert after.camera.distortion == before.camera.distortion
+    assert "0.03" in (tmp_path / "copy" / "sparse" / "points3D.txt").read_text()
+
+
+def test_deep_images_stay_deep(tmp_path: Path) -> None:
+    source = make(tmp_path / "source", bits=16)
+    spoil(source, tmp_path / "copy", preset=PRESETS["studio"])
+    for before, after in pairs(source, tmp_path / "copy"):
+        new = load(after.image)
+        assert new.dtype == np.uint16 and (new % 257 != 0).any()
+        assert linear(after.image).mean() == pytest.approx(linear(before.image).mean(), rel=0.13)
+
+
+def test_one_seed_is_one_copy(tmp_path: Path) -> None:
+    source = make(tmp_path / "source")
+    copies = [
+        files(spoil(source, tmp_path / f"copy{i}", preset=PRESETS["studio"], seed=seed))
+        for i, seed in enumerate((7, 7, 8))
+    ]
+    assert copies[0] == copies[1]
+    for name in copies[0].keys() & copies[2].keys():
+        if name.split("/")[0] in ("images", "masks", "normals", "landmarks") or name == "sparse/images.txt":
+            assert copies[0][name] != copies[2][name], name
+
+
+def test_a_view_can_be_broken(tmp_path: Path) -> None:
+    source = make(tmp_path / "source")
+    ramp = np.arange(100, 220, dtype=np.uint8)[:, None]  # over the image's width; beyond 167 it will be clipped
+    cv2.imwrite(str(source / "images" / "cam2.png"), np.tile(ramp, (160, 1, 3)))
+    breaks = {"cam0": ["shifted"], "cam1": ["black"], "cam2": ["exposure"], "cam3": ["black", "shifted"]}
+    spoil(source, tmp_path / "copy", preset=PRESETS["none"], breaks=breaks)
+    found = dict(zip((view.name for view in native.read(source).views), pairs(source, tmp_path / "copy"), strict=True))
+    for name, (before, after) in found.items():
+        shift = 30 if "shifted" in breaks.get(name, []) else 0
+        np.testing.assert_allclose(after.landmarks["68"], before.landmarks["68"] + [shift, 0, 0], atol=1e-9)
+        np.testing.assert_allclose(after.camera.T_cam_world, before.camera.T_cam_world, rtol=0, atol=1e-14)
+        for old, new in (
+            (before.mask, after.mask),
+            (before.normals, after.normals),
+            (before.segmentation, after.segmentation),
+            *([] if name in ("cam1", "cam2", "cam3") else [(before.image, after.image)]),
+        ):
+            np.testing.assert_array_equal(load(new)[:, shift:], load(old)[:, : 120 - shift])
+            assert (load(new)[:, :shift] == load(old)[:, :1]).all()
+    for name in ("cam1", "cam3"):
+        assert load(found[name][1].image).max() == 0
+    old, new = (linear(view.image) for view in found["cam2"])
+    bright = 2.5 * old > 1.01
+    assert 0.02 < bright.mean() < 0.98
+    assert (new[bright] == 1).all()
+    np.testing.assert_allclose(new[~bright], 2.5 * old[~bright], atol=0.006)  # half a step of 8 bits
+
+
+def test_a_broken_view_stays_and_leaves_the_others_alone(tmp_path: Path) -> None:
+    source = make(tmp_path / "source")
+    names = [f"cam{i}" for i in range(5)]
+    plain = files(spoil(source, tmp_path / "plain", preset=PRESETS["studio"], seed=2))
+    dropped = next(name for name in names if f"images/{name}.png" not in plain)
+    first = next(name for name in names if name != dropped)
+    broken = files(
+        spoil(source, tmp_path / "broken", preset=PRESETS["studio"], seed=2, breaks={first: ["exposure", "shifted"]})
+    )
+    changed = {name for name in plain if plain[name] != broken.get(name)}
+    assert changed == {"capture.toml", *(f"{folder}/{first}.png" for folder in FOLDERS[:4]), f"landmarks/{first}.json"}
+    other = files(spoil(source, tmp_path / "other", preset=PRESETS["studio"], seed=2, breaks={dropped: ["black"]}))
+    assert f"images/{dropped}.png" in other
+    assert sum(f"images/{name}.png" in other for name in names) == 4
+
+
+@pytest.mark.parametrize(
+    "options, what, told",
+    [
+        ({"breaks": {"cam9": ["black"]}}, "no such view", "cam9"),
+        ({"breaks": {"cam1": ["black", "bent"]}}, "cannot be broken like this", "bent"),
+        ({"preset": Preset(name="few", dropped_views=4)}, "Too few views", "5 views"),
+        (
+            {"preset": PRESETS["harsh"], "breaks": dict.fromkeys(("cam0", "cam1", "cam2"), ["black"])},
+            "Too few views",
+            "3 of them to be broken",
+        ),
+        ({"seed": -1}, "seed is out of range", "-1"),
+    ],
+)
+def test_bad_wishes_are_told_before_anything_is_written(options: dict, what: str, told: str, tmp_path: Path) -> None:
+    source = make(tmp_path / "source")
+    with pytest.raises(InputError) as error:
+        spoil(source, tmp_path / "out" / "copy", **{"preset": PRESETS["studio"], **options})
+    assert what in error.value.what and told in str(error.value)
+    assert list(tmp_path.iterdir()) == [source]
+
+
+def test_bad_captures_are_told_before_anything_is_written(tmp_path: Path) -> None:
+    source = make(tmp_path / "source")
+    copy = spoil(source, tmp_path / "copy", preset=PRESETS["studio"])
+    before = files(tmp_path)
+
+    def refused(root: Path, target: str, what: str) -> None:
+        with pytest.raises(InputError, match=what):
+            spoil(root, tmp_path / target, preset=PRESETS["studio"])
+
+    refused(source, "copy", "exists already")
+    refused(copy, "again", "is a spoiled one")
+    refused(tmp_path / "nowhere", "again", "capture folder is missing")
+    assert files(tmp_path) == before
+    shutil.rmtree(source / "landmarks")
+    (source / "scan.ply").unlink()
+    refused(source, "again", "where the subject is")
+    cv2.imwrite(str(source / "masks" / "cam2.png"), np.zeros((160, 120), np.uint8))
+    refused(source, "again", "mask is empty")
+    assert not (tmp_path / "again").exists()
+
+
+@pytest.mark.slow
+@needs_shared
+@pytest.mark.parametrize("name", ["ict_dev/neutral", "gnm_identity_a/happy"])
+@pytest.mark.parametrize("preset", ["studio", "harsh"])
+def test_spoiled_heads_are_sound_captures(name: str, preset: str, tmp_path: Path) -> None:
+    source = SHARED / "data" / "captures" / name
+    report = check(spoil(source, tmp_path / "copy", preset=PRESETS[preset], seed=1))
+    capture: Capture = report.capture
+    assert len(capture.views) == 22 - PRESETS[preset].dropped_views
+    assert report.eye_distance_mm == pytest.approx(check(source).eye_distance_mm, abs=5)
+    points = read_scan(source / "scan.ply").vertices
+    for before, after in pairs(source, tmp_path / "copy"):
+        moved = after.camera.project(points)[0] - before.camera.project(points)[0]
+        assert np.sqrt((moved**2).sum(-1).mean()) == pytest.approx(PRESETS[preset].camera_rms_px, rel=0.05)

@@ -1,0 +1,120 @@
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from registration.capture import native
+from registration.capture.doctor import eye_distance
+from registration.capture.triangulation import jaw_disorder, residuals, triangulate
+from registration.types import Camera, Capture, View
+from tests.conftest import SHARED, needs_shared
+from tests.registration.capture.small import DISTORTIONS, TURNS, camera, distorted, landmarks_68
+
+
+def capture_of(cameras: list[Camera], edit: Callable[[int, np.ndarray], None] = lambda view, rows: None) -> Capture:
+    """Views that see the 68 landmarks exactly, then `edit` spoils their rows (x, y, confidence) in place."""
+    views = []
+    for number, cam in enumerate(cameras):
+        rows = np.column_stack([distorted(cam, landmarks_68()), np.ones(68)])
+        edit(number, rows)
+        views.append(View(name=f"cam{number}", camera=cam, image=Path("unused.png"), landmarks={"68": rows}))
+    return Capture(root=Path("unused"), subject="s", expression="e", views=tuple(views))
+
+
+@pytest.mark.parametrize("distortion", [(), *DISTORTIONS.values()])
+def test_exact_landmarks_come_back(distortion: tuple[float, ...]) -> None:
+    points, used, residual = triangulate(capture_of([camera(turn, distortion=distortion) for turn in TURNS]), "68")
+    np.testing.assert_allclose(points, landmarks_68(), atol=1e-8)
+    assert (used == len(TURNS)).all() and (residual < 1e-4).all()
+
+
+@pytest.mark.parametrize("count", [3, 5])
+def test_one_broken_view_spoils_nothing(count: int) -> None:
+    def swap_sides(view: int, rows: np.ndarray) -> None:
+        if view == 1:
+            rows[:, 0] = 120 - rows[:, 0]
+            rows[:, 1] += 25
+
+    capture = capture_of([camera(turn) for turn in TURNS[:count]], swap_sides)
+    points, used, residual = triangulate(capture, "68")
+    np.testing.assert_allclose(points, landmarks_68(), atol=1e-8)
+    assert (used == count - 1).all() and (residual < 1e-4).all()
+    assert (residuals(capture.views[1], "68", points) > 5).all()
+    assert (residuals(capture.views[0], "68", points) < 1e-4).all()
+
+
+def test_the_solution_minimises_reprojection_error() -> None:
+    rng = np.random.default_rng(0)
+
+    def blur(view: int, rows: np.ndarray) -> None:
+        rows[:, :2] += rng.normal(0, 0.2, (68, 2))
+
+    capture = capture_of([camera(turn) for turn in np.linspace(-1.2, 1.2, 12)], blur)
+    points, used, residual = triangulate(capture, "68")
+    assert (used == 12).all()
+
+    def cost(xyz: np.ndarray) -> np.ndarray:
+        return np.stack([residuals(view, "68", xyz) ** 2 for view in capture.views]).mean(0)
+
+    np.testing.assert_allclose(cost(points), residual**2, rtol=1e-9)
+    for step in 3e-5 * np.concatenate([np.eye(3), -np.eye(3)]):  # about 0.02 px
+        assert (cost(points + step) > cost(points)).mean() > 0.98
+    assert np.linalg.norm(points - landmarks_68(), axis=-1).mean() < 4e-4
+
+
+def test_confidence_and_number_of_views() -> None:
+    def hide(view: int, rows: np.ndarray) -> None:
+        rows[3, 2] = 0.5  # not used
+        rows[4, 2] = 0.6 if view < 2 else 0.0
+        rows[5, 2] = 1.0 if view == 0 else 0.0
+
+    points, used, residual = triangulate(capture_of([camera(turn) for turn in TURNS], hide), "68")
+    assert used[3] == 0 and used[4] == 2 and used[5] == 0
+    assert np.isnan(points[[3, 5]]).all() and np.isnan(residual[[3, 5]]).all()
+    np.testing.assert_allclose(points[4], landmarks_68()[4], atol=1e-8)
+
+
+def test_cameras_at_one_place_determine_no_depth() -> None:
+    points, used, _ = triangulate(capture_of([camera(0.2), camera(0.2, width_px=240, height_px=320)]), "68")
+    assert np.isnan(points).all() and (used == 0).all()
+
+
+def test_a_scheme_that_no_view_has_is_empty() -> None:
+    points, used, residual = triangulate(capture_of([camera(turn) for turn in TURNS]), "478")
+    assert points.shape == (0, 3) and used.shape == residual.shape == (0,)
+
+
+def test_views_without_the_scheme_are_passed_over() -> None:
+    capture = capture_of([camera(turn) for turn in TURNS])
+    capture = replace(capture, views=(replace(capture.views[0], landmarks={}), *capture.views[1:]))
+    points, used, _ = triangulate(capture, "68")
+    np.testing.assert_allclose(points, landmarks_68(), atol=1e-8)
+    assert (used == len(TURNS) - 1).all()
+
+
+def test_jaw_order() -> None:
+    points = landmarks_68()
+    assert jaw_disorder(points) == []
+    turned = points.copy()
+    turned[2:7] = turned[2:7][::-1]
+    assert jaw_disorder(turned) == [2, 3, 4, 5, 6]
+    mirrored = points.copy()
+    mirrored[:17] = mirrored[:17][::-1]
+    assert jaw_disorder(mirrored) == list(range(17))
+    points[[4, 9]] = np.nan
+    assert jaw_disorder(points) == []
+    points[27] = np.nan
+    assert jaw_disorder(points) == []
+
+
+@needs_shared
+def test_shared_landmarks() -> None:
+    captures = SHARED / "data" / "captures"
+    for name, disorder in (("gnm_identity_a/neutral", [2, 3, 4, 5, 6]), ("ict_dev/jaw_open", [])):
+        points, used, residual = triangulate(native.read(captures / name), "68")
+        distance = eye_distance(points)
+        assert distance is not None and 0.085 < distance < 0.095
+        assert used.min() >= 9 and residual.max() < 0.01
+        assert jaw_disorder(points) == disorder

@@ -1,0 +1,147 @@
+"""Update rules against their formulas, and the loop on problems whose answers are known."""
+
+import pytest
+import torch
+
+from registration.fit.optimizer import AdamBlock, AdamUniformBlock, Rate, minimise
+
+
+def test_a_rate_is_held_and_then_falls_by_equal_ratios():
+    rate = Rate(start=0.1, end=0.001, hold=0.5)
+    assert [rate.at(p) for p in (0.0, 0.3, 0.5, 0.75, 1.0)] == pytest.approx([0.1, 0.1, 0.1, 0.01, 0.001])
+    assert Rate(start=2.0, end=0.5).at(0.5) == pytest.approx(1.0)
+    assert Rate(start=0.3, end=0.1, hold=1.0).at(1.0) == pytest.approx(0.3)
+
+
+def test_adam_steps_by_its_rate():
+    """Adam's first step is the rate, whatever the gradient's size."""
+    for progress, size in ((0.0, 0.1), (1.0, 0.01)):
+        tensor = torch.zeros(3, requires_grad=True)
+        block = AdamBlock([tensor], Rate(start=0.1, end=0.01))
+        tensor.grad = torch.tensor([5.0, -1e-3, 0.0])
+        block.step(progress)
+        torch.testing.assert_close(tensor.detach(), torch.tensor([-size, size, 0.0]), atol=1e-4 * size, rtol=1e-4)
+
+
+def paper_updates(gradients: list[torch.Tensor], rate: float, b1: float, b2: float) -> torch.Tensor:
+    """Nicolet 2021: Adam with the largest second moment of all coordinates, as released (`AdamUniform`)."""
+    g1 = g2 = torch.zeros_like(gradients[0])
+    total = torch.zeros_like(gradients[0])
+    for step, gradient in enumerate(gradients, start=1):
+        g1 = b1 * g1 + (1 - b1) * gradient
+        g2 = b2 * g2 + (1 - b2) * gradient.square()
+        total -= rate * (g1 / (1 - b1**step)) / (1e-8 + (g2 / (1 - b2**step)).max().sqrt())
+    return total
+
+
+def test_adam_uniform_is_the_papers_where_one_coordinate_leads(monkeypatch):
+    """Ours measures a vertex' gradient by its length and averages the largest; the paper's the largest average
+    coordinate. With one vertex ahead all the way, along one axis, they are the same."""
+    monkeypatch.setattr(AdamUniformBlock, "QUANTILE", 1.0)
+    rng = torch.Generator().manual_seed(0)
+    gradients = [torch.randn(50, 3, generator=rng, dtype=torch.float64) for _ in range(12)]
+    for gradient in gradients:
+        gradient[7] = torch.tensor([0.0, 20.0 + 10 * gradient[7, 0], 0.0])
+    latent = torch.zeros(50, 3, dtype=torch.float64, requires_grad=True)
+    block = AdamUniformBlock(latent, Rate(start=0.02, end=0.02), betas=(0.9, 0.99))
+    for gradient in gradients:
+        latent.grad = gradient
+        block.step(0.5)
+    torch.testing.assert_close(latent.detach(), paper_updates(gradients, 0.02, 0.9, 0.99), rtol=1e-5, atol=1e-9)
+
+
+def test_adam_uniform_keeps_directions():
+    """Unlike Adam's, a step is a multiple of the gradient field."""
+    gradient = torch.randn(40, 3, generator=torch.Generator().manual_seed(1))
+    latent = torch.zeros(40, 3, requires_grad=True)
+    block = AdamUniformBlock(latent, Rate(start=0.1, end=0.1))
+    latent.grad = gradient
+    block.step(0.0)
+    ratio = latent.detach() / gradient
+    torch.testing.assert_close(ratio, ratio[0, 0].expand(40, 3))
+    assert latent.detach().norm(dim=1).max() == pytest.approx(0.1, rel=0.15)
+
+
+def test_one_wild_vertex_does_not_rule():
+    gradient = torch.randn(2000, 3, generator=torch.Generator().manual_seed(1))
+    steps = []
+    for wild in (1.0, 1e4):
+        latent = torch.zeros(2000, 3, requires_grad=True)
+        latent.grad = gradient.clone()
+        latent.grad[0] *= wild
+        AdamUniformBlock(latent, Rate(start=0.1, end=0.1)).step(0.0)
+        steps.append(latent.detach()[1:].norm())
+    assert steps[1] > 0.9 * steps[0]
+
+
+def test_a_quadratic_is_solved():
+    """Two blocks, one of each rule, coupled through one residual."""
+    rng = torch.Generator().manual_seed(0)
+    target = torch.randn(30, 3, generator=rng)
+    field, shift = torch.zeros(30, 3, requires_grad=True), torch.zeros(3, requires_grad=True)
+
+    def objective(step: int) -> dict[str, torch.Tensor]:
+        return {"fit": (field + shift - target).square().mean(), "small": 1e-3 * field.square().mean()}
+
+    rate = Rate(start=0.1, end=1e-4, hold=0.5)
+    blocks = [AdamUniformBlock(field, rate), AdamBlock([shift], rate)]
+    seen: list[int] = []
+    history, failure = minimise(blocks, objective, 300, seen.append)
+    assert failure is None and seen == list(range(300))
+    assert {name: len(values) for name, values in history.items()} == {"fit": 300, "small": 300}
+    assert history["fit"][0] == pytest.approx(target.square().mean().item())
+    assert history["fit"][-1] < 1e-4 * history["fit"][0]
+    torch.testing.assert_close((field + shift).detach(), target, atol=0.01, rtol=0)
+
+
+def test_the_rate_follows_the_steps():
+    progress: list[float] = []
+
+    class Recorder:
+        tensors = (torch.zeros(1, requires_grad=True),)
+
+        def step(self, share: float) -> None:
+            progress.append(share)
+
+    block = Recorder()
+    minimise([block], lambda step: {"a": block.tensors[0].sum()}, 5)
+    assert progress == [0.0, 0.25, 0.5, 0.75, 1.0]
+    minimise([block], lambda step: {"a": block.tensors[0].sum()}, 1)
+    assert progress[5:] == [0.0]
+
+
+def test_gradients_do_not_add_up_over_steps():
+    tensor = torch.zeros(1, requires_grad=True)
+    seen: list[float] = []
+    minimise(
+        [AdamBlock([tensor], Rate(start=1e-3, end=1e-3))],
+        lambda step: {"a": 2 * tensor.sum()},
+        4,
+        lambda step: seen.append(tensor.grad.item()),
+    )
+    assert seen == [2.0] * 4
+
+
+@pytest.mark.parametrize("bad", [float("nan"), float("inf")])
+def test_a_term_that_is_not_finite_stops_the_loop(bad):
+    """It is named, it is in the history, and the unknowns are those before that step."""
+    tensor = torch.ones(2, requires_grad=True)
+    kept: list[torch.Tensor] = []
+
+    def objective(step: int) -> dict[str, torch.Tensor]:
+        return {"good": tensor.square().sum(), "bad": tensor.sum() * (bad if step == 3 else 1.0)}
+
+    block = AdamBlock([tensor], Rate(start=0.1, end=0.1))
+    history, failure = minimise([block], objective, 10, lambda step: kept.append(tensor.detach().clone()))
+    assert failure == "bad not finite at step 3"
+    assert len(kept) == 3 and len(history["bad"]) == len(history["good"]) == 4
+    torch.testing.assert_close(tensor.detach(), kept[-1])
+
+
+def test_a_gradient_that_is_not_finite_stops_the_loop():
+    """The root of zero is fine, its slope is not."""
+    tensor = torch.zeros(2, requires_grad=True)
+    block = AdamBlock([tensor], Rate(start=0.1, end=0.1))
+    _, failure = minimise([block], lambda step: {"root": (0 * tensor).sqrt().sum()}, 3)
+    assert failure == "gradient not finite at step 0"
+    assert (tensor.detach() == 0).all()

@@ -1,0 +1,130 @@
+"""Penalties on offsets do what their lengths say, measured on waves and on a pinned line."""
+
+import numpy as np
+import pytest
+import torch
+
+from registration.losses.regularization import Elasticity, prior, strengths
+from tests.registration.geometry.test_large_steps import lattice, wave
+
+EDGE_M = 0.0005
+
+
+def elasticity(columns: int, rows: int, half_gain_m: float, decay_m: float = 0.025) -> Elasticity:
+    points, triangles = lattice(columns, rows)
+    # The lattice closes on itself, so its positions do not tell its edges' lengths: unfold one cell of it.
+    count = columns * rows
+    flat = Elasticity(
+        triangles,
+        np.concatenate([points, np.zeros((count, 1))], 1) * EDGE_M,
+        half_gain_m=np.full(count, half_gain_m),
+        decay_m=np.full(count, decay_m),
+        device=torch.device("cpu"),
+    )
+    inner = flat._membrane.median(), flat._bending.median()  # of vertices whose edges do not wrap around
+    flat._membrane.fill_(inner[0])
+    flat._bending.fill_(inner[1])
+    return flat
+
+
+def kept(penalty: Elasticity, mode: torch.Tensor) -> float:
+    """What a fit to `mode`, pulled with strength one, keeps of it: the minimum over the mode's height."""
+    height = torch.tensor(0.0, dtype=torch.float32, requires_grad=True)
+    rest = (height * mode - mode).square().sum(-1).mean() + sum(penalty(height * mode).values())
+    (slope,) = torch.autograd.grad(rest, height, create_graph=True)
+    (curvature,) = torch.autograd.grad(slope, height)
+    return -slope.item() / curvature.item()
+
+
+@pytest.mark.parametrize("turns", [(2, 0), (0, 3), (3, 1), (5, 4)])
+@pytest.mark.parametrize("half_gain_mm", [4.0, 12.0])
+def test_gain_of_waves(turns, half_gain_mm):
+    """Eigenmodes of 4 to 30 mm keep 1 / (1 + a + b q^2 + c q^4), within 5 %."""
+    columns, rows = 60, 60
+    field, k = wave(columns, rows, turns)
+    mode = torch.tensor(np.outer(0.001 * field, [0.6, 0, 0.8]), dtype=torch.float32)
+    a, b, c = (float(s[0]) for s in strengths(np.array([half_gain_mm * 1e-3]), np.array([0.025])))
+    q = np.linalg.norm(k) / EDGE_M
+    found = kept(elasticity(columns, rows, half_gain_mm * 1e-3), mode)
+    assert found == pytest.approx(1 / (1 + a + b * q**2 + c * q**4), rel=0.05)
+
+
+def test_half_of_a_wave_of_the_half_gain_length_is_kept():
+    field, k = wave(60, 60, (3, 0))
+    length_m = 2 * np.pi / np.linalg.norm(k) * EDGE_M
+    mode = torch.tensor(np.outer(0.001 * field, [0, 0, 1]), dtype=torch.float32)
+    assert kept(elasticity(60, 60, length_m), mode) == pytest.approx(0.5, abs=0.02)
+
+
+def test_an_offset_without_data_decays_over_the_decay_length():
+    """One column of a long strip is held 1 mm up: the others sink by a factor e every 25 mm."""
+    columns, rows, edge_m = 120, 6, 0.002
+    points, triangles = lattice(columns, rows)
+    count = columns * rows
+    flat = np.concatenate([points, np.zeros((count, 1))], 1) * edge_m
+    penalty = Elasticity(
+        triangles,
+        flat,
+        half_gain_m=np.full(count, 0.004),
+        decay_m=np.full(count, 0.025),
+        device=torch.device("cpu"),
+    )
+    for values in (penalty._membrane, penalty._bending):
+        values.fill_(values.median())
+    column = torch.arange(count) % columns
+    height = torch.zeros(count, 3, dtype=torch.float64)
+    free = (column > 0).nonzero()[:, 0]
+    penalty._l2, penalty._membrane, penalty._bending = (
+        v.double() for v in (penalty._l2, penalty._membrane, penalty._bending)
+    )
+    penalty._laplacian = penalty._laplacian.double()
+
+    def energy(lifted: torch.Tensor) -> torch.Tensor:
+        offsets = height.index_copy(0, free, lifted[:, None] * torch.tensor([0.0, 0, 1], dtype=torch.float64))
+        offsets = offsets + 0.001 * (column == 0)[:, None] * torch.tensor([0.0, 0, 1], dtype=torch.float64)
+        return 1e12 * sum(penalty(offsets).values())
+
+    unknown = torch.zeros(len(free), dtype=torch.float64, requires_grad=True)
+    optimizer = torch.optim.LBFGS([unknown], max_iter=2000, tolerance_grad=1e-14, tolerance_change=1e-18)
+    optimizer.zero_grad()
+
+    def closure() -> torch.Tensor:
+        optimizer.zero_grad()
+        value = energy(unknown)
+        value.backward()
+        return value
+
+    optimizer.step(closure)
+    lifted = unknown.detach()
+    near, far = (lifted[column[free] == distance].mean().item() for distance in (5, 15))
+    apart = 10 * np.sqrt(0.75) * edge_m  # columns lean, so they are nearer to each other than an edge is long
+    assert apart / np.log(near / far) == pytest.approx(0.025, rel=0.03)
+
+
+def test_stiffness_is_per_place():
+    """The same bump costs more where the half-gain wavelength is longer."""
+    points, triangles = lattice(40, 40)
+    count = 1600
+    half = np.where(np.arange(count) % 40 < 20, 0.004, 0.008)
+    penalty = Elasticity(
+        triangles,
+        np.concatenate([points, np.zeros((count, 1))], 1) * EDGE_M,
+        half_gain_m=half,
+        decay_m=np.full(count, 0.025),
+        device=torch.device("cpu"),
+    )
+    costs = []
+    for place in (20 * 40 + 10, 20 * 40 + 30):
+        bump = torch.zeros(count, 3)
+        bump[place, 2] = 0.001
+        costs.append(float(penalty(bump)["offset laplacian"]))
+    assert costs[1] == pytest.approx(16 * costs[0], rel=1e-3)
+
+
+def test_prior():
+    coefficients = torch.tensor([1.0, -2.0, 0.0], requires_grad=True)
+    value = prior(coefficients)
+    assert value.item() == pytest.approx(5 / 3)
+    value.backward()
+    torch.testing.assert_close(coefficients.grad, torch.tensor([2 / 3, -4 / 3, 0.0]))
+    assert prior(torch.zeros(0)).item() == 0

@@ -1,0 +1,226 @@
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from scipy.spatial.transform import Rotation
+
+from bench.support.crossed_parts import (
+    displaced,
+    moved,
+    pressed_lid,
+    raised_lower_lip,
+    teeth_of,
+    tooth_depths_mm,
+    winding,
+)
+from registration.errors import InputError
+from registration.geometry.topology import vertex_normals
+from registration.losses.self_intersection import SelfIntersection
+from registration.model import gnm_npz, regions
+from registration.model.gnm_npz import GNMData
+from tests.conftest import SHARED, needs_shared
+from tests.fixtures.make_fixtures import tiny_model
+
+CPU = torch.device("cpu")
+PAIRS = (
+    "lids-eyeballs",
+    "lips-teeth",
+    "upper-lower lip",
+    "tongue-teeth",
+    "tongue-lips",
+    "tongue-palate",
+    "tongue-gums",
+    "ears-head",
+)
+MARGIN_MM = 0.05
+
+
+@pytest.fixture(scope="module")
+def full() -> GNMData:
+    return gnm_npz.read(SHARED / "data" / "gnm" / "gnm_head_reconstructed.npz")
+
+
+@pytest.fixture(scope="module")
+def penalty(full) -> SelfIntersection:
+    return SelfIntersection(full, CPU)
+
+
+def template(data: GNMData) -> torch.Tensor:
+    return torch.as_tensor(data.template_vertex_positions)
+
+
+def posed(vertices: torch.Tensor, scale: float) -> torch.Tensor:
+    turn = torch.as_tensor(Rotation.from_rotvec([0.5, -0.8, 0.3]).as_matrix(), dtype=vertices.dtype)
+    return scale * vertices @ turn.T + torch.tensor([0.7, -0.3, 1.1], dtype=vertices.dtype)
+
+
+def squeezed(data: GNMData) -> torch.Tensor:
+    """Both ears pressed against the head."""
+    inwards = np.zeros((len(data.template_vertex_positions), 3))
+    inwards[:, 0] = -0.022 * np.sign(data.template_vertex_positions[:, 0])
+    away = np.abs(data.template_vertex_positions[:, 0])
+    return displaced(data, regions.ears(data) & (away > 0.083), inwards)
+
+
+CROSSED: dict[str, Callable[[GNMData], torch.Tensor]] = {
+    "lids-eyeballs": lambda data: pressed_lid(data, 1.0),
+    "lips-teeth": lambda data: moved(data, regions.lips(data)[0], (0.0, 0.0, -6.0)),
+    "upper-lower lip": lambda data: raised_lower_lip(data, 2.0),
+    "tongue-teeth": lambda data: moved(data, regions.tongue(data), (4.0, 0.0, 0.0)),
+    "tongue-lips": lambda data: moved(data, regions.tongue(data), (0.0, 2.0, 15.0)),
+    "tongue-palate": lambda data: moved(data, regions.tongue(data), (0.0, 14.0, 0.0)),
+    "tongue-gums": lambda data: moved(data, regions.tongue(data), (0.0, -4.0, 6.0)),
+    "ears-head": squeezed,
+}
+
+
+@pytest.mark.parametrize("model", ["tiny", pytest.param("full", marks=needs_shared)])
+def test_a_template_costs_nothing_wherever_it_is(model, request):
+    data = tiny_model() if model == "tiny" else request.getfixturevalue("full")
+    penalty = SelfIntersection(data, CPU)
+    for vertices in (template(data), posed(template(data), 1.0), posed(template(data), 1.3)):
+        vertices = vertices.clone().requires_grad_(True)
+        penalty.refresh(vertices)
+        costs = penalty(vertices)
+        assert tuple(costs) == PAIRS and all(cost.shape == () and cost.item() == 0 for cost in costs.values())
+        torch.stack(list(costs.values())).sum().backward()
+        assert not vertices.grad.any()
+
+
+@pytest.mark.parametrize("name", ["eye_exteriors", "upper_lip", "lower_lip_region", "ears", "teeth", "tongue", "gums"])
+def test_a_missing_part_is_named(name):
+    data = tiny_model()
+    keep = data.vertex_group_names != name
+    lacking = replace(data, vertex_groups=data.vertex_groups[keep], vertex_group_names=data.vertex_group_names[keep])
+    with pytest.raises(InputError, match=f"no vertex group '{name}'"):
+        SelfIntersection(lacking, CPU)
+
+
+@pytest.mark.parametrize("name", ["teeth", "tongue", "ears", "gums", "lower_lip", "upper_lip"])
+def test_a_part_without_vertices_touches_nothing(name):
+    data = tiny_model()
+    groups = data.vertex_groups.copy()
+    groups[[k for k, group in enumerate(data.vertex_group_names) if group in (name, f"{name}_region")]] = 0
+    penalty = SelfIntersection(replace(data, vertex_groups=groups), CPU)
+    assert not any(penalty(template(data)).values())
+
+
+def test_a_tooth_in_the_tongue_pushes_both():
+    data = tiny_model()
+    penalty = SelfIntersection(data, CPU)
+    vertices = moved(data, regions.tongue(data), (0.0, -8.0, 0.0)).requires_grad_(True)
+    penalty.refresh(vertices)
+    penalty(vertices)["tongue-teeth"].backward()
+    up, tongue, teeth = vertices.grad[:, 1], regions.tongue(data), regions.teeth(data)
+    assert up[tongue].sum() < 0 < up[teeth].sum() and not up[~(tongue | teeth)].any()  # the gradient looks uphill
+    assert up.sum().abs() < 1e-4 * up[teeth].sum()
+
+
+@needs_shared
+@pytest.mark.parametrize("pair", PAIRS)
+def test_gradients_of_every_pair(full, penalty, pair):
+    vertices = CROSSED[pair](full).double()
+    penalty.refresh(vertices)
+    at = vertices.clone().requires_grad_(True)
+    cost = penalty(at)[pair]
+    cost.backward()
+    assert cost.item() > 1
+    generator = torch.Generator().manual_seed(0)
+    along = 0.3 * torch.randn(at.shape, dtype=at.dtype, generator=generator) + at.grad / at.grad.abs().max()
+    high, low = (penalty(vertices + sign * 1e-8 * along)[pair] for sign in (1, -1))
+    assert float((at.grad * along).sum()) == pytest.approx(float(high - low) / 2e-8, rel=0.01)
+    # Moving everything alike changes nothing: what one side gets the other gives.
+    assert at.grad.sum(0).abs().max() < 1e-6 * at.grad.abs().sum()
+
+
+@needs_shared
+def test_excess_is_in_millimetres_of_the_head_at_hand(full, penalty):
+    vertices = CROSSED["tongue-teeth"](full)
+    penalty.refresh(vertices)
+    excess, cost = penalty.excess_mm(vertices)["tongue-teeth"], penalty(vertices)["tongue-teeth"]
+    assert excess.max() > 1 and excess.square().sum() <= cost * (1 + 1e-5)
+    for scale in (0.5, 1.2):
+        elsewhere = posed(vertices, scale)
+        penalty.refresh(elsewhere)
+        torch.testing.assert_close(
+            penalty.excess_mm(elsewhere)["tongue-teeth"], scale * excess, atol=1e-3, rtol=0, check_dtype=False
+        )
+        assert float(penalty(elsewhere)["tongue-teeth"]) == pytest.approx(scale**2 * float(cost), rel=2e-3)
+
+
+def test_what_is_accepted_costs_nothing_in_its_pairs_alone():
+    data = tiny_model()
+    penalty = SelfIntersection(data, CPU)
+    crossed = moved(data, regions.tongue(data), (0.0, -8.0, 0.0))
+
+    def cost(pair: str) -> float:
+        penalty.refresh(crossed)
+        return penalty(crossed)[pair].item()
+
+    before = cost("tongue-teeth")
+    penalty.accept(posed(crossed, 1.2), ["lips-teeth"])
+    assert cost("tongue-teeth") == before > 0
+    penalty.accept(posed(crossed, 1.2), ["tongue-teeth"])
+    assert cost("tongue-teeth") < 1e-6 * before  # what turning it did to its numbers
+    penalty.accept(template(data))  # what was accepted before is forgotten
+    assert cost("tongue-teeth") == before
+
+
+def outside(data: GNMData, vertices: torch.Tensor, excess: torch.Tensor) -> np.ndarray:
+    """Whether each vertex that has an excess lies outside the skin all the same."""
+    skin = data.triangles[(regions.components(data) == 0)[data.triangles].all(1)].astype(np.int64)
+    deep = excess.nonzero()[:, 0]
+    points = vertices[deep] + 5e-5 * vertex_normals(vertices, torch.as_tensor(skin))[deep]
+    return winding(points.double().numpy(), vertices.double().numpy()[skin]) < 0.5
+
+
+@needs_shared
+def test_skin_at_the_corners_of_the_mouth_is_not_in_the_other_lip(full, penalty):
+    """A face that purses its lips: behind the skin beside them lies the lining of the other lip, through the flesh."""
+    vertices, random = template(full).numpy().astype(np.float64), np.random.default_rng(5)
+    for basis, share in ((full.expression_basis[200:350], 0.5), (full.expression_basis[350:382], 0.3)):
+        vertices = vertices + np.einsum("e,evc->vc", random.normal(size=len(basis)) * share, basis)
+    basis = full.vertex_identity_basis
+    head = torch.as_tensor(vertices + np.einsum("e,evc->vc", random.normal(size=len(basis)), basis)).float()
+    penalty.refresh(head)
+    excess = penalty.excess_mm(head)["upper-lower lip"]
+    # By the closest surface alone, 16 vertices of the skin beside the mouth would be up to 7 mm too deep.
+    assert 0 < excess.count_nonzero() < 10 and not outside(full, head, excess).any()
+
+
+@needs_shared
+def test_what_official_faces_do_by_themselves(full, penalty):
+    """Every lip vertex that is too deep is indeed inside the head; a wide open mouth costs nothing."""
+    samples = np.load(SHARED / "data" / "gnm" / "gnm_real_samples.npz")
+    names = [*samples["identity_names"].tolist(), *samples["expression_names"].tolist()]
+    deepest = {}
+    for name, delta in zip(names, [*samples["identity_deltas"], *samples["expression_deltas"]], strict=True):
+        vertices = template(full) + torch.as_tensor(delta)
+        penalty.refresh(vertices)
+        found = penalty.excess_mm(vertices)
+        deepest[name] = {pair: float(excess.max()) for pair, excess in found.items()}
+        assert not outside(full, vertices, found["upper-lower lip"]).any(), name
+    assert 0 < deepest["surprise"].pop("tongue-gums") < 0.1 and not any(deepest["surprise"].values())
+    assert 0.4 < deepest["identity_a"]["upper-lower lip"] < 0.8  # lips that end before their lining give 1.7
+    assert 0.8 < deepest["pucker"]["upper-lower lip"] < 1.4 and 2.5 < deepest["pucker"]["tongue-palate"] < 3.5
+    assert max(found["lips-teeth"] + found["ears-head"] for found in deepest.values()) == 0
+
+
+@needs_shared
+@pytest.mark.parametrize("direction", [(1.0, 0.0, 0.0), (-0.7, 0.3, 0.7)])
+def test_a_tongue_pushed_into_the_teeth(full, penalty, direction):
+    tongue = regions.tongue(full)
+    teeth = teeth_of(full)
+    assert len(teeth) == 32
+    deepest = []
+    for push in (0.0, 1.0, 2.0, 3.0, 4.0, 5.0):
+        vertices = moved(full, tongue, tuple(push * axis for axis in direction))
+        penalty.refresh(vertices)
+        found = penalty.excess_mm(vertices)["tongue-teeth"].numpy()[tongue]
+        points = vertices.numpy().astype(np.float64)
+        truth = tooth_depths_mm(points[tongue], points, teeth)
+        np.testing.assert_allclose(found, np.maximum(truth - MARGIN_MM, 0), atol=0.01)
+        deepest.append(truth.max())
+    assert deepest[0] == 0 and deepest[-1] > 2 and np.all(np.diff(deepest) >= 0)

@@ -1,0 +1,234 @@
+"""The term against sliding: on a ball with a smaller one before it, and on the official model's head.
+
+Values, gradients by differences, what must be ignored; then vertices that have slid must come back, and under a gain
+and a blush they must not move.
+"""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from bench.support import sliding
+from bench.support.sliding import Problem
+from registration.geometry.quads import corner_triangles, triangles_of
+from registration.geometry.texels import eroded, texels
+from registration.losses.uv_ssim import trusted
+from registration.model import gnm_npz
+from registration.model.regions import blush, exterior, inner_lips, lids
+from registration.render import backend
+from registration.types import Targets
+from tests.conftest import SHARED, needs_shared
+from tests.fixtures.make_fixtures import ball, tiny_model
+
+RADIUS = 0.08  # metres
+SIZE_PX = 256  # of the textures that are compared
+SURFACE = 0.05  # weight of the distance to the true surface
+
+
+@pytest.fixture(scope="module")
+def problem() -> Problem:
+    """A ball seen by four cameras; a small ball hides a part of it. Six charts each."""
+    backend.activate()
+    sides = [ball(16, np.zeros(3), np.full(3, RADIUS)), ball(4, np.array([0.035, 0.01, 0.105]), np.full(3, 0.012))]
+    points = np.concatenate([side[0] for side in sides])
+    skin = np.arange(len(points)) < len(sides[0][0])
+    triangles = triangles_of(np.concatenate([sides[0][1], sides[1][1] + skin.sum()]))
+    flat = np.concatenate([sides[0][2] * [0.7, 1], sides[1][2] * [0.3, 1] + [0.7, 0]])
+    corner_uvs = corner_triangles(flat).astype(np.float32)
+    views = ((-40, 5), (-10, -25), (15, 20), (45, -5))
+    cameras = [sliding.camera(np.zeros(3), *view, 2 * RADIUS, 96) for view in views]
+    texture = sliding.noise_texture(triangles, corner_uvs, points, 512, contrast=0.15, wavelengths_mm=(8.0, 30.0))
+    texture[:, int(0.7 * 512) :] = 0.02  # the small ball is dark
+    return Problem(
+        triangles=triangles,
+        corner_uvs=corner_uvs,
+        texture=texture,
+        trust=skin.astype(float),
+        truth=points,
+        start=sliding.slid(points, triangles, skin, 2.0),
+        moves=skin,
+        judged=skin & (sliding.times_seen(points, triangles, cameras) > 1),
+        cheek=np.exp(-0.5 * np.square((points - [0, -0.02, RADIUS]) / 0.025).sum(1)),
+        batch=sliding.photograph(triangles, corner_uvs, points, texture, skin.astype(float), cameras, 0.005),
+    )
+
+
+def cost(problem: Problem, vertices: np.ndarray, batch: Targets | None = None, **changes) -> float:
+    loss = replace(problem, **changes).loss(SIZE_PX)
+    return loss(torch.as_tensor(vertices, dtype=torch.float32), batch or problem.batch).item()
+
+
+def test_equal_textures_cost_little_and_slid_ones_much(problem):
+    at_truth = cost(problem, problem.truth)
+    assert 0 < at_truth < 0.03
+    assert cost(problem, problem.start) > 5 * at_truth
+    # A uniform texture tells nothing.
+    assert cost(problem, problem.start, texture=torch.full_like(problem.texture, 0.3)) > 0.3
+
+
+def test_nothing_known_costs_nothing(problem):
+    vertices = torch.tensor(problem.start, dtype=torch.float32, requires_grad=True)
+    for silent in (
+        replace(problem, trust=np.zeros(len(problem.truth))),
+        replace(problem, batch=replace(problem.batch, rgb_weight=torch.zeros_like(problem.batch.rgb_weight))),
+    ):
+        value = silent.loss(SIZE_PX)(vertices, silent.batch)
+        (gradient,) = torch.autograd.grad(value, vertices)
+        assert value == 0 and not gradient.any()
+
+
+def test_gradient_against_differences(problem):
+    """Along random fields; in double, and by steps so small that no point crosses into another pixel.
+
+    All pixels are compared: at the borders of what is not, texels come and go, which the gradient does not know.
+    """
+    loss = problem.loss(SIZE_PX, torch.float64)
+    rgb = problem.batch.rgb.double()
+    batch = replace(problem.batch, rgb=rgb, rgb_weight=torch.ones_like(rgb[:, 0]))
+    start = torch.as_tensor(problem.start).requires_grad_()
+    (gradient,) = torch.autograd.grad(loss(start, batch), start)
+    rng = np.random.default_rng(0)
+    for _ in range(3):
+        way = torch.as_tensor(rng.standard_normal(start.shape))
+        step = 1e-8
+        with torch.no_grad():
+            difference = (loss(start + step * way, batch) - loss(start - step * way, batch)) / (2 * step)
+        assert (gradient * way).sum().item() == pytest.approx(difference.item(), rel=1e-5)
+    unseen = torch.as_tensor(~problem.moves | (problem.truth[:, 2] < -0.06))
+    assert not gradient[unseen].any()
+
+
+def test_equal_from_run_to_run(problem):
+    threads = torch.get_num_threads()
+    torch.set_num_threads(2)
+    try:
+        runs = []
+        for _ in range(4):
+            vertices = torch.tensor(problem.start, dtype=torch.float32, requires_grad=True)
+            value = problem.loss(SIZE_PX)(vertices, problem.batch)
+            runs.append((value, *torch.autograd.grad(value, vertices)))
+    finally:
+        torch.set_num_threads(threads)
+    for run in runs[1:]:
+        assert all(torch.equal(a, b) for a, b in zip(runs[0], run, strict=True))
+
+
+def test_pixels_without_weight_are_not_looked_at(problem):
+    batch = problem.batch
+    image = batch.pixels.x > 50  # the right half of every image
+    weight = batch.rgb_weight * ~image
+    spoiled = torch.where(image[:, None], torch.rand(batch.rgb.shape), batch.rgb)
+    clean = cost(problem, problem.start, replace(batch, rgb_weight=weight))
+    assert cost(problem, problem.start, replace(batch, rgb=spoiled, rgb_weight=weight)) == clean
+    assert cost(problem, problem.start, replace(batch, rgb=spoiled)) > clean + 0.05
+
+
+def test_what_is_hidden_is_not_looked_at(problem):
+    """Without the small ball, its pictures are taken for the large one's skin."""
+    batch = replace(problem.batch, rgb_weight=torch.ones_like(problem.batch.rgb_weight))
+    hidden = cost(problem, problem.truth, batch)
+    seen = cost(problem, problem.truth, batch, triangles=problem.triangles[:3072], corner_uvs=problem.corner_uvs[:3072])
+    assert hidden < 0.02 and seen > 2 * hidden
+
+
+def test_a_new_look_follows_the_mesh(problem):
+    """What a camera sees is asked again when the mesh has moved: turned about, the back is in front."""
+    loss = problem.loss(SIZE_PX)
+    loss(torch.as_tensor(problem.truth, dtype=torch.float32), problem.batch)
+    turned = torch.as_tensor(problem.truth * [-1, 1, -1], dtype=torch.float32)
+    again = loss(turned, problem.batch).item()
+    assert again == problem.loss(SIZE_PX)(turned, problem.batch).item()
+
+
+def test_resolutions_of_the_reference_agree(problem):
+    half = torch.nn.functional.avg_pool2d(problem.texture.permute(2, 0, 1), 2).permute(1, 2, 0)
+    double = problem.texture.repeat_interleave(2, 0).repeat_interleave(2, 1)
+    for texture in (half, double):
+        assert cost(problem, problem.start, texture=texture) == pytest.approx(cost(problem, problem.start), rel=1e-4)
+
+
+def test_windows_hold_one_chart(problem):
+    """At every scale: what has a weight is further from all other charts than a window reaches."""
+    loss = replace(problem, trust=np.ones(len(problem.truth))).loss(SIZE_PX)
+    atlas = texels(problem.triangles, problem.corner_uvs, SIZE_PX)
+    charts = atlas.image(atlas.chart, -1)
+    first = [places.min() // 4 * 4 for places in np.nonzero(eroded(charts, 2))]  # where the compared part begins
+    charts = charts[first[0] :, first[1] :]
+    for number, scale in enumerate(loss._scales):
+        block, weight = 2**number, scale.weight.numpy()
+        places = np.argwhere(weight > 0)[:: 16 // block**2]
+        assert len(places) > 900
+        for row, column in places:
+            above, left = (max(0, block * (place - 5)) for place in (row, column))
+            near = charts[above : block * (row + 6), left : block * (column + 6)]
+            assert len(np.unique(near[near >= 0])) == 1
+
+
+def test_sizes_that_cannot_be_halved_are_refused(problem):
+    with pytest.raises(ValueError, match="258 texels"):
+        problem.loss(258)
+
+
+def search(problem: Problem, start: np.ndarray, batch: Targets | None, stages, size_px: int = SIZE_PX) -> np.ndarray:
+    """With the term, or without if there is no batch."""
+    surface, loss = sliding.OnSurface(problem), problem.loss(size_px)
+    terms = {"surface": lambda vertices: SURFACE * surface(vertices)}
+    if batch is not None:
+        terms["slide"] = lambda vertices: loss(vertices, batch)
+    return sliding.fit(problem, terms, start, stages)
+
+
+def rms(values: np.ndarray) -> float:
+    return float(np.sqrt(np.square(values).mean()))
+
+
+STAGES = ((40, 20.0, 4e-3, 2e-3), (40, 8.0, 2e-3, 1e-4))
+
+
+def test_what_has_slid_comes_back(problem):
+    before = rms(problem.tangential_mm(problem.start))
+    assert 1.5 < before < 2.5
+    without = search(problem, problem.start, None, STAGES)
+    assert rms(problem.tangential_mm(without)) > 0.7 * before
+    back = search(problem, problem.start, problem.batch, STAGES)
+    assert rms(problem.tangential_mm(back)) < 0.3
+    off = np.linalg.norm(back[problem.judged], axis=1) - np.linalg.norm(problem.truth[problem.judged], axis=1)
+    assert 1e3 * rms(off) < 0.1  # still on the surface
+
+
+def test_a_gain_and_a_blush_move_no_vertex(problem):
+    """A faint blush, for coarse images; the bench has three times as much in finer ones."""
+    undisturbed = search(problem, problem.truth, problem.batch, STAGES[1:])
+    disturbed = search(problem, problem.truth, problem.disturbed(1.2, 0.1), STAGES[1:])
+    assert 1e3 * np.linalg.norm(disturbed - undisturbed, axis=1).max() < 0.1
+
+
+def test_trust_of_the_tiny_head():
+    data = tiny_model()
+    confidence = np.full(len(data.template_vertex_positions), 0.5)
+    confidence[:600] = 0.1
+    trust = trusted(data, confidence)
+    assert ((trust > 0) == (exterior(data) & (np.arange(len(trust)) >= 600))).all()
+    plain = (trust > 0) & (lids(data) + inner_lips(data) + blush(data) == 0)
+    assert (trust[plain] == 1).all() and plain.any()
+    cheeks = (trust > 0) & (blush(data) == 1) & (lids(data) == 0)
+    assert (trust[cheeks] == 0.5).all() and cheeks.any()
+    assert (trust[(trust > 0) & (lids(data) > 0.5)] < 0.6).all()
+
+
+@needs_shared
+@pytest.mark.slow
+def test_an_expression_of_the_full_head():
+    """Small; `python -m bench.uv_ssim` does it at full size."""
+    data = gnm_npz.read(SHARED / "data" / "gnm" / "gnm_head_reconstructed.npz")
+    coefficients = 0.8 * np.random.default_rng(3).standard_normal(60)
+    views = ((-55, 0), (-25, -20), (0, 15), (20, -25), (50, 5))
+    problem = sliding.head(
+        data, coefficients=coefficients.tolist(), views=views, head_px=160, texture_px=1024, slide_mm=2.0
+    )
+    before = rms(problem.tangential_mm(problem.start))
+    back = search(problem, problem.start, problem.batch, (*STAGES, (30, 4.0, 1e-3, 5e-5)), 320)
+    print(before, rms(problem.tangential_mm(back)))
+    assert before > 1.5 and rms(problem.tangential_mm(back)) < 0.3

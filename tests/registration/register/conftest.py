@@ -1,0 +1,140 @@
+"""Registrations that several tests look at; each is made once, some in a process beside the tests' own."""
+
+import shutil
+import subprocess
+import sys
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from registration.register import register
+from registration.storage.registration_folder import load_registration
+from registration.types import Registration
+from tests.registration.register.synthetic import MODEL, Truth, make
+
+
+class Notes:
+    """A progress that keeps what it is told."""
+
+    def __init__(self) -> None:
+        self.notes: list[str] = []
+        self.stages: list[str] = []
+
+    def note(self, text: str) -> None:
+        self.notes.append(text)
+
+    def at(self, done: int, total: int, what: str) -> None:
+        assert 0 <= done <= total
+        if what not in self.stages:
+            self.stages.append(what)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Run:
+    """A registration that was made."""
+
+    truth: Truth
+    out: Path
+    result: Registration
+    progress: Notes
+
+    @property
+    def error_mm(self) -> np.ndarray:
+        """Distance of each vertex from the true one."""
+        return 1e3 * np.linalg.norm(self.result.vertices - self.truth.vertices, axis=1)
+
+
+class Beside:
+    """`gnmreg register` in a process of its own."""
+
+    def __init__(self, truth: Truth, out: Path, *options: str):
+        self.truth, self.out = truth, out
+        command = [sys.executable, "-m", "workflows.cli", "register", str(truth.root), "--model", str(MODEL)]
+        self._process = subprocess.Popen(
+            [*command, "--out", str(out), *options], text=True, stdout=subprocess.PIPE, stderr=subprocess.PIPE
+        )
+        self._ended: Run | None = None
+        self.stdout = ""
+
+    def run(self) -> Run:
+        """Wait for it; the notes are the lines of its log."""
+        if self._ended is None:
+            self.stdout, log = self._process.communicate(timeout=600)
+            assert self._process.returncode == 0, log
+            progress = Notes()
+            progress.notes = log.splitlines()
+            self._ended = Run(truth=self.truth, out=self.out, result=load_registration(self.out), progress=progress)
+        return self._ended
+
+    def end(self) -> None:
+        self._process.kill()
+        self._process.communicate()
+
+
+def run(truth: Truth, out: Path, **options) -> Run:
+    progress = Notes()
+    result = register(truth.root, model_path=MODEL, out=out, progress=progress, **options)
+    return Run(truth=truth, out=out, result=result, progress=progress)
+
+
+@pytest.fixture(scope="session")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("register")
+
+
+@pytest.fixture(scope="session")
+def neutral(folder: Path) -> Truth:
+    return make(folder / "neutral")
+
+
+@pytest.fixture(scope="session")
+def again_beside(neutral: Truth, folder: Path) -> Iterator[Beside]:
+    beside = Beside(neutral, folder / "out" / "again")
+    yield beside
+    beside.end()
+
+
+@pytest.fixture(scope="session")
+def registered(neutral: Truth, again_beside: Beside, folder: Path) -> Run:
+    """The neutral, as anyone would register it."""
+    return run(neutral, folder / "out" / "neutral")
+
+
+@pytest.fixture(scope="session")
+def again(again_beside: Beside) -> Run:
+    """The same once more."""
+    return again_beside.run()
+
+
+@pytest.fixture(scope="session")
+def without_landmarks_beside(neutral: Truth, folder: Path) -> Iterator[Beside]:
+    root = folder / "without_landmarks"
+    shutil.copytree(neutral.root, root, ignore=shutil.ignore_patterns("landmarks"))
+    beside = Beside(replace(neutral, root=root), folder / "out" / "without_landmarks")
+    yield beside
+    beside.end()
+
+
+@pytest.fixture(scope="session")
+def without_landmarks(without_landmarks_beside: Beside) -> Run:
+    """The neutral with its landmark files hidden."""
+    return without_landmarks_beside.run()
+
+
+@pytest.fixture(scope="session")
+def smile(registered: Run, again: Run, without_landmarks_beside: Beside, folder: Path) -> Run:
+    """Another expression of the subject, from its neutral."""
+    return run(make(folder / "smile", "smile"), folder / "out" / "smile", neutral=registered.out)
+
+
+@pytest.fixture(scope="session")
+def deterministic(neutral: Truth, folder: Path) -> Iterator[list[Beside]]:
+    """Two runs side by side with `--deterministic`, three views and another seed."""
+    options = ("--views", "3", "--seed", "5", "--deterministic")
+    pair = [Beside(neutral, folder / "out" / f"deterministic_{i}", *options) for i in range(2)]
+    yield pair
+    for beside in pair:
+        beside.end()

@@ -1,0 +1,51 @@
+"""From nothing: a subject beyond the first model's span, photographed and registered; figures against the truth."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from coregister import bootstrap, makehuman
+from coregister.subjects import capture
+from registration.errors import InputError
+from registration.model import gnm_npz, regions
+from registration.register import register
+from registration.storage.registration_folder import read_manifest
+from registration.types import Registration
+
+pytestmark = pytest.mark.slow
+
+
+@pytest.fixture(scope="module")
+def model() -> Path:
+    try:
+        makehuman.fetch()
+    except InputError as error:
+        pytest.skip(f"{error.what}: {error.got}")
+    return bootstrap.bootstrap()
+
+
+def test_neutral(model: Path, tmp_path: Path) -> None:
+    """The demo's bound: scan to mesh on the face, mean, mm."""
+    root = capture(tmp_path / "capture", seed=8)
+    register(root, model_path=model, out=tmp_path / "out", recipe="draft")
+    figures = read_manifest(tmp_path / "out")["figures"]
+    print(figures["scan_to_mesh"]["face"], figures["vertex_error"]["face"])
+    assert figures["scan_to_mesh"]["face"]["mean_mm"] <= 0.20
+
+
+def test_teeth_and_tongue_of_an_open_mouth(model: Path, tmp_path: Path) -> None:
+    """Teeth and tongue have no offsets: what the pictures and the `oral` landmarks say must reach the model."""
+    root = capture(tmp_path / "capture", seed=5, expression="jaw_open")
+    result = register(root, model_path=model, out=tmp_path / "out", recipe="draft")
+    error = errors_mm(result, root)
+    data = gnm_npz.read(model)
+    means = {name: float(error[regions.group(data, name) > 0.5].mean()) for name in ("teeth", "tongue")}
+    print(means)
+    assert means["teeth"] <= 1.0
+    assert means["tongue"] <= 2.0
+
+
+def errors_mm(result: Registration, root: Path) -> np.ndarray:
+    truth = np.load(root / "ground_truth.npz")["vertices"]
+    return np.linalg.norm(result.vertices - truth, axis=1) * 1000

@@ -1,0 +1,215 @@
+"""A capture of which everything is known, registered: what was put in comes back."""
+
+import json
+import re
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+
+from registration.model.gnm import GNM
+from registration.model.gnm_npz import read
+from registration.model.regions import group, neck_other
+from registration.register import register
+from registration.render import backend
+from registration.storage.registration_folder import FILES, load_registration
+from registration.types import Parameters, Registration
+from tests.registration.register.conftest import Beside, Run
+from tests.registration.register.synthetic import GAINS, MODEL
+from workflows.cli import main
+
+VIEWS = 8
+
+
+def face(run: Run) -> np.ndarray:
+    """Skin within 9 cm of the bridge of the nose, where most cameras look."""
+    data = read(MODEL)
+    bridge = run.result.landmarks["68"][27]
+    near = np.linalg.norm(run.truth.vertices - bridge, axis=1) < 0.09
+    return near & (group(data, "skin_exterior") > 0.5) & ~neck_other(data)
+
+
+def scan_to_mesh(run: Run) -> dict[str, float]:
+    return run.result.figures["scan_to_mesh"]["face"]
+
+
+def same_mesh(result: Registration, vertices: np.ndarray) -> float:
+    """The largest difference (m) between `vertices` and the model's, evaluated in double precision."""
+    names = ("identity", "expression", "rotations", "translation", "scale")
+    parameters = Parameters(**{name: torch.tensor(getattr(result, name), dtype=torch.float64) for name in names})
+    model = GNM(read(MODEL), torch.float64)
+    rebuilt = model(parameters, torch.tensor(result.offsets, dtype=torch.float64)).numpy()
+    return float(np.abs(rebuilt - vertices).max())
+
+
+def test_surface_vertices_and_status(registered: Run):
+    skin = registered.error_mm[face(registered)]
+    print(f"face: vertices {skin.mean():.3f} mm, scan to mesh {scan_to_mesh(registered)}")
+    assert registered.result.status == "converged", registered.result.reason
+    assert scan_to_mesh(registered)["mean_mm"] < 0.12
+    assert skin.mean() < 0.45
+
+
+def test_offsets_were_needed(registered: Run):
+    """The bumps that were put on the model are a millimetre high: a fit of the model alone must miss them."""
+    result = registered.result
+    model = GNM(read(MODEL))
+    names = ("identity", "expression", "rotations", "translation", "scale")
+    parameters = Parameters(**{name: torch.tensor(getattr(result, name)) for name in names})
+    plain = model(parameters).numpy()
+    normal_error = np.linalg.norm(plain - registered.truth.vertices, axis=1)[face(registered)] * 1e3
+    assert normal_error.mean() > 2 * registered.error_mm[face(registered)].mean()
+
+
+def test_gains_of_the_cameras(registered: Run):
+    gains = np.array(registered.result.figures["camera_gains"])
+    assert gains.shape == (VIEWS, 3)
+    relative = gains / np.exp(np.log(gains).mean(0))
+    truth = GAINS / np.exp(np.log(GAINS).mean())
+    error = np.abs(relative / truth[:, None] - 1)
+    print(f"gains: error {100 * error.mean():.2f} % in the mean, {100 * error.max():.2f} % at most")
+    assert error.max() < 0.06
+
+
+def test_parameters_make_the_vertices(registered: Run, smile: Run):
+    for run in (registered, smile):
+        assert same_mesh(run.result, run.result.vertices) < 1e-5
+
+
+def test_what_lies_on_disk(registered: Run):
+    out, result, data = registered.out, registered.result, read(MODEL)
+    assert sorted(file.name for file in out.iterdir()) == sorted(FILES)
+    stored = load_registration(out)
+    for name in ("identity", "expression", "rotations", "translation", "scale", "offsets", "vertices", "confidence"):
+        np.testing.assert_array_equal(getattr(stored, name), getattr(result, name))
+    assert stored.triangles.tolist() == data.triangles.tolist()
+    mesh = trimesh.load(out / "mesh.ply", process=False, maintain_order=True)
+    np.testing.assert_array_equal(np.asarray(mesh.vertices, np.float32), result.vertices)
+    assert mesh.faces.tolist() == data.triangles.tolist()
+
+
+def test_manifest_tells_how_it_was_made(registered: Run):
+    manifest = json.loads((registered.out / "manifest.json").read_text())
+    stages = [stage["name"] for stage in manifest["config"]["recipe"]["stages"]]
+    assert manifest["config"]["seed"] == 0
+    assert manifest["config"]["views"] == [f"cam{i}" for i in range(VIEWS)]
+    assert {"targets", "start", *stages} == set(manifest["seconds"])
+    assert all(seconds > 0 for seconds in manifest["seconds"].values())
+    assert {"mitsuba", "drjit", "torch", "gnm-registration", "python"} <= set(manifest["versions"])
+    assert {"capture", "model", "landmarks 68"} == set(manifest["inputs"])
+    assert all(re.fullmatch("[0-9a-f]{64}", digest) for digest in manifest["inputs"].values())
+    assert {"scan_to_mesh", "vertex_error", "landmark_residual_px", "motion_mm"} <= set(manifest["figures"])
+    assert list(registered.result.history) == stages
+    assert registered.progress.stages == ["reading views", *stages]
+
+
+def test_report_needs_nothing_else(registered: Run):
+    page = (registered.out / "report.html").read_text()
+    assert page.count("data:image/") >= 3 * VIEWS
+    links = re.findall(r'(?:src|href)\s*=\s*"([^"]*)"', page)
+    assert all(link.startswith(("data:", "#")) for link in links)
+    assert not re.search(r"<script[^>]+src|@import|url\((?!['\"]?(?:data:|#))", page)
+
+
+class Computing(Exception):
+    """The renderer was about to start."""
+
+
+@pytest.fixture
+def no_compute(monkeypatch: pytest.MonkeyPatch) -> None:
+    def stop(*args, **kwargs):
+        raise Computing
+
+    monkeypatch.setattr(backend, "activate", stop)
+
+
+def contents(folder: Path) -> dict[str, tuple[int, bytes]]:
+    return {file.name: (file.stat().st_mtime_ns, file.read_bytes()) for file in folder.iterdir()}
+
+
+def test_same_inputs_return_at_once(registered: Run, no_compute: None):
+    before = contents(registered.out)
+    result = register(registered.truth.root, model_path=MODEL, out=registered.out)
+    np.testing.assert_array_equal(result.vertices, registered.result.vertices)
+    assert contents(registered.out) == before
+
+
+@pytest.mark.parametrize(
+    "change", [{"force": True}, {"seed": 1}, {"views": 4}, {"recipe": "studio"}, {"deterministic": True}]
+)
+def test_force_and_other_settings_compute(change: dict, registered: Run, no_compute: None):
+    before = contents(registered.out)
+    with pytest.raises(Computing):
+        register(registered.truth.root, model_path=MODEL, out=registered.out, **change)
+    assert contents(registered.out) == before
+
+
+def test_one_seed_one_result(registered: Run, again: Run):
+    motion = 1e3 * np.linalg.norm(registered.result.vertices - again.result.vertices, axis=1)
+    print(f"two runs: vertices {motion.max():.5f} mm apart at most")
+    assert motion.max() < 0.01
+
+
+def test_deterministic_runs_are_equal_to_the_last_bit(deterministic: list[Beside]):
+    first, second = (beside.run().out for beside in deterministic)
+    with np.load(first / "registration.npz") as a, np.load(second / "registration.npz") as b:
+        assert a.files == b.files
+        for name in a.files:
+            np.testing.assert_array_equal(a[name], b[name], err_msg=name)
+    for name in ("texture.png", "mesh.ply", "mesh.obj", "history.json"):
+        assert (first / name).read_bytes() == (second / name).read_bytes(), name
+    ids = {json.loads((out / "manifest.json").read_text())["content_id"] for out in (first, second)}
+    assert len(ids) == 1
+
+
+def test_command_tells_and_uses_the_views_asked_for(deterministic: list[Beside]):
+    ended = deterministic[0].run()
+    result, log = ended.result, "\n".join(ended.progress.notes)
+    assert deterministic[0].stdout == f"{result.status}: {result.reason}\n{ended.out}\n"
+    assert "reading views: 0/3" in log and "offsets" in log
+    assert len(result.config["views"]) == 3 and result.config["views"][0] == "cam0"
+    assert result.config["seed"] == 5 and result.config["deterministic"] is True
+    assert len(result.figures["camera_gains"]) == 3
+    assert scan_to_mesh(ended)["mean_mm"] < 0.5
+
+
+def test_evaluate_tells_and_stores_the_drift(registered: Run, smile: Run, tmp_path: Path, capsys):
+    out = shutil.copytree(smile.out, tmp_path / "smile")
+    neutral = ["--neutral", str(registered.out), "--neutral-capture", str(registered.truth.root)]
+    assert main(["evaluate", str(out), "--capture", str(smile.truth.root), *neutral]) == 0
+    drift = json.loads((out / "manifest.json").read_text())["figures"]["drift"]["face"]
+    print(f"smile: drift {drift}")
+    assert "drift" in capsys.readouterr().out
+    assert 0 < drift["mean_mm"] < 0.6
+    assert load_registration(out).figures["scan_to_mesh"] == smile.result.figures["scan_to_mesh"]
+
+
+def test_expression_from_its_neutral(registered: Run, smile: Run):
+    start, result = registered.result, smile.result
+    np.testing.assert_array_equal(result.identity, start.identity)
+    assert result.scale == start.scale
+    skin = face(smile)
+    moved = 1e3 * np.linalg.norm(result.offsets - start.offsets, axis=1)[skin]
+    error = smile.error_mm[skin]
+    print(f"smile: vertices {error.mean():.3f} mm, offsets moved {moved.mean():.3f} mm, {scan_to_mesh(smile)}")
+    assert result.status == "converged", result.reason
+    assert scan_to_mesh(smile)["mean_mm"] < 0.15
+    assert error.mean() < 0.6
+    assert moved.mean() < 0.5
+    jaw = list(read(MODEL).expression_names).index("lower_face_region_000")
+    assert result.expression[jaw] - start.expression[jaw] == pytest.approx(0.35, abs=0.25)
+    free = {name for stage in result.config["recipe"]["stages"] for name, _ in stage["free"]}
+    assert free.isdisjoint({"identity", "scale"})
+    assert set(result.inputs) == {"capture", "model", "landmarks 68", "neutral"}
+
+
+def test_landmarks_hidden(registered: Run, without_landmarks: Run):
+    assert any("searching the head's pose in the masks" in note for note in without_landmarks.progress.notes)
+    error = without_landmarks.error_mm[face(without_landmarks)]
+    print(f"without landmarks: vertices {error.mean():.3f} mm, {scan_to_mesh(without_landmarks)}")
+    assert without_landmarks.result.status == "converged", without_landmarks.result.reason
+    assert scan_to_mesh(without_landmarks)["mean_mm"] < scan_to_mesh(registered)["mean_mm"] + 0.05
+    assert error.mean() < 0.8

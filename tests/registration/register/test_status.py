@@ -1,0 +1,42 @@
+"""What a registration says of itself."""
+
+import pytest
+import torch
+
+from registration.fit.problem import Outcome
+from registration.fit.view_weights import ViewErrors
+from registration.register import _status
+
+NAN = torch.full((2,), torch.nan)
+CALM = ViewErrors(names=("a", "b"), outline_px=NAN, landmark_px=NAN, brightness=torch.zeros(2))
+TORN = ViewErrors(names=("a", "b"), outline_px=NAN, landmark_px=torch.tensor([1.0, 40.0]), brightness=torch.zeros(2))
+STILL, MOVING = Outcome(motion_mm=0.01), Outcome(motion_mm=0.2)
+GOOD = {"68": 0.5, "oral": float("nan")}
+
+
+def test_converged_says_how_still_it_was() -> None:
+    status, reason = _status(STILL, GOOD, ["oral"], TORN)
+    assert status == "converged" and "0.010 mm" in reason and "views" not in reason
+
+
+def test_landmarks_on_the_skin_fail_it() -> None:
+    status, reason = _status(STILL, {"68": 3.5, "dense": 8.0, "oral": 20.0}, ["oral"], TORN)
+    assert status == "failed" and reason.index("dense are 8.0 px") < reason.index("68 are 3.5 px")
+    assert "oral" not in reason and "landmarks off by 40 px in views b" in reason
+
+
+def test_landmarks_on_teeth_are_told_but_fail_nothing() -> None:
+    status, reason = _status(STILL, {"68": 0.5, "oral": 5.5}, ["oral"], CALM)
+    assert status == "converged"
+    assert reason.endswith("; landmarks of scheme oral are 5.5 px off in the median (limit 3.0)")
+    assert _status(STILL, {"68": 0.5, "oral": 5.5}, [], CALM)[0] == "failed"
+
+
+@pytest.mark.parametrize("landmarks, status", [(GOOD, "stopped"), ({"68": 5.0}, "failed")])
+def test_a_fit_that_still_moves_has_stopped(landmarks: dict[str, float], status: str) -> None:
+    assert _status(MOVING, landmarks, ["oral"], CALM)[0] == status
+
+
+def test_what_broke_the_fit_is_the_reason() -> None:
+    broken = Outcome(failure="the loss is not finite")
+    assert _status(broken, {"68": 50.0}, [], TORN) == ("failed", "the loss is not finite")

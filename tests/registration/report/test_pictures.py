@@ -1,0 +1,215 @@
+"""Comparison pictures and their numbers, on views whose differences are known."""
+
+import base64
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+import torch
+import trimesh
+
+from registration.frames import srgb_to_linear
+from registration.geometry.rasterizer import rasterize
+from registration.report import heat_map, pictures
+from registration.report.heat_map import heat_pictures, scale_limit_mm
+from registration.report.inputs import HeatMap, ReportView, report_views
+from registration.report.pictures import OUTLINE, PAPER, SCALE, data_uri, overlap, scale_colours, view_pictures
+from registration.types import Camera, Pixels, Rendered, Targets
+
+HEIGHT, WIDTH = 40, 30
+
+
+@pytest.fixture(autouse=True)
+def coarse_heat_maps(monkeypatch):
+    monkeypatch.setattr(heat_map, "_OVERSAMPLING", 1)
+
+
+def a_view(**changes) -> ReportView:
+    """A square subject: the render is 0.1 brighter (sRGB), turned by 10 degrees, and has one wrong class row."""
+    mask = np.zeros((HEIGHT, WIDTH))
+    mask[10:30, 5:25] = 1
+    grey = srgb_to_linear(np.full((HEIGHT, WIDTH, 3), 0.4))
+    normals = np.zeros((HEIGHT, WIDTH, 3))
+    normals[mask > 0] = [0, 0, 1]
+    turned = np.zeros_like(normals)
+    turned[mask > 0] = [np.sin(np.radians(10)), 0, np.cos(np.radians(10))]
+    classes = np.where(mask > 0, 0, -1)
+    drawn = classes.copy()
+    drawn[10] = np.where(drawn[10] < 0, -1, 1)
+    fields = dict(
+        name="cam",
+        target_rgb=grey,
+        rendered_rgb=srgb_to_linear(np.full((HEIGHT, WIDTH, 3), 0.5)) * mask[..., None],
+        compared=np.ones((HEIGHT, WIDTH), bool),
+        target_mask=mask,
+        rendered_mask=mask,
+        target_normals=normals,
+        rendered_normals=turned,
+        target_classes=classes,
+        rendered_classes=drawn,
+    )
+    return ReportView(**{**fields, **changes})
+
+
+def test_numbers_of_a_view():
+    assert view_pictures(a_view()).numbers == {
+        "colour": "0.100",
+        "normals": "10.0°",
+        "classes": "95.0 %",
+        "mask overlap": "100.0 %",
+    }
+    half = a_view().rendered_mask.copy()
+    half[:20] = 0
+    assert view_pictures(a_view(rendered_mask=half)).numbers["mask overlap"] == "50.0 %"
+
+
+def test_pictures_show_the_differences():
+    rows = {name: [p for _, p in row] for name, row in view_pictures(a_view()).rows.items()}
+    assert list(rows) == ["Colour", "Normals", "Classes"] and all(len(row) == 3 for row in rows.values())
+    inside, outside = (20, 15), (2, 2)
+    colour, normal, wrong = (rows[name][2] for name in rows)
+    np.testing.assert_allclose(colour[inside], scale_colours(np.array(0.1 / pictures.COLOUR_LIMIT)), atol=1)
+    np.testing.assert_allclose(normal[inside], scale_colours(np.array(10 / pictures.ANGLE_LIMIT)), atol=1)
+    assert tuple(colour[outside]) == tuple(normal[outside]) == tuple(wrong[outside]) == PAPER
+    red = (wrong == SCALE[-2]).all(-1)
+    assert red[10, 5:25].all() and red.sum() == 20
+    assert abs(int(rows["Colour"][1][inside][0]) - 128) <= 1  # 0.5 sRGB
+
+
+def test_the_outline_of_the_render_lies_on_the_capture():
+    capture = view_pictures(a_view()).rows["Colour"][0][1]
+    outlined = (capture == OUTLINE).all(-1)
+    rows, columns = np.nonzero(outlined)
+    assert (rows.min(), rows.max(), columns.min(), columns.max()) == (10, 29, 5, 24)
+    assert not outlined[12:28, 7:23].any()
+    np.testing.assert_allclose(capture[20, 15], 0.4 * 255, atol=1)
+
+
+def test_what_a_view_lacks_is_left_out():
+    found = view_pictures(a_view(target_normals=None, target_classes=None, target_mask=None))
+    assert list(found.rows) == ["Colour"] and list(found.numbers) == ["colour"]
+    blind = view_pictures(a_view(compared=np.zeros((HEIGHT, WIDTH), bool), rendered_mask=np.zeros((HEIGHT, WIDTH))))
+    assert "colour" not in blind.numbers and blind.numbers["mask overlap"] == "0.0 %"
+
+
+def test_large_views_are_shrunk_and_drawn_alike():
+    def tall(array):
+        return np.repeat(np.repeat(array, 40, 0), 40, 1)
+
+    view = a_view()
+    arrays = {k: tall(v) for k, v in vars(view).items() if isinstance(v, np.ndarray)}
+    picture = view_pictures(replace(view, **arrays)).rows["Colour"][0][1]
+    assert picture.shape == (pictures.PICTURE_HEIGHT, 480, 3)
+
+
+def test_overlap():
+    a, b = np.zeros((2, 4)), np.zeros((2, 4))
+    assert overlap(a, b) == 1
+    a[:, :2], b[:, 1:3] = 1, 1
+    assert overlap(a, b) == pytest.approx(1 / 3)
+
+
+def test_scale_runs_from_first_to_last_colour():
+    np.testing.assert_array_equal(scale_colours(np.array([-1.0, 0, 1, 9])), [SCALE[0], SCALE[0], SCALE[-1], SCALE[-1]])
+
+
+def test_data_uri_is_a_jpeg_of_the_picture():
+    picture = np.zeros((16, 16, 3), np.uint8) + np.array([200, 60, 20], np.uint8)
+    head, body = data_uri(picture).split(",")
+    assert head == "data:image/jpeg;base64"
+    decoded = cv2.imdecode(np.frombuffer(base64.b64decode(body), np.uint8), cv2.IMREAD_COLOR)[..., ::-1]
+    np.testing.assert_allclose(decoded.astype(int), picture, atol=6)
+
+
+@pytest.mark.parametrize(("p95", "limit"), [(0.05, 0.1), (0.19, 0.2), (0.3, 0.5), (50.0, 10.0)])
+def test_scale_limit(p95, limit):
+    assert scale_limit_mm(np.append(np.full(99, p95), np.nan)) == limit
+    assert scale_limit_mm(np.array([np.nan])) == heat_map.LIMITS_MM[0]
+
+
+def a_heat_map(**changes) -> HeatMap:
+    """A sphere in the world; distances only on the head frame's +x half. The head is turned by 90 degrees about y."""
+    ball = trimesh.creation.icosphere(subdivisions=4, radius=0.1)
+    vertices = np.asarray(ball.vertices)
+    T_head_world = np.eye(4)
+    T_head_world[:3, :3] = [[0, 0, 1], [0, 1, 0], [-1, 0, 0]]
+    head_x = vertices @ T_head_world[0, :3]
+    fields = dict(
+        vertices=vertices + [5, 6, 7],
+        triangles=np.asarray(ball.faces),
+        distance_mm=np.where(head_x > 0.001, 0.5, np.nan),
+        T_head_world=T_head_world,
+    )
+    return HeatMap(**{**fields, **changes})
+
+
+def hue_share(picture, colour) -> float:
+    """Share of the drawn pixels whose hue is the colour's."""
+    drawn = (np.abs(picture.astype(int) - PAPER) > 3).any(-1)
+    wanted, given = np.array(colour, float), picture[drawn].astype(float)
+    cosine = given @ wanted / np.linalg.norm(given, axis=1) / np.linalg.norm(wanted)
+    return float((cosine > 0.999).mean())
+
+
+def test_heat_is_drawn_on_the_right_side_and_grey_where_unmeasured():
+    drawn = dict(heat_pictures(a_heat_map(), limit_mm=1.0))
+    colour = scale_colours(np.array(0.5))
+    assert hue_share(drawn["subject's left"], colour) > 0.8
+    assert hue_share(drawn["subject's right"], heat_map.UNMEASURED) > 0.8
+    front = drawn["front"]
+    middle = front.shape[1] // 2
+    assert hue_share(front[:, middle + 15 :], colour) > 0.95  # the subject's left is on the picture's right
+    assert hue_share(front[:, : middle - 15], heat_map.UNMEASURED) > 0.95
+
+
+def test_the_head_fills_the_pictures():
+    for _, picture in heat_pictures(a_heat_map(), limit_mm=1.0):
+        rows, columns = np.nonzero((np.abs(picture.astype(int) - PAPER) > 3).any(-1))
+        spans = np.ptp(columns) / picture.shape[1], np.ptp(rows) / picture.shape[0]
+        assert max(spans) == pytest.approx(0.94, abs=0.02)
+        assert abs(columns.min() + columns.max() - picture.shape[1]) < 6
+
+
+def test_report_views_of_targets_and_a_rendering():
+    """Two views of 8 x 6; the targets list only the pixels around the head."""
+    mask = torch.zeros(2, 8, 6)
+    mask[:, 2:6, 1:5] = 1
+    camera = Camera(width_px=6, height_px=8, intrinsics=np.eye(3), T_cam_world=np.eye(4))
+    pixels = Pixels.of((camera, camera), torch.nn.functional.max_pool2d(mask, 3, 1, 1) > 0)
+    listed = mask[pixels.view.long(), pixels.y.long(), pixels.x.long()]
+    classes = torch.nn.functional.one_hot((listed * 2).long(), 3).float()
+    nothing = torch.zeros(len(listed), 3)
+    targets = Targets(
+        names=("cam0", "cam1"),
+        class_names=("skin", "eye", "lip"),
+        pixels=pixels,
+        rgb=nothing + 0.25,
+        rgb_weight=listed,
+        normals=nothing,
+        normal_weight=listed * 0,
+        mask=listed,
+        mask_weight=listed * 0 + 1,
+        classes=classes,
+        class_weight=listed,
+        landmarks={},
+        px_per_head=8.0,
+    )
+    rendered = Rendered(rgb=nothing + 0.5, normals=nothing, classes=classes * listed[:, None], mask=listed)
+    views = report_views(targets, rendered)
+    assert [view.name for view in views] == ["cam0", "cam1"]
+    for view in views:
+        np.testing.assert_array_equal(view.target_mask, mask[0])
+        np.testing.assert_array_equal(view.target_classes, np.where(mask[0] > 0, 2, -1))
+        np.testing.assert_array_equal(view.rendered_classes, view.target_classes)
+        assert view.target_normals is None and view.target_rgb[3, 3, 0] == 0.25 and view.target_rgb[0, 5, 0] > 0.9
+        assert view_pictures(view).numbers["mask overlap"] == "100.0 %"
+    unknown = replace(targets, mask_weight=listed * 0, class_weight=listed * 0)
+    assert all(view.target_mask is None and view.target_classes is None for view in report_views(unknown, rendered))
+
+
+def test_heat_cameras_see_the_mesh_they_are_fitted_to():
+    head = np.asarray(trimesh.creation.icosphere(subdivisions=2, radius=0.1).vertices)
+    triangles = np.asarray(trimesh.creation.icosphere(subdivisions=2, radius=0.1).faces)
+    for camera in heat_map._cameras(head, heat_map.SIZE).values():
+        assert 0.4 < (rasterize(head, triangles, camera)[0] >= 0).mean() < 0.9

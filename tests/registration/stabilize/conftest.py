@@ -1,0 +1,30 @@
+"""Truths and what a registration would make of them, made once."""
+
+import pytest
+
+from bench.support import performances
+from bench.support.performances import Performed, Seen
+from registration.model.gnm_npz import GNMData
+from registration.stabilize.components import Head
+from registration.stabilize.subject_meshes import SkullSkin
+from tests.coregister.conftest import anatomy, model, model_file, source, wheel  # noqa: F401  fixtures
+
+
+@pytest.fixture(scope="session")
+def head(model: GNMData) -> Head:  # noqa: F811
+    return Head.of(model)
+
+
+@pytest.fixture(scope="session")
+def skin(model: GNMData) -> SkullSkin:  # noqa: F811
+    return SkullSkin.of(model)
+
+
+@pytest.fixture(scope="session")
+def truths(anatomy) -> list[Performed]:  # noqa: F811
+    return [performances.perform(anatomy, 1000 + number) for number in range(3)]
+
+
+@pytest.fixture(scope="session")
+def seens(truths: list[Performed]) -> list[Seen]:
+    return [performances.seen(truth, number) for number, truth in enumerate(truths)]

@@ -1,0 +1,49 @@
+"""Digests of nested values tell apart what differs and nothing else; arrays go in by their bytes."""
+
+import time
+
+import numpy as np
+import pytest
+
+from registration.storage import hashing
+
+
+def digest(value) -> str:
+    return hashing.input_hash({}, {"value": value})
+
+
+def test_equal_values_have_one_digest_wherever_they_lie_in_memory():
+    array = np.arange(12.0).reshape(3, 4)
+    assert hashing.content_of(array) == hashing.content_of(array.copy(order="F"))
+    assert hashing.content_of(array[:, ::2]) == hashing.content_of(array[:, ::2].copy())
+    assert digest({"a": 1, "b": (array, "x")}) == digest({"b": [array.copy(), "x"], "a": 1})
+
+
+@pytest.mark.parametrize(
+    "other",
+    [
+        np.arange(12.0).reshape(4, 3),
+        np.arange(12.0, dtype=np.float32).reshape(3, 4),
+        np.arange(12).reshape(3, 4),
+        np.arange(12.0).reshape(3, 4) + 1e-15 * np.eye(3, 4),
+        np.arange(12.0).reshape(3, 4).tolist(),
+    ],
+    ids=["shape", "precision", "type", "a last bit", "a list"],
+)
+def test_other_arrays_have_other_digests(other):
+    array = np.arange(12.0).reshape(3, 4)
+    assert digest(array) != digest(other)
+    assert digest({"deep": [1, {"er": array}]}) != digest({"deep": [1, {"er": other}]})
+
+
+def test_order_and_number_of_arrays_count():
+    a, b = np.zeros(3), np.ones(3)
+    assert len({hashing.content_of(a, b), hashing.content_of(b, a), hashing.content_of(a), hashing.content_of()}) == 4
+
+
+def test_large_arrays_are_quick():
+    """A 2048 x 2048 texture; written out as JSON it took 20 s."""
+    texture = np.zeros((2048, 2048, 3), np.float32)
+    begun = time.process_time()
+    hashing.content_of(texture)
+    assert time.process_time() - begun < 3

@@ -1,0 +1,294 @@
+"""Targets from a small capture: a ball with a cap of hair, a neck and an eye, seen by five cameras."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from scipy.ndimage import distance_transform_edt
+
+from registration.capture.native import read
+from registration.capture.native_writer import PlainView, write
+from registration.targets.classes import class_map
+from registration.targets.pyramid import build_pyramid
+from registration.types import Targets
+from tests.registration.capture import small
+
+CLASSES = ("background", "skin", "neck_other", "hair", "left_eye")
+LEVELS = 3
+VALUES = ("rgb", "normals", "mask", "classes")
+WEIGHTS = ("rgb_weight", "normal_weight", "mask_weight", "class_weight")
+
+
+def labels_of(direction: np.ndarray) -> np.ndarray:
+    """Labels by where on the ball a point lies; `direction` is its outward unit normal in the world."""
+    x, y, z = np.moveaxis(direction, -1, 0)
+    labels = np.where(y < -0.6, 2, np.where(y > 0.55, 3, 1))
+    return np.where((x - 0.35) ** 2 + (y - 0.1) ** 2 + np.minimum(z, 0) < 0.04, 4, labels)
+
+
+def picture(name: str, turn: float, distortion: tuple[float, ...] = ()) -> PlainView:
+    view = small.picture(name, small.camera(turn, distortion=distortion))
+    world = view.normals @ view.camera.T_cam_world[:3, :3]
+    return replace(view, labels=np.where(view.mask, labels_of(world), 0).astype(np.uint8))
+
+
+def capture_of(root: Path, views: list[PlainView]):
+    write(root, views, subject="ball", expression="neutral", classes=CLASSES)
+    return read(root)
+
+
+@pytest.fixture(scope="module")
+def capture(tmp_path_factory):
+    views = [picture(f"cam{i}", turn, small.DISTORTIONS["OPENCV"]) for i, turn in enumerate(small.TURNS)]
+    return capture_of(tmp_path_factory.mktemp("targets") / "ball", views)
+
+
+@pytest.fixture(scope="module")
+def pyramid(capture):
+    return build_pyramid(capture, class_map(CLASSES), finest_head_px=10_000, levels=LEVELS)
+
+
+def images(level: Targets, name: str) -> np.ndarray:
+    """One channel laid out as images (N, H, W, D)."""
+    values = getattr(level, name).float()
+    return level.pixels.image(values.reshape(len(values), -1)).numpy()
+
+
+def world_directions(camera) -> tuple[np.ndarray, np.ndarray]:
+    """The ball's outward normal at each pixel's centre, by ray tracing, and how near the ray is to its rim (m)."""
+    y, x = np.mgrid[: camera.height_px, : camera.width_px] + 0.5
+    rays = np.stack([x, y, np.ones_like(x)], -1) @ np.linalg.inv(camera.intrinsics).T @ camera.T_cam_world[:3, :3]
+    rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
+    along = -(rays @ camera.centre)
+    miss = np.linalg.norm(camera.centre + along[..., None] * rays, axis=-1)
+    depth = along - np.sqrt(np.maximum(small.RADIUS_M**2 - miss**2, 0))
+    return (camera.centre + depth[..., None] * rays) / small.RADIUS_M, small.RADIUS_M - miss
+
+
+@pytest.mark.parametrize("level", range(LEVELS))
+def test_cameras_follow_windows_and_levels(pyramid, level):
+    """Values at a pixel are those of the ball's point that the level's own camera sees there."""
+    targets = pyramid[level]
+    channels = {name: images(targets, name) for name in (*VALUES, *WEIGHTS)}
+    pixel_m = 0.45 / targets.pixels.cameras[0].intrinsics[0, 0]
+    compared = 0
+    for number, camera in enumerate(targets.pixels.cameras):
+        assert not camera.distortion
+        world, depth = world_directions(camera)
+        listed = targets.pixels.index[number].numpy() >= 0
+        assert (channels["mask"][number, ..., 0][listed & (depth < -2 * pixel_m)] < 0.01).all()
+        safe = listed & (depth > 2 * pixel_m) & (channels["class_weight"][number, ..., 0] > 0)
+        safe &= channels["normal_weight"][number, ..., 0] > 0.5
+        compared += safe.sum()
+        assert (channels["mask"][number, ..., 0][safe] > 0.99).all()
+        np.testing.assert_allclose(channels["normals"][number][safe], world[safe], atol=0.02)
+        colour = (0.3 + 0.1 * np.sin(6 * world + [0, 1, 2]))[safe]
+        np.testing.assert_allclose(channels["rgb"][number][safe], colour, atol=0.015)
+        # Labels, away from their borders: in every direction by a pixel the label is the same.
+        label = labels_of(world)
+        shifted = [np.roll(label, step, axis) for axis in (0, 1) for step in (-1, 1)]
+        pure = safe & np.all([s == label for s in shifted], axis=0) & (label != 3)
+        names = np.array([targets.class_names.index("left_eye" if k == 4 else "skin") for k in label[pure]])
+        np.testing.assert_array_equal(channels["classes"][number][pure].argmax(-1), names)
+    assert compared > 2000 / 4**level
+
+
+def test_landmarks_follow_their_cameras(pyramid, capture):
+    points = small.landmarks_68()
+    for targets in pyramid:
+        seen = targets.landmarks["68"].numpy()
+        assert seen.shape == (5, 68, 3)
+        for camera, view in zip(targets.pixels.cameras, seen, strict=True):
+            np.testing.assert_allclose(view[:, :2], camera.project(points)[0], atol=0.02)
+        np.testing.assert_allclose(np.unique(seen[..., 2]), [0.2, 1.0], rtol=1e-6)
+
+
+def test_windows_hold_the_head_and_a_margin(pyramid):
+    """The ball's rim is inside every window, what is far from it is not; all windows have one size."""
+    finest = pyramid[0]
+    assert len({(c.width_px, c.height_px) for c in finest.pixels.cameras}) == 1
+    assert finest.pixels.cameras[0].width_px % 2 ** (LEVELS - 1) == 0
+    for camera, index in zip(finest.pixels.cameras, finest.pixels.index.numpy(), strict=True):
+        assert camera.width_px < 130 and camera.height_px < 160
+        # The head is what is neither hair nor neck; its outline is in the window.
+        angle = np.linspace(0, 2 * np.pi, 400)
+        ball = small.RADIUS_M * np.stack([np.cos(angle), np.sin(angle), 0 * angle], 1) @ camera.T_cam_world[:3, :3]
+        direction = ball / small.RADIUS_M
+        head = np.isin(labels_of(direction), (1, 4))
+        x, y = camera.project(ball[head])[0].T
+        assert x.min() > 4 and y.min() > 4 and x.max() < camera.width_px - 4 and y.max() < camera.height_px - 4
+        rows, columns = index.shape
+        assert (rows, columns) == (camera.height_px, camera.width_px)
+    assert 55 < finest.px_per_head < 80  # the ball is 98 px high
+    assert pyramid[1].px_per_head == finest.px_per_head / 2
+
+
+def test_a_level_is_the_block_mean_of_the_one_before(pyramid):
+    for fine, coarse in zip(pyramid, pyramid[1:], strict=False):
+        for name in ("rgb", "mask", "classes"):
+            before, after = images(fine, name), images(coarse, name)
+            n, h, w, d = after.shape
+            blocks = before.reshape(n, h, 2, w, 2, d).mean((2, 4))
+            whole = (fine.pixels.index.numpy() >= 0).reshape(n, h, 2, w, 2).all((2, 4))
+            whole &= coarse.pixels.index.numpy() >= 0
+            assert whole.sum() > 500 / 4
+            np.testing.assert_allclose(after[whole], blocks[whole], atol=2e-3)
+
+
+def test_reducing_while_decoding_gives_the_same_level(capture, pyramid):
+    """At 1/2 from the start: the windows may begin elsewhere, the cameras tell where."""
+    half = build_pyramid(capture, class_map(CLASSES), finest_head_px=int(pyramid[1].px_per_head) - 2, levels=1)[0]
+    assert half.px_per_head == pytest.approx(pyramid[1].px_per_head, abs=1)
+    compared = 0
+    for number, camera in enumerate(half.pixels.cameras):
+        other = pyramid[1].pixels.cameras[number]
+        shift = other.intrinsics[:2, 2] - camera.intrinsics[:2, 2]
+        np.testing.assert_allclose(camera.intrinsics[0, 0], other.intrinsics[0, 0])
+        if np.abs(shift - shift.round()).max() > 1e-9:
+            continue  # windows begin half a pixel apart
+        dx, dy = shift.round().astype(int)
+        a, b = images(pyramid[1], "rgb")[number], images(half, "rgb")[number]
+        ours, theirs = pyramid[1].pixels.index[number].numpy() >= 0, half.pixels.index[number].numpy() >= 0
+        y, x = np.nonzero(ours)
+        inside = (y - dy >= 0) & (y - dy < b.shape[0]) & (x - dx >= 0) & (x - dx < b.shape[1])
+        y, x = y[inside], x[inside]
+        both = theirs[y - dy, x - dx]
+        compared += both.sum()
+        np.testing.assert_allclose(a[y, x][both], b[y - dy, x - dx][both], atol=2e-3)
+    assert compared > 500
+
+
+@pytest.mark.parametrize("level", range(LEVELS))
+def test_hair_and_outlines_that_are_not_the_heads_compare_nothing(pyramid, level):
+    """Hair has no weight at all. Mask weight lies on the head and on the background that is nearest to the head."""
+    targets = pyramid[level]
+    weights = {name: images(targets, name)[..., 0] for name in WEIGHTS}
+    checked = {"hair": 0, "head": 0, "neck": 0, "beside head": 0, "beside others": 0, "far": 0}
+    for number, camera in enumerate(targets.pixels.cameras):
+        world, depth = world_directions(camera)
+        label = np.where(depth > 0, labels_of(world), 0)
+        rim = np.abs(depth) < 1.5 * 0.45 / camera.intrinsics[0, 0]
+        borders = [np.roll(label, step, axis) != label for axis in (0, 1) for step in (-1, 1)]
+        pure = ~np.any(borders, axis=0) & ~rim
+        inner = {"hair": pure & (label == 3), "neck": pure & (label == 2), "head": pure & np.isin(label, (1, 4))}
+        assert all((w[number][inner["hair"]] == 0).all() for w in weights.values())
+        outline = weights["mask_weight"][number]
+        margin = 0.08 * np.ptp(np.flatnonzero(np.isin(label, (1, 4)).any(1))) + 2
+        to_head, to_other = (distance_transform_edt(~np.isin(label, k)) for k in ((1, 4), (2, 3)))
+        background = (depth < 0) & ~rim
+        clear = np.abs(to_head - to_other) > 2
+        inner["beside head"] = background & clear & (to_head < to_other) & (to_head < margin - 1)
+        inner["beside others"] = background & clear & (to_other < to_head)
+        inner["far"] = background & (to_head > margin + 1)
+        for name, here in inner.items():
+            here = here & (targets.pixels.index[number].numpy() >= 0) if name in ("head", "neck") else here
+            checked[name] += here.sum()
+            assert (outline[here] == (name in ("head", "beside head"))).all(), name
+        seen_neck = inner["neck"] & (targets.pixels.index[number].numpy() >= 0)
+        assert (weights["class_weight"][number][seen_neck] == 1).all()
+    assert min(checked.values()) > 0 or level == LEVELS - 1
+
+
+def test_grazing_normals_weigh_less(pyramid):
+    targets = pyramid[0]
+    for number, camera in enumerate(targets.pixels.cameras):
+        weight = images(targets, "normal_weight")[number, ..., 0]
+        world, depth = world_directions(camera)
+        y, x = np.mgrid[: camera.height_px, : camera.width_px] + 0.5
+        rays = np.stack([x, y, np.ones_like(x)], -1) @ np.linalg.inv(camera.intrinsics).T @ camera.T_cam_world[:3, :3]
+        facing = -(rays * world).sum(-1) / np.linalg.norm(rays, axis=-1)
+        used = weight > 0
+        np.testing.assert_allclose(weight[used], facing[used], atol=0.04)
+        rgb = images(targets, "rgb_weight")[number, ..., 0]
+        np.testing.assert_allclose(rgb[rgb > 0], weight[rgb > 0])
+        assert (rgb > 0).sum() < used.sum()  # a pixel is eroded at the rim
+
+
+def test_pixels_are_those_that_some_term_compares(pyramid):
+    for targets in pyramid:
+        total = sum(getattr(targets, name).float() for name in WEIGHTS)
+        assert (total > 0).all()
+        for name in (*VALUES, *WEIGHTS):
+            assert getattr(targets, name).dtype == torch.float16
+
+
+def test_views_may_lack_masks_normals_and_labels(tmp_path):
+    parts = ("mask", "normals", "labels")
+    views = [picture(f"cam{i}", turn) for i, turn in enumerate(small.TURNS)]
+    views = [replace(view, **({parts[i]: None} if i < 3 else {})) for i, view in enumerate(views)]
+    views[3] = replace(views[3], mask=None, normals=None, labels=None, landmarks={})
+    targets = build_pyramid(capture_of(tmp_path / "ball", views), class_map(CLASSES), finest_head_px=999, levels=2)[1]
+    used = {name: [bool((images(targets, name)[k] > 0).any()) for k in range(5)] for name in WEIGHTS}
+    assert used["rgb_weight"] == [True] * 5
+    assert used["normal_weight"] == [True, False, True, False, True]
+    assert used["class_weight"] == [True, True, False, False, True]
+    # Labels tell the outline where there is no mask; with neither there is none.
+    assert used["mask_weight"] == [True, True, True, False, True]
+    assert (targets.landmarks["68"][3, :, 2] == 0).all()
+    whole = targets.pixels.index[3] >= 0
+    assert whole.sum() > 0.9 * 60 * 80
+
+
+def test_a_capture_of_images_alone(tmp_path):
+    views = [
+        replace(picture(f"cam{i}", turn), mask=None, normals=None, labels=None, landmarks={})
+        for i, turn in enumerate(small.TURNS)
+    ]
+    write(tmp_path / "ball", views, subject="ball", expression="neutral")
+    targets = build_pyramid(read(tmp_path / "ball"), class_map(()), finest_head_px=999, levels=1)[0]
+    assert targets.px_per_head == 160 and targets.landmarks == {} and targets.class_names == ("skin",)
+    assert (targets.mask_weight == 0).all() and (targets.class_weight == 0).all() and (targets.rgb_weight > 0).any()
+
+
+@pytest.mark.parametrize("views", [[2], [4, 0], [1, 3, 2, 0, 4]])
+def test_select_equals_indexing(pyramid, views):
+    targets = pyramid[1]
+    batch = targets.select(views, torch.device("cpu"))
+    assert batch.names == tuple(targets.names[v] for v in views)
+    assert batch.pixels.cameras == tuple(targets.pixels.cameras[v] for v in views)
+    for name in (*VALUES, *WEIGHTS):
+        assert getattr(batch, name).dtype == torch.float32
+        np.testing.assert_array_equal(images(batch, name), images(targets, name)[views])
+    torch.testing.assert_close(batch.landmarks["68"], targets.landmarks["68"][views])
+    found = batch.pixels
+    inverse = found.index[found.view.long(), found.y.long(), found.x.long()]
+    torch.testing.assert_close(inverse, torch.arange(len(found.view), dtype=torch.int32))
+    assert (found.index >= 0).sum() == len(found.view)
+
+
+def test_progress_is_told(capture):
+    done = []
+    build_pyramid(capture, class_map(CLASSES), finest_head_px=40, levels=1, progress=done.append)
+    assert done == [0, 1, 2, 3, 4]
+
+
+def test_a_mask_larger_than_the_labels_makes_no_head_of_the_neck(tmp_path):
+    """Labels and masks come from two networks: what only the mask has belongs to what it is next to."""
+    plain = [picture(f"cam{i}", turn) for i, turn in enumerate(small.TURNS)]
+    larger = [replace(view, mask=distance_transform_edt(~view.mask) <= 3) for view in plain]
+    made = []
+    for name, views in (("plain", plain), ("larger", larger)):
+        capture = capture_of(tmp_path / name, views)
+        made.append(build_pyramid(capture, class_map(CLASSES), finest_head_px=10_000, levels=1)[0])
+    tight, wide = made
+    assert wide.px_per_head == pytest.approx(tight.px_per_head, abs=6.0)  # not by the neck's length
+    unlabelled = 0
+    for number, (camera, view) in enumerate(zip(wide.pixels.cameras, larger, strict=True)):
+        shift = np.round(view.camera.intrinsics[:2, 2] - camera.intrinsics[:2, 2]).astype(int)
+        listed = np.argwhere(wide.pixels.index[number].numpy() >= 0)
+        y, x = (listed + shift[::-1]).T
+        held = (y < view.camera.height_px) & (x < view.camera.width_px)
+        listed, y, x = listed[held], y[held], x[held]
+        ring = view.mask[y, x] & (view.labels[y, x] == 0)
+        away = {
+            name: distance_transform_edt(~np.isin(view.labels, labels))[y, x]
+            for name, labels in (("head", (1, 4)), ("other", (2, 3)))
+        }
+        of_neck, of_head = ring & (away["other"] < away["head"] - 1), ring & (away["head"] < away["other"] - 1)
+        weight = images(wide, "mask_weight")[number, ..., 0][tuple(listed.T)]
+        classes = images(wide, "class_weight")[number, ..., 0][tuple(listed.T)]
+        assert not weight[of_neck].any() and (weight[of_head] == 1).all() and not classes[ring].any()
+        unlabelled += of_head.sum()
+    assert unlabelled > 100
