@@ -20,15 +20,15 @@ from pathlib import Path
 
 import numpy as np
 
-from coregister import bootstrap
-from coregister.build import build
-from coregister.decide import Rule
-from coregister.evaluate import HeldOut
-from coregister.generalization import LinearPart, fit, identity_part, surface_part
-from coregister.samples import NEUTRAL, Mesh, Subject
-from coregister.scan_fit import fit_scan
-from coregister.specificity import specificity_mm
-from coregister.synth import Studio
+from coregister.evaluate.evaluation import HeldOut
+from coregister.evaluate.linear_fit import LinearPart, fit, identity_part, surface_part
+from coregister.evaluate.scan_fit import fit_scan
+from coregister.evaluate.specificity import specificity_mm
+from coregister.first_model import build as bootstrap
+from coregister.next_model.build import build
+from coregister.next_model.training_data import NEUTRAL, Mesh, Subject
+from coregister.stopping_rule import Rule
+from coregister.synthetic.capture import Studio
 from registration.capture.scan import read_truth
 from registration.evaluate.distances import Surface, spread
 from registration.model import gnm_npz, regions

@@ -14,11 +14,12 @@ from dataclasses import replace
 
 import numpy as np
 
-from coregister import anatomy as anatomy_of
-from coregister import bootstrap, expressions, makehuman, population
-from coregister.anatomy import Anatomy
-from coregister.evaluate import HeldOut, Settings, evaluate
-from coregister.identity import principal_components
+from coregister.evaluate.evaluation import HeldOut, Settings, evaluate
+from coregister.first_model import assembly as anatomy_of
+from coregister.first_model import build, makehuman, population
+from coregister.first_model.assembly import Anatomy
+from coregister.next_model.identity import principal_components
+from coregister.synthetic import expressions
 from registration.geometry.closest_point import barycentric_points
 from registration.model import gnm_npz, regions
 from registration.model.gnm_npz import GNMData
@@ -86,7 +87,7 @@ def main() -> None:
     parser.add_argument("--training", type=int, nargs="*", default=[40, 200])
     parser.add_argument("--samples", type=int, default=100)
     arguments = parser.parse_args()
-    data = gnm_npz.read(bootstrap.bootstrap())
+    data = gnm_npz.read(build.bootstrap())
     anatomy = anatomy_of.make(makehuman.read(makehuman.fetch()), population.mean_person())
     moves = Moves(anatomy)
     subjects = people(anatomy, data, moves, arguments.subjects)

@@ -18,8 +18,8 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from coregister import bootstrap
-from coregister.expression import REGIONS, regional_masks
+from coregister.first_model import build
+from coregister.next_model.expression import REGIONS, regional_masks
 from registration.geometry.pca import principal_components
 from registration.model import gnm_npz
 
@@ -62,7 +62,7 @@ def main() -> None:
     parser.add_argument("--components", type=int, default=150)
     parser.add_argument("--memory-gb", type=float, default=4.0)
     args = parser.parse_args()
-    data = gnm_npz.read(bootstrap.bootstrap())
+    data = gnm_npz.read(build.bootstrap())
     rows = np.flatnonzero(regional_masks(data)[REGIONS.index("lower_face_region")] > 0)
     modes = modes_of(data.template_vertex_positions[rows].astype(np.float64), np.random.default_rng(1))
     drawn = Drawn(args.samples, modes)

@@ -5,9 +5,10 @@
 
 Each draw is people that the first model does not span: `--training` of them make the next model, `--held-out` others
 judge it against the first, at the same numbers of components: the mean distance of the nearest head from each true
-mesh on the head's skin, vertex to vertex (`coregister.generalization`), and how far random heads are from real ones
-(`coregister.specificity`; real: of both groups). A line a setting: means over draws of both, the gain over the first
-model and the smallest of a draw. `--noise-mm` adds smooth noise of so many mm (rms; about 30 mm from wave to wave) to
+mesh on the head's skin, vertex to vertex (`coregister.evaluate.linear_fit`), and how far random heads are from real
+ones (`coregister.evaluate.specificity`; real: of both groups). A line a setting: means over draws of both, the gain
+over the first model and the smallest of a draw. `--noise-mm` adds smooth noise of so many mm (rms; about 30 mm from
+wave to wave) to
 the training meshes, as registrations may be off. `--control` builds from heads drawn from the first model itself
 instead, and judges by heads of it: there is nothing to gain. No timed test: seconds are wall-clock.
 """
@@ -21,14 +22,16 @@ import numpy as np
 from jaxtyping import Float
 
 from bench.evaluation import Moves
-from coregister import anatomy as anatomy_of
-from coregister import bootstrap, identity, makehuman, population
-from coregister.anatomy import Anatomy
-from coregister.build import Build, build
-from coregister.generalization import fit, identity_part
-from coregister.identity import Identity
-from coregister.samples import Mesh, Subject
-from coregister.specificity import specificity_mm
+from coregister.evaluate.linear_fit import fit, identity_part
+from coregister.evaluate.specificity import specificity_mm
+from coregister.first_model import assembly as anatomy_of
+from coregister.first_model import build as bootstrap
+from coregister.first_model import makehuman, population
+from coregister.first_model.assembly import Anatomy
+from coregister.next_model import identity
+from coregister.next_model.build import Build, build
+from coregister.next_model.identity import Identity
+from coregister.next_model.training_data import Mesh, Subject
 from registration.model import gnm_npz
 from registration.model.gnm_npz import GNMData
 

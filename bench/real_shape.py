@@ -8,7 +8,7 @@ as far as their registrations did not fail, and MODEL, and both models are fitte
 numbers of components, in two ways:
 
 scan      the scan's points of the face (as `gnmreg evaluate` takes them) from the model's surface, all coefficients and
-          the rigid motion free (`coregister.scan_fit`): owes nothing to the registration of the one left out
+          the rigid motion free (`coregister.evaluate.scan_fit`): owes nothing to the registration of the one left out
 vertices  the vertices of its registration that cameras saw, on the head's skin. That registration was made with MODEL,
           so where it saw little it looks like MODEL, in whose favour this figure is biased; and it slides as MODEL does
 
@@ -24,11 +24,11 @@ from jaxtyping import Float
 from rich.console import Console
 from rich.table import Table
 
-from coregister.build import Build, build
-from coregister.generalization import Fit, fit, identity_part
-from coregister.identity import Identity
-from coregister.samples import Mesh, Subject, unposed
-from coregister.scan_fit import fit_scan
+from coregister.evaluate.linear_fit import Fit, fit, identity_part
+from coregister.evaluate.scan_fit import fit_scan
+from coregister.next_model.build import Build, build
+from coregister.next_model.identity import Identity
+from coregister.next_model.training_data import Mesh, Subject, unposed
 from registration.capture.native import read
 from registration.capture.scan import read_scan
 from registration.errors import InputError

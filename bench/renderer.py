@@ -24,8 +24,8 @@ import torch
 from rich.console import Console
 from rich.table import Table
 
-from coregister.bootstrap import bootstrap
-from coregister.synth import label_shares
+from coregister.first_model.build import bootstrap
+from coregister.synthetic.capture import label_shares
 from registration.model import gnm_npz
 from registration.model.atlas import texture_atlas
 from registration.render import backend

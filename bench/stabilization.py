@@ -20,8 +20,8 @@ from pathlib import Path
 import numpy as np
 
 from bench.support import performances, stabilization_measures
-from coregister import anatomy as anatomy_of
-from coregister import bootstrap, makehuman, population
+from coregister.first_model import assembly as anatomy_of
+from coregister.first_model import build, makehuman, population
 from registration.geometry.rigid import align
 from registration.model import gnm_npz
 from registration.model.gnm_npz import GNMData
@@ -43,7 +43,7 @@ MOTIONS = 50
 
 def population_bench(subjects: int) -> None:
     """The figures that count, last."""
-    data = gnm_npz.read(bootstrap.bootstrap())
+    data = gnm_npz.read(build.bootstrap())
     anatomy = anatomy_of.make(makehuman.read(makehuman.fetch()), population.mean_person())
     truths = [performances.perform(anatomy, 1000 + number) for number in range(subjects)]
     injected = [stabilization_measures.injected(truths, data, seed) for seed in range(DRAWS)]

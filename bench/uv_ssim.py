@@ -23,7 +23,7 @@ from rich.table import Table
 
 from bench.support import sliding
 from bench.support.sliding import OnSurface, Problem, Term
-from coregister.bootstrap import bootstrap
+from coregister.first_model.build import bootstrap
 from registration.capture.native import read
 from registration.frames import MM_PER_M
 from registration.losses import image

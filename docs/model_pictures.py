@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int, UInt8
 
-from coregister import anatomy, eyes, makehuman, population
+from coregister.first_model import assembly, eyes, makehuman, population
 from registration.geometry.rasterizer import rasterize
 from registration.geometry.topology import vertex_normals
 from registration.model import gnm_npz
@@ -267,7 +267,7 @@ def _row(pictures: list[Picture], titles: list[str]) -> Picture:
 def units(data: GNMData) -> dict[str, Float[np.ndarray, "V 3"]]:
     """MakeHuman's face units as near as the model's expression basis comes to them."""
     source = makehuman.read(makehuman.fetch())
-    made = anatomy.make(source, population.mean_person())
+    made = assembly.make(source, population.mean_person())
     basis, _ = np.linalg.qr(data.expression_basis.reshape(len(data.expression_basis), -1).T.astype(np.float64))
     wanted = {name: made.expression(source.target(f"faceunits/{name}")) for name in UNITS}
     return {name: (basis @ (basis.T @ unit.ravel())).reshape(unit.shape) for name, unit in wanted.items()}

@@ -14,8 +14,8 @@ import numpy as np
 from playwright.sync_api import sync_playwright
 
 from bench.support import performances
-from coregister import anatomy as anatomy_of
-from coregister import bootstrap, makehuman, population
+from coregister.first_model import assembly as anatomy_of
+from coregister.first_model import build, makehuman, population
 from registration.geometry.rigid import motion_fields
 from registration.model import gnm_npz
 from registration.stabilize.components import Head, regional_components
@@ -52,7 +52,7 @@ def stored(head: Head) -> StoredComponents:
 
 
 def main() -> None:
-    head = Head.of(gnm_npz.read(bootstrap.bootstrap()))
+    head = Head.of(gnm_npz.read(build.bootstrap()))
     with tempfile.TemporaryDirectory() as folder, sync_playwright() as playwright:
         page = Page(Review(stored(head), head, Path(folder) / "log.jsonl", "picture"), port=0)
         browser = playwright.chromium.launch(executable_path=CHROMIUM or shutil.which("chromium"), args=list(FLAGS))

@@ -273,8 +273,8 @@ def synth_capture(
         shirt: Put a shirt on the shoulders, with its own label.
     """
     targets = _target_weights(target)
-    from coregister.subjects import capture
-    from coregister.synth import Studio
+    from coregister.synthetic.capture import Studio
+    from coregister.synthetic.subject import capture
 
     studio = Studio(
         cameras=views, size_px=size, distortion=distortion, seed=seed, sensor=_sensor(noise), hair=hair, shirt=shirt
@@ -353,7 +353,7 @@ def synth_dataset(
         shirt: Put shirts on the shoulders, with their own label.
         jobs: Captures that are made side by side.
     """
-    from coregister.synth import Studio
+    from coregister.synthetic.capture import Studio
     from registration.progress import shown
     from workflows.synth_dataset import Population, synth_dataset
 
@@ -389,7 +389,7 @@ def evaluate_model(
         seed: Seed of everything random.
         force: Measure again although the folder holds the result of the same input.
     """
-    from coregister.evaluate import Settings
+    from coregister.evaluate.evaluation import Settings
     from registration.progress import shown
     from workflows.evaluate_models import PAGE, evaluate_models, lines
 
@@ -422,7 +422,7 @@ def bootstrap_model(out: Annotated[Path | None, arg(metavar="NPZ")] = None) -> i
     Args:
         out: Where to put a copy of the model file; its landmark schemes go beside it.
     """
-    from coregister.bootstrap import bootstrap
+    from coregister.first_model.build import bootstrap
 
     print(bootstrap(out))
     return 0

@@ -11,8 +11,8 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from coregister.decide import Rule
-from coregister.generalization import identity_part
+from coregister.evaluate.linear_fit import identity_part
+from coregister.stopping_rule import Rule
 from registration.errors import InputError
 from registration.fit.recipes import recipe_named
 from registration.model import gnm_npz

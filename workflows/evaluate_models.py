@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from coregister.evaluate import Evaluation, Settings, check, evaluate
+from coregister.evaluate.evaluation import Evaluation, Settings, check, evaluate
 from registration.errors import InputError
 from registration.model import gnm_npz
 from registration.model.gnm_npz import GNMData
@@ -39,7 +39,7 @@ def evaluate_models(
     Models are named as in the mapping, or after their files.
 
     Raises:
-        InputError: as `read_held_out`, `coregister.evaluate.check` and `check_out`, before anything is computed.
+        InputError: as `read_held_out`, `evaluation.check` and `check_out`, before anything is computed.
     """
     settings = settings or Settings()
     check_out(out)

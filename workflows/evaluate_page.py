@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from coregister.evaluate import Curve, Evaluation, Row
-from coregister.intervals import Interval
+from coregister.evaluate.confidence_intervals import Interval
+from coregister.evaluate.evaluation import Curve, Evaluation, Row
 from registration.model.gnm_npz import GNMData
 from registration.report.charts import Line, number_curves
 from registration.report.heat_map import UNMEASURED, heat_pictures, scale_limit_mm

@@ -191,7 +191,7 @@ def coregister(
         folder: As for batch.
         db: The queue's database, as for worker.
     """
-    from coregister.decide import Rule
+    from coregister.stopping_rule import Rule
     from registration.progress import shown
     from workflows.coregistration import PAGE, planned
     from workflows.engine.durable import migrate

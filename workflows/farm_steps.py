@@ -6,7 +6,7 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
-from coregister.decide import Rule
+from coregister.stopping_rule import Rule
 from registration.capture.native import read
 from registration.errors import InputError
 from registration.fit.recipes import recipe_named

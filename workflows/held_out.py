@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Int
 
-from coregister.evaluate import NEUTRAL, HeldOut
+from coregister.evaluate.evaluation import NEUTRAL, HeldOut
 from registration.capture.native import natural_key, read
 from registration.capture.scan import read_scan
 from registration.errors import InputError

@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from coregister.evaluate import HeldOut
-from coregister.samples import NEUTRAL, Mesh, Subject, onto_unposed, unposed
+from coregister.evaluate.evaluation import HeldOut
+from coregister.next_model.training_data import NEUTRAL, Mesh, Subject, onto_unposed, unposed
 from registration.capture.scan import read_truth
 from registration.model.gnm import GNM
 from registration.model.gnm_npz import GNMData

@@ -10,13 +10,13 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from coregister import decide as deciding
-from coregister import provenance
-from coregister.build import Build
-from coregister.build import build as build_model
-from coregister.evaluate import Settings
-from coregister.generalization import identity_part
-from coregister.identity import Identity
+from coregister import stopping_rule as deciding
+from coregister.evaluate.evaluation import Settings
+from coregister.evaluate.linear_fit import identity_part
+from coregister.next_model import provenance
+from coregister.next_model.build import Build
+from coregister.next_model.build import build as build_model
+from coregister.next_model.identity import Identity
 from registration.errors import InputError
 from registration.fit.recipes import recipe_named
 from registration.model import gnm_npz
@@ -151,7 +151,7 @@ def build(
 ) -> Told:
     """Registrations, stabilized expressions (`steady`) and the previous model -> the folder of the next model.
 
-    Raises InputError as `coregister.build.build`.
+    Raises InputError as `coregister.next_model.build.build`.
     """
     found, data = read_dataset(Path(dataset)), gnm_npz.read(Path(previous))
     tags = {name: found.tags(name) for name in names}

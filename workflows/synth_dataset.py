@@ -6,8 +6,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from coregister import expressions, subjects
-from coregister.synth import Studio, check
+from coregister.synthetic import expressions, subject
+from coregister.synthetic.capture import Studio, check
 from registration.errors import InputError
 from registration.progress import Progress, Silent
 from registration.storage.hashing import plain, versions
@@ -43,7 +43,7 @@ class Population:
 def synth_dataset(
     out: Path, population: Population, *, jobs: int = 1, progress: Progress | None = None
 ) -> dict[str, Any]:
-    """Photograph a population (`coregister.subjects.capture`, people of any age and build) into `out`.
+    """Photograph a population (`coregister.synthetic.subject.capture`, people of any age and build) into `out`.
 
     `out/SUBJECT/EXPRESSION` are captures, each whole or not there; called again it goes on where it was interrupted.
     `out/dataset.json` tells the seeds, who is held out, and whether all is there. Held-out subjects' captures have the
@@ -89,7 +89,7 @@ def synth_dataset(
 def photograph(**settings: Any) -> str:
     """One capture. Returns its trouble, "" if there was none."""
     try:
-        subjects.capture(**settings)
+        subject.capture(**settings)
     except InputError as error:
         return error.line
     except Exception as error:

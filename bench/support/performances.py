@@ -7,9 +7,10 @@ import numpy as np
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from coregister import expressions, population
-from coregister.anatomy import Anatomy
-from coregister.expressions import EXPRESSIONS, Expression
+from coregister.first_model import population
+from coregister.first_model.assembly import Anatomy
+from coregister.synthetic import expressions
+from coregister.synthetic.expressions import EXPRESSIONS, Expression
 from registration.frames import transform_points
 from registration.model.gnm_npz import GNMData
 from registration.stabilize.subject_meshes import SubjectMeshes

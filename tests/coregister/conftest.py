@@ -4,10 +4,10 @@ from pathlib import Path
 
 import pytest
 
-from coregister import anatomy as anatomy_of
-from coregister import bootstrap, makehuman, population
-from coregister.anatomy import Anatomy
-from coregister.makehuman import MakeHuman
+from coregister.first_model import assembly as anatomy_of
+from coregister.first_model import build, makehuman, population
+from coregister.first_model.assembly import Anatomy
+from coregister.first_model.makehuman import MakeHuman
 from registration.errors import InputError
 from registration.model import gnm_npz
 from registration.model.gnm_npz import GNMData
@@ -33,7 +33,7 @@ def anatomy(source) -> Anatomy:
 
 @pytest.fixture(scope="session")
 def model_file(wheel) -> Path:
-    return bootstrap.bootstrap()
+    return build.bootstrap()
 
 
 @pytest.fixture(scope="session")

@@ -7,6 +7,7 @@ import pytest
 
 import registration.register
 import workflows.subject
+from tests.conftest import FIXTURES
 from tests.registration.capture.small import make
 from workflows.cli import main
 from workflows.subject_folder import Row, Subject
@@ -46,7 +47,6 @@ def test_every_command_explains_itself(command: str, capsys: pytest.CaptureFixtu
 def test_help_imports_nothing_heavy() -> None:
     code = """
 import sys
-from tests.conftest import FIXTURES
 from workflows.cli import main
 try:
     main(["register", "--help"])

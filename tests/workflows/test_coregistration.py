@@ -14,7 +14,7 @@ import workflows.farm_coregistration
 import workflows.farm_steps
 import workflows.stabilize_run
 import workflows.subject
-from coregister.decide import Rule
+from coregister.stopping_rule import Rule
 from registration.errors import InputError
 from registration.model import gnm_npz
 from tests.workflows.conftest import change

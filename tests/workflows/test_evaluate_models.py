@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import workflows.evaluate_models
-from coregister.evaluate import Settings
+from coregister.evaluate.evaluation import Settings
 from registration.errors import InputError
 from registration.model import gnm_npz
 from registration.stabilize import stabilized_folder as stabilized

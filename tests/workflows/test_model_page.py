@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from coregister.build import build
-from coregister.samples import Mesh, Subject
+from coregister.next_model.build import build
+from coregister.next_model.training_data import Mesh, Subject
 from registration.model import gnm_npz
 from tests.workflows.rounds import MODEL, head
 from workflows import model_page

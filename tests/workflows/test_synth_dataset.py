@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 import workflows.synth_dataset
-from coregister import subjects
-from coregister.synth import Studio
+from coregister.synthetic import subject as subjects
+from coregister.synthetic.capture import Studio
 from registration.errors import InputError
 from registration.storage.hashing import hash_file
 from workflows.children import side_by_side
@@ -147,7 +147,7 @@ def test_one_trouble_in_another_process_does_not_stop_the_others(tmp_path):
 
 @pytest.mark.slow
 def test_real_photographs_of_a_person_and_an_expression(tmp_path):
-    from coregister import makehuman
+    from coregister.first_model import makehuman
 
     try:
         makehuman.fetch()

@@ -5,8 +5,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from coregister import bootstrap, makehuman
-from coregister.subjects import capture
+from coregister.first_model import build, makehuman
+from coregister.synthetic.subject import capture
 from registration.errors import InputError
 from registration.model import gnm_npz, regions
 from registration.register import register
@@ -22,7 +22,7 @@ def model() -> Path:
         makehuman.fetch()
     except InputError as error:
         pytest.skip(f"{error.what}: {error.got}")
-    return bootstrap.bootstrap()
+    return build.bootstrap()
 
 
 def test_neutral(model: Path, tmp_path: Path) -> None:

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from coregister.bootstrap import bootstrap
+from coregister.first_model.build import bootstrap
 from registration.errors import InputError
 from registration.frames import linear_to_srgb
 from registration.geometry.rasterizer import rasterize

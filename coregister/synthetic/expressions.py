@@ -1,0 +1,111 @@
+"""Named expressions of synthetic subjects, in the ten categories of the paper's capture protocol (Data Foundation)."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+from jaxtyping import Float
+from scipy.spatial.transform import Rotation
+
+from coregister.first_model import tongue
+from coregister.first_model.assembly import Anatomy, off_eyes
+from registration.errors import InputError
+
+
+@dataclass(frozen=True, kw_only=True)
+class Expression:
+    """One static expression: weights of MakeHuman's face units, where the eyes look, what the tongue does."""
+
+    category: str
+    units: Mapping[str, float] = field(default_factory=dict)
+    gaze_deg: tuple[float, float] = (0.0, 0.0)  # to the subject's left, up
+    tongue: Mapping[str, float] = field(default_factory=dict)  # arguments of `tongue.moved`
+
+
+def _both(*units: str, weight: float = 1.0) -> dict[str, float]:
+    return {f"{unit}{side}": weight for unit in units for side in ("Left", "Right")}
+
+
+def _looking(direction: str, weight: float = 1.0) -> dict[str, float]:
+    """The lids go with the eyes."""
+    inner, outer = ("Right", "Left") if direction == "Left" else ("Left", "Right")
+    if direction in ("Up", "Down"):
+        return _both(f"eyeLook{direction}", weight=weight)
+    return {f"eyeLookIn{inner}": weight, f"eyeLookOut{outer}": weight}
+
+
+EXPRESSIONS: Mapping[str, Expression] = {
+    "neutral": Expression(category="neutral"),
+    "stretch": Expression(
+        category="flexing", units={"jawOpen": 0.8, "browInnerUp": 0.8} | _both("eyeWide", "browOuterUp", "mouthStretch")
+    ),
+    "compress": Expression(
+        category="flexing", units=_both("eyeSquint", "browDown", "noseSneer", "mouthPress") | {"mouthShrugLower": 0.5}
+    ),
+    "smile": Expression(category="flexing", units=_both("mouthSmile", weight=0.9) | _both("cheekSquint", weight=0.6)),
+    "viseme_aa": Expression(category="visemes", units={"jawOpen": 0.55} | _both("mouthLowerDown", weight=0.3)),
+    "viseme_ee": Expression(
+        category="visemes", units={"jawOpen": 0.15} | _both("mouthStretch", "mouthDimple", weight=0.6)
+    ),
+    "viseme_oo": Expression(category="visemes", units={"jawOpen": 0.2, "mouthPucker": 0.7}),
+    "viseme_ff": Expression(category="visemes", units={"mouthRollLower": 0.6} | _both("mouthUpperUp", weight=0.4)),
+    "lips_rolled": Expression(category="lips", units={"mouthRollUpper": 1.0, "mouthRollLower": 1.0}),
+    "pucker": Expression(category="lips", units={"mouthPucker": 1.0}),
+    "funnel": Expression(category="lips", units={"mouthFunnel": 1.0, "jawOpen": 0.2}),
+    "sadness": Expression(
+        category="emotions", units={"browInnerUp": 1.0, "mouthShrugLower": 0.5} | _both("mouthFrown", weight=0.9)
+    ),
+    "fear": Expression(
+        category="emotions",
+        units={"browInnerUp": 0.9, "jawOpen": 0.25} | _both("eyeWide") | _both("mouthStretch", weight=0.7),
+    ),
+    "anger": Expression(category="emotions", units=_both("browDown", "noseSneer") | _both("mouthPress", weight=0.6)),
+    "tongue_out": Expression(category="tongue", units={"jawOpen": 0.5}, tongue={"out": 1.0}),
+    "tongue_left": Expression(category="tongue", units={"jawOpen": 0.5}, tongue={"out": 0.8, "turn": 0.5}),
+    "jaw_open": Expression(category="jaw", units={"jawOpen": 1.0}),
+    "jaw_left": Expression(category="jaw", units={"jawLeft": 1.0, "jawOpen": 0.1}),
+    "jaw_right": Expression(category="jaw", units={"jawRight": 1.0, "jawOpen": 0.1}),
+    "wink_left": Expression(category="eyes", units={"eyeBlinkLeft": 1.0, "cheekSquintLeft": 0.7}),
+    "wink_right": Expression(category="eyes", units={"eyeBlinkRight": 1.0, "cheekSquintRight": 0.7}),
+    "squint": Expression(category="eyes", units=_both("eyeSquint", "cheekSquint", weight=0.9)),
+    "gaze_left": Expression(category="gaze", units=_looking("Left"), gaze_deg=(25.0, 0.0)),
+    "gaze_up": Expression(category="gaze", units=_looking("Up"), gaze_deg=(0.0, 18.0)),
+    "gaze_down": Expression(category="gaze", units=_looking("Down"), gaze_deg=(0.0, -20.0)),
+    "brows_up": Expression(category="eyebrows", units={"browInnerUp": 1.0} | _both("browOuterUp")),
+    "brows_down": Expression(category="eyebrows", units=_both("browDown")),
+    "cheeks_blown": Expression(category="cheeks", units={"cheekPuff": 1.0}),
+}
+
+
+def named(name: str) -> Expression:
+    """The expression of this name. Raises InputError, with the names there are, if there is none."""
+    if name not in EXPRESSIONS:
+        raise InputError(
+            "there is no such expression",
+            where="expression",
+            expected=", ".join(EXPRESSIONS),
+            got=name,
+            fix="choose one of these",
+        )
+    return EXPRESSIONS[name]
+
+
+def perform(
+    anatomy: Anatomy, expression: Expression, vertices: Float[np.ndarray, "V 3"], joints: Float[np.ndarray, "J 3"]
+) -> Float[np.ndarray, "V 3"]:
+    """A neutral head's vertices (m, with its joints, not turned against the template) with an expression on it."""
+    source, rows = anatomy.source, anatomy.slices
+    result = vertices.copy()
+    if expression.units:
+        delta = sum(weight * source.target(f"faceunits/{unit}") for unit, weight in expression.units.items())
+        result += anatomy.expression(np.asarray(delta))
+    if expression.tongue:
+        rest = anatomy.template[rows["tongue"]]
+        out = anatomy.tongue_motion(source.target("faceunits/tongueOut"))[rows["tongue"]]
+        result[rows["tongue"]] += tongue.moved(rest, out, **expression.tongue)
+    left, up = expression.gaze_deg
+    gaze = Rotation.from_euler("yx", [left, -up], degrees=True)
+    for side, name in enumerate(("left_eye", "right_eye"), start=2):
+        result[rows[name]] = gaze.apply(result[rows[name]] - joints[side]) + joints[side]
+    result[rows["skin"]] = off_eyes(result[rows["skin"]], joints[2:])
+    return result

@@ -1,0 +1,264 @@
+"""The evaluation of models as a whole: known figures, gains, tables, what is refused, and people of the population."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from coregister.evaluate import evaluation as whole
+from coregister.evaluate.evaluation import HeldOut, Settings, evaluate
+from coregister.first_model import population
+from coregister.synthetic import expressions
+from registration.errors import InputError
+from registration.model import gnm_npz, regions
+from registration.storage.hashing import plain
+from tests.conftest import SHARED, needs_shared
+from tests.coregister.spectrum import DEVIATIONS_MM, heads, spectrum_model, with_identity
+
+SETTINGS = Settings(components=(2, 4, 8), samples=5, draws=500)
+AGES = (25, 31, 38, 64)
+
+
+@pytest.fixture(scope="module")
+def model():
+    return spectrum_model()
+
+
+def people(model, count=4, seed=0):
+    """Samples of the model with two expressions each, whose tags and scans are known."""
+    rng = np.random.default_rng(seed)
+    found = []
+    for number in range(count):
+        neutral = heads(model, rng.standard_normal((1, len(model.vertex_identity_basis))))[0]
+        acts = np.tensordot(rng.standard_normal((2, 12)), model.expression_basis, 1)
+        found.append(
+            HeldOut(
+                subject=f"subject_{number}",
+                neutral=neutral,
+                expressions=neutral + acts,
+                categories=("jaw", "lips"),
+                tags={
+                    "gender": ("female", "male")[number % 2],
+                    "age": AGES[number % 4],
+                    "category": "neutral",
+                    "note": f"{number}",
+                },
+                scan=neutral[regions.head_skin(model)],
+            )
+        )
+    return found
+
+
+@pytest.fixture(scope="module")
+def found(model):
+    return evaluate({"own": model}, people(model), model.triangles, SETTINGS)
+
+
+def test_a_model_on_its_own_samples(model, found):
+    own = found.models["own"]
+    assert own.identity.components == (2, 4, 8, 12)
+    assert own.identity.at(12).max() < 1e-6
+    means = [interval.mean for interval in own.identity.intervals]
+    assert means == sorted(means, reverse=True)
+    assert own.expressions["lower_face"].at(12).max() < 1e-6
+    assert own.scans is not None and own.scans.at(12).max() < 1e-2
+    assert (own.scans.at(2) <= own.identity.at(2) + 1e-9).all()  # the surface is nearer than the vertex
+    assert own.unconverged == 0
+    skin = regions.head_skin(model)
+    assert own.vertex_mm[skin].mean() == pytest.approx(own.identity.at(8).mean())
+    assert np.isnan(own.vertex_mm[~skin]).all()
+    share = np.cumsum(DEVIATIONS_MM**2) / (DEVIATIONS_MM**2).sum()
+    np.testing.assert_allclose(own.compactness["identity"].share, share, rtol=1e-6)
+    assert own.compactness["identity"].rms_mm[-1] == pytest.approx(np.sqrt((DEVIATIONS_MM**2).sum()), rel=1e-6)
+    assert found.vertices == regions.head_skin(model).sum()
+
+
+def test_turned_and_moved_subjects_change_nothing(model, found):
+    turns = Rotation.random(4, random_state=1)
+    moved = []
+    for turn, one in zip(turns, people(model), strict=True):
+
+        def place(points, turn=turn):
+            return (turn.apply(points.reshape(-1, 3)) + (0.5, 1.0, -2.0)).reshape(points.shape)
+
+        moved.append(replace(one, neutral=place(one.neutral), expressions=place(one.expressions), scan=place(one.scan)))
+    again = evaluate({"own": model}, moved, model.triangles, SETTINGS).models["own"]
+    own = found.models["own"]
+    np.testing.assert_allclose(again.identity.values_mm, own.identity.values_mm, atol=1e-6)
+    np.testing.assert_allclose(again.scans.values_mm, own.scans.values_mm, rtol=2e-2, atol=1e-2)
+    np.testing.assert_allclose(
+        again.expressions["lower_face"].values_mm, own.expressions["lower_face"].values_mm, atol=1e-6
+    )
+    np.testing.assert_allclose(again.specificity.values_mm, own.specificity.values_mm, atol=1e-4)
+    for row, other in zip(own.rows, again.rows, strict=True):
+        assert (row.kind, row.name, row.subjects) == (other.kind, other.name, other.subjects)
+        assert row.distance_mm.mean == pytest.approx(other.distance_mm.mean, abs=1e-6)
+
+
+def test_tables_count_subjects_and_split_them_by_what_they_share(model, found):
+    own = found.models["own"]
+    rows = {(row.kind, row.name): row for row in own.rows}
+    assert {name for kind, name in rows if kind == "category"} == {"neutral", "jaw", "lips"}
+    assert {name for kind, name in rows if kind == "age"} == {"20 to 29", "30 to 39", "60 to 69"}
+    assert rows["age", "30 to 39"].subjects == 2 and rows["age", "20 to 29"].subjects == 1
+    assert rows["age", "20 to 29"].distance_mm.low is None
+    assert "note" not in {kind for kind, _ in rows}  # everybody has another one
+    neutrals = own.identity.at(8)
+    assert rows["gender", "female"].distance_mm.mean == pytest.approx(neutrals[::2].mean())
+    assert rows["gender", "male"].distance_mm.mean == pytest.approx(neutrals[1::2].mean())
+    assert rows["category", "jaw"].distance_mm.mean < 1e-6  # all components: the model's own samples
+    parts = [row for (kind, _), row in rows.items() if kind == "region"]
+    assert parts and all(row.subjects == 4 and row.distance_mm.mean > 0 for row in parts)
+
+
+def test_gains_are_paired_and_of_the_same_number_of_components(model):
+    """The other model lacks the first component but has one more at the end: with k it leaves what k + 1 leave, and
+    the first."""
+    weak = with_identity(model, np.roll(model.vertex_identity_basis, -1, 0))
+    subjects = [replace(one, scan=None) for one in people(model, 12, seed=2)]
+    settings = replace(SETTINGS, samples=0)
+    result = evaluate({"weak": weak, "own": model, "same": weak}, subjects, model.triangles, settings)
+    assert [(gain.model, gain.components) for gain in result.gains] == [
+        (name, k) for name in ("own", "same") for k in (2, 4, 8)
+    ]
+    for gain in result.gains[:3]:
+        first, other = (result.models[name].identity.at(gain.components) for name in ("weak", "own"))
+        assert gain.gain.mean == pytest.approx(1 - other.mean() / first.mean())
+        assert gain.gain.low < gain.gain.mean < gain.gain.high
+        assert gain.difference_mm.mean == pytest.approx(first.mean() - other.mean())
+    assert result.gains[2].gain.low > 0.3
+    for gain in result.gains[3:]:
+        assert gain.gain.mean == pytest.approx(0, abs=1e-9) and gain.gain.high == pytest.approx(0, abs=1e-9)
+    assert result.models["own"].specificity is None
+
+
+def test_equal_seeds_make_equal_figures_that_fit_into_a_manifest(model, found):
+    again = evaluate({"own": model}, people(model), model.triangles, SETTINGS)
+    text = json.dumps(plain(found.figures), allow_nan=False)
+    assert text == json.dumps(plain(again.figures), allow_nan=False)
+    other = evaluate({"own": model}, people(model), model.triangles, replace(SETTINGS, seed=1))
+    assert other.models["own"].specificity.values_mm.tolist() != found.models["own"].specificity.values_mm.tolist()
+
+
+def test_subjects_without_scans_or_expressions_have_no_such_figures(model):
+    bare = [replace(one, scan=None, expressions=one.expressions[:0], categories=()) for one in people(model)]
+    own = evaluate({"own": model}, bare, model.triangles, SETTINGS).models["own"]
+    assert own.scans is None and own.expressions == {}
+    mixed = [people(model)[0], *bare[1:]]
+    own = evaluate({"own": model}, mixed, model.triangles, SETTINGS).models["own"]
+    assert own.scans.intervals[0].low is None and np.isnan(own.scans.values_mm[1:]).all()
+    assert len(own.expressions["lower_face"].intervals) == 4
+
+
+def spoiled(one, value):
+    neutral = one.neutral.copy()
+    neutral[5, 1] = value
+    return replace(one, neutral=neutral)
+
+
+BAD = {
+    "no subjects": (lambda m, p, s: ({"m": m}, [], m.triangles, s), "too few held-out"),
+    "one subject": (lambda m, p, s: ({"m": m}, p[:1], m.triangles, s), "too few held-out"),
+    "a subject twice": (lambda m, p, s: ({"m": m}, [p[0], p[0]], m.triangles, s), "comes twice"),
+    "no model": (lambda m, p, s: ({}, p, m.triangles, s), "no model"),
+    "foreign topology": (lambda m, p, s: ({"m": m}, p, m.triangles[:, ::-1], s), "another topology"),
+    "NaN": (lambda m, p, s: ({"m": m}, [spoiled(p[0], np.nan), *p[1:]], m.triangles, s), "not finite"),
+    "infinite": (lambda m, p, s: ({"m": m}, [spoiled(p[0], np.inf), *p[1:]], m.triangles, s), "not finite"),
+    "fewer vertices": (
+        lambda m, p, s: (
+            {"m": m},
+            [replace(p[0], neutral=p[0].neutral[:-1], expressions=p[0].expressions[:, :-1]), *p[1:]],
+            m.triangles,
+            s,
+        ),
+        "another size",
+    ),
+    "categories missing": (
+        lambda m, p, s: ({"m": m}, [replace(p[0], categories=()), *p[1:]], m.triangles, s),
+        "categories are incomplete",
+    ),
+    "an empty scan": (
+        lambda m, p, s: ({"m": m}, [replace(p[0], scan=np.zeros((0, 3))), *p[1:]], m.triangles, s),
+        "scan is empty",
+    ),
+    "too many components": (
+        lambda m, p, s: ({"m": m}, p, m.triangles, replace(s, components=(2, 13))),
+        "fewer identity components",
+    ),
+    "components out of order": (
+        lambda m, p, s: ({"m": m}, p, m.triangles, replace(s, components=(4, 2))),
+        "out of order",
+    ),
+    "no components": (lambda m, p, s: ({"m": m}, p, m.triangles, replace(s, components=())), "out of order"),
+    "a negative number of samples": (
+        lambda m, p, s: ({"m": m}, p, m.triangles, replace(s, samples=-1)),
+        "out of range",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", BAD)
+def test_what_cannot_be_evaluated_is_refused_before_any_work(model, name, monkeypatch):
+    def never(*_, **__):
+        raise AssertionError("work was begun")
+
+    monkeypatch.setattr(whole.general, "fit", never)
+    make, what = BAD[name]
+    with pytest.raises(InputError) as error:
+        evaluate(*make(model, people(model), SETTINGS))
+    assert what in error.value.what
+    assert all((error.value.where, error.value.expected, error.value.got, error.value.fix))
+
+
+@needs_shared
+@pytest.mark.slow
+def test_a_model_of_the_official_size_on_its_own_samples():
+    data = gnm_npz.read(SHARED / "data" / "gnm" / "gnm_head_reconstructed.npz")
+    rng = np.random.default_rng(0)
+    members = np.concatenate([members for members, _ in regions.expression_regions(data).values()])
+    subjects = []
+    for number in range(2):
+        neutral = heads(data, rng.standard_normal((1, len(data.vertex_identity_basis))))[0]
+        move = np.tensordot(rng.standard_normal(len(members)), data.expression_basis[members].astype(np.float64), 1)
+        both = {"expressions": (neutral + move)[None], "categories": ("any",)}
+        subjects.append(HeldOut(subject=f"{number}", neutral=neutral, **both))
+    settings = Settings(components=(10, 20, 40), samples=0)
+    found = evaluate({"own": data}, subjects, data.triangles, settings).models["own"]
+    means = [interval.mean for interval in found.identity.intervals]
+    assert found.unconverged == 0 and means == sorted(means, reverse=True)
+    assert means[0] > 0.2 and means[-1] < 1e-5
+    rows = {(row.kind, row.name): row.distance_mm.mean for row in found.rows}
+    assert rows["category", "any"] < 1e-5 and rows["category", "neutral"] < 1e-5
+
+
+@pytest.mark.slow
+def test_people_beyond_the_first_models_span(anatomy, model, model_file):
+    data, source = gnm_npz.read(model_file), anatomy.source
+    rng = np.random.default_rng(12345)
+    acts = [expressions.named(name) for name in ("smile", "jaw_open", "brows_up")]
+
+    def someone(number, draw):
+        person = draw(source, rng)
+        neutral, joints = anatomy.person(person, {name: source.target(name) for name in person.weights})
+        moved = np.stack([expressions.perform(anatomy, act, neutral, joints) for act in acts])
+        return HeldOut(
+            subject=f"{draw.__name__}_{number}",
+            neutral=neutral,
+            expressions=moved,
+            categories=tuple(act.category for act in acts),
+            tags=person.tags,
+        )
+
+    settings = Settings(components=(10, 20, 40), samples=0)
+    means = {}
+    for draw in (population.model_person, population.any_person):
+        result = evaluate({"first": data}, [someone(k, draw) for k in range(8)], data.triangles, settings)
+        figures = result.models["first"]
+        means[draw.__name__] = [interval.mean for interval in figures.identity.intervals]
+        assert figures.unconverged == 0
+        for region in ("left_eye", "right_eye", "lower_face"):
+            assert figures.expressions[region].intervals[-1].mean < 0.15
+    assert means["model_person"][-1] < 0.6  # 99.5 % of the variance leave 0.41 mm rms of the basis' own samples
+    assert means["any_person"][1] > 1.2 and means["any_person"][-1] > 1.5 * means["model_person"][-1]

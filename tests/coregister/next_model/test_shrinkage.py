@@ -1,0 +1,61 @@
+"""The previous model's share by cross-validation, against doing it at full length."""
+
+import numpy as np
+import pytest
+
+from coregister.next_model.shrinkage import Mixed
+from coregister.next_model.shrinkage_weight import FOLDS, SHARES, left_out_rms
+from registration.geometry.pca import principal_components
+
+SIZE = 60
+
+
+def _chosen(samples: np.ndarray, previous: np.ndarray, components: int) -> float:
+    rows = np.concatenate([samples, previous])
+    rms = left_out_rms(rows @ rows.T, [np.arange(len(samples))], [True], components)
+    return SHARES[int(rms.argmin())]
+
+
+@pytest.mark.parametrize("share", (0.0, 0.35, 0.95))
+def test_products_tell_what_building_anew_without_each_group_tells(share):
+    rng = np.random.default_rng(0)
+    samples, previous = rng.normal(size=(13, SIZE)) + 5, rng.normal(size=(7, SIZE))
+    rows = np.concatenate([samples, previous])
+    found = left_out_rms(rows @ rows.T, [np.arange(13)], [True], 6, (share,))
+    squares = 0.0
+    for fold in range(FOLDS):
+        out = np.arange(13) % FOLDS == fold
+        mean = samples[~out].mean(0)
+        kept = samples[~out] - mean
+        stream = Mixed(kept, np.ones(len(kept)), len(kept) - 1, previous, share)
+        basis = principal_components(stream, centred=False, most=6).components
+        for test in samples[out] - mean:
+            squares += ((test - np.linalg.lstsq(basis.T, test, rcond=None)[0] @ basis) ** 2).sum()
+    assert found[0] == pytest.approx(np.sqrt(squares / 13), rel=1e-5)
+
+
+def test_parts_about_zero_are_left_out_together_with_those_about_a_mean():
+    rng = np.random.default_rng(1)
+    even, odd, previous = np.zeros((11, SIZE)), np.zeros((11, SIZE)), np.zeros((4, SIZE))
+    even[:, :30], odd[:, 30:] = rng.normal(size=(11, 30)) + 2, rng.normal(size=(11, 30))
+    previous[:, :30] = rng.normal(size=(4, 30))
+    rows = np.concatenate([even, odd, previous])
+    both = left_out_rms(rows @ rows.T, [np.arange(11), np.arange(11, 22)], [True, False], 100, (0.2,))
+    # All components there are: the remainders of both parts add up, for nothing of one part is in the other's span.
+    squares = 0.0
+    for fold in range(FOLDS):
+        out = np.arange(11) % FOLDS == fold
+        mean = even[~out].mean(0)
+        for test, span in ((even[out] - mean, np.concatenate([even[~out] - mean, previous])), (odd[out], odd[~out])):
+            squares += ((test - test @ np.linalg.pinv(span) @ span) ** 2).sum()
+    assert both[0] == pytest.approx(np.sqrt(squares / 11), rel=1e-6)
+
+
+def test_few_samples_of_the_previous_model_leave_it_much_and_many_others_little():
+    rng = np.random.default_rng(2)
+    model = rng.normal(size=(15, SIZE)) * 0.8 ** np.arange(15)[:, None]
+    other = rng.normal(size=(6, SIZE))
+    few = rng.normal(size=(8, 15)) @ model
+    assert _chosen(few, model, 10) >= 0.5
+    many = rng.normal(size=(200, 6)) @ other
+    assert _chosen(many, model, 6) <= 0.1
