@@ -35,13 +35,13 @@ from registration.model import gnm_npz, regions
 from registration.model.gnm_npz import GNMData
 from registration.progress import shown
 from registration.render.studio.shoot import Quality
-from workflows import steps
-from workflows.coregistration import FIRST, planned
 from workflows.engine.database import default_url
-from workflows.engine.durable import migrate
-from workflows.farm_coregistration import coregister
-from workflows.held_out import read_held_out
-from workflows.synth_dataset import Population, synth_dataset
+from workflows.engine.process import migrate
+from workflows.farm.coregistration import coregister
+from workflows.records.coregistration import FIRST, planned
+from workflows.records.held_out import read_held_out
+from workflows.steps import coregistration
+from workflows.steps.synthesize import Population, synth_dataset
 
 COMPONENTS = (10, 20, 40)
 AT = "20"  # what counts
@@ -134,10 +134,10 @@ def main() -> None:
     if "stopped" in told:
         sys.exit(told["stopped"])
     print(f"captures {count} seconds {captured - begun:.0f}; rounds {time.perf_counter() - captured:.0f}")
-    people = read_held_out(options.out / "rounds" / "held_out" / steps.PEOPLE).subjects
+    people = read_held_out(options.out / "rounds" / "held_out" / coregistration.PEOPLE).subjects
     models = {name: gnm_npz.read(Path(file)) for name, file in told["models"].items()}
     samples = own_samples(models[FIRST], options.training, options.seed)
-    models[CONTROL] = build(samples, models[FIRST], steps.builder()).data
+    models[CONTROL] = build(samples, models[FIRST], coregistration.builder()).data
     figures = {}
     for measure, (distance_mm, part_of) in MEASURES.items():
         print(f"{measure:44}" + "".join(f"{k:>9} mm" for k in COMPONENTS))

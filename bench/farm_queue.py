@@ -17,11 +17,11 @@ from typing import Any
 import sqlalchemy as sa
 
 from bench.support.postgres_server import server
-from workflows.engine.control import Queue
+from workflows.engine.client import Queue
 from workflows.engine.database import checked_url, default_url, engine, is_sqlite, sqlite_file
-from workflows.engine.durable import migrate
-from workflows.engine.reads import Reader, ended
-from workflows.jobs import DRIVER, FlowJob, Job
+from workflows.engine.jobs import DRIVER, FlowJob, Job
+from workflows.engine.process import migrate
+from workflows.engine.reader import Reader, ended
 
 MB = 2**20
 

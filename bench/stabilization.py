@@ -35,7 +35,7 @@ from registration.stabilize.pipeline import (
     regional_stage,
 )
 from registration.stabilize.subject_meshes import SkullSkin, SubjectMeshes
-from workflows.stabilize_folder import read_run
+from workflows.records.run import read_run
 
 DRAWS = 5
 MOTIONS = 50

@@ -20,10 +20,10 @@ from registration.geometry.rigid import motion_fields
 from registration.model import gnm_npz
 from registration.stabilize.components import Head, regional_components
 from registration.stabilize.stabilized_folder import StoredComponents
-from tests.workflows.test_review import CHROMIUM, FLAGS
-from workflows.stabilize_run import along
-from workflows.web.decide import Review
+from tests.workflows.web.test_review import CHROMIUM, FLAGS
+from workflows.steps.stabilize import along
 from workflows.web.review import Page
+from workflows.web.review_state import Review
 
 PICTURE = Path(__file__).with_name("stabilization.jpg")
 SIZE = {"width": 1500, "height": 960}

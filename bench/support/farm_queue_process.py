@@ -3,9 +3,9 @@
 import sys
 from pathlib import Path
 
-from workflows.engine.durable import Process, serve
-from workflows.flows import FLOWS
-from workflows.jobs import DRIVER, GPU, SUBJECTS, Step
+from workflows.engine.jobs import DRIVER, GPU, SUBJECTS, Step
+from workflows.engine.process import Process, serve
+from workflows.farm.flows import FLOWS
 
 
 def nothing(**arguments: object) -> None:

@@ -55,7 +55,7 @@ def stabilize(
     """Both stages: every subject by itself, then regional components over all, corrected by default or as decided.
 
     Everything is held in memory: for larger sets call `automatic_stage`, `regional_stage` and `corrected` as
-    `workflows/stabilize_run.py` does, which keeps subjects on disk. Raises InputError as these do.
+    `workflows/steps/stabilize.py` does, which keeps subjects on disk. Raises InputError as these do.
     """
     settings = settings or Stabilization()
     head, skin = Head.of(data), SkullSkin.of(data)

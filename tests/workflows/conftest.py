@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import trimesh
 
-import workflows.subject
+import workflows.steps.subject
 from registration.storage.registration_folder import save_registration
 from registration.types import Registration
 from tests.registration.capture import small
@@ -98,7 +98,7 @@ class FakeRegister:
 @pytest.fixture
 def fake(monkeypatch: pytest.MonkeyPatch) -> FakeRegister:
     fake = FakeRegister()
-    monkeypatch.setattr(workflows.subject, "register", fake)
+    monkeypatch.setattr(workflows.steps.subject, "register", fake)
     return fake
 
 

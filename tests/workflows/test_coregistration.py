@@ -8,28 +8,29 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-import workflows.coregistration_page
-import workflows.evaluate_models
-import workflows.farm_coregistration
-import workflows.farm_steps
-import workflows.stabilize_run
-import workflows.subject
+import workflows.farm.coregistration
+import workflows.pages.coregistration
+import workflows.steps.evaluate
+import workflows.steps.register
+import workflows.steps.stabilize
+import workflows.steps.subject
 from coregister.stopping_rule import Rule
 from registration.errors import InputError
 from registration.model import gnm_npz
 from tests.workflows.conftest import change
 from tests.workflows.farm.inline import Inline, really
 from tests.workflows.rounds import ACTS, MODEL, Finds, head, world, write_people, write_person
-from workflows import model_page, steps
-from workflows.cli import main
-from workflows.coregistration import planned
-from workflows.dataset import read_dataset, split
-from workflows.engine.reads import Reader
-from workflows.engine.rows import JobFailed
-from workflows.farm_coregistration import begin
-from workflows.farm_local import Ended, LocalFarm
-from workflows.flows import coregister
-from workflows.model_subjects import Registered
+from workflows.cli.app import main
+from workflows.engine.reader import Reader
+from workflows.engine.serialization import JobFailed
+from workflows.farm.coregistration import begin
+from workflows.farm.flows import coregister
+from workflows.farm.local import Ended, LocalFarm
+from workflows.pages import model
+from workflows.records.coregistration import planned
+from workflows.records.dataset import read_dataset, split
+from workflows.records.training_subjects import Registered
+from workflows.steps import coregistration
 
 TWICE = Rule(rounds=2, failures=1.0, early=False)
 
@@ -38,14 +39,14 @@ TWICE = Rule(rounds=2, failures=1.0, early=False)
 def finds(monkeypatch) -> Finds:
     """Registrations that find the truth, in this process; and no pictures, which other tests look at."""
     found = Finds()
-    monkeypatch.setattr(workflows.subject, "register", found)
-    monkeypatch.setattr(workflows.subject, "thumbnail", lambda registration: None)
-    monkeypatch.setattr(workflows.farm_steps, "register", found)
-    monkeypatch.setattr(workflows.evaluate_models, "write_evaluate_page", lambda *a: "<html></html>")
-    monkeypatch.setattr(workflows.stabilize_run, "write_stabilize_page", lambda *a: "<html></html>")
-    monkeypatch.setattr(workflows.coregistration_page, "number_curves", lambda *a: "<svg></svg>")
-    monkeypatch.setattr(model_page, "number_curves", lambda *a: "<svg></svg>")
-    monkeypatch.setattr(model_page, "heat_pictures", lambda *a, **k: [])
+    monkeypatch.setattr(workflows.steps.subject, "register", found)
+    monkeypatch.setattr(workflows.steps.subject, "thumbnail", lambda registration: None)
+    monkeypatch.setattr(workflows.steps.register, "register", found)
+    monkeypatch.setattr(workflows.steps.evaluate, "write_evaluate_page", lambda *a: "<html></html>")
+    monkeypatch.setattr(workflows.steps.stabilize, "write_stabilize_page", lambda *a: "<html></html>")
+    monkeypatch.setattr(workflows.pages.coregistration, "number_curves", lambda *a: "<svg></svg>")
+    monkeypatch.setattr(model, "number_curves", lambda *a: "<svg></svg>")
+    monkeypatch.setattr(model, "heat_pictures", lambda *a, **k: [])
     return found
 
 
@@ -110,7 +111,7 @@ def test_two_rounds_without_those_who_are_held_out(dataset, finds, tmp_path):
 @pytest.mark.parametrize("where", ["registering", "building", "evaluating"])
 def test_a_killed_loop_goes_on_without_computing_anything_twice(dataset, finds, tmp_path, monkeypatch, where):
     out, built = tmp_path / "out", []
-    real, evaluated = steps.build_model, steps.evaluate_models
+    real, evaluated = coregistration.build_model, coregistration.evaluate_models
 
     def build(*arguments):
         built.append(1)
@@ -125,8 +126,8 @@ def test_a_killed_loop_goes_on_without_computing_anything_twice(dataset, finds, 
         return evaluated(*arguments, **options)
 
     stopped: list[int] = []
-    monkeypatch.setattr(steps, "build_model", build)
-    monkeypatch.setattr(steps, "evaluate_models", evaluate)
+    monkeypatch.setattr(coregistration, "build_model", build)
+    monkeypatch.setattr(coregistration, "evaluate_models", evaluate)
     if where == "registering":
         finds.outcomes["p1/smile"] = KeyboardInterrupt()
     with pytest.raises(KeyboardInterrupt):
@@ -216,8 +217,8 @@ def test_expressions_reach_the_builder_in_the_neutrals_own_frame(dataset, finds,
     """Captures turn heads at will; the builder gets the displacement on the unposed neutral, and its confidence."""
     run, data = tmp_path / "run", gnm_npz.read(MODEL)
     for name in ("p0", "p1"):
-        steps.register_subject(subject_dir=str(dataset / name), model=str(MODEL), out=str(run / name))
-    still = steps.stabilize(run=str(run), names=["p0", "p1"], model=str(MODEL), out=str(run / "stabilized"))
+        coregistration.register_subject(subject_dir=str(dataset / name), model=str(MODEL), out=str(run / name))
+    still = coregistration.stabilize(run=str(run), names=["p0", "p1"], model=str(MODEL), out=str(run / "stabilized"))
     subjects = list(Registered(run=run, names=["p0", "p1"], model=data, steady=Path(still["out"])))
     assert [subject.name for subject in subjects] == ["p0", "p1"]
     for seed, subject in enumerate(subjects):
@@ -333,7 +334,7 @@ def test_the_command(dataset, finds, tmp_path, capsys, monkeypatch):
             return Ended(counts={}, reason=str(error))
         return Ended(counts={})
 
-    monkeypatch.setattr(workflows.farm_coregistration, "run_until_done", run)
+    monkeypatch.setattr(workflows.farm.coregistration, "run_until_done", run)
     local = [*arguments, "--local", "--iterations", "1", "--held-out", "0.4"]
     for _ in range(2):
         assert main(local) == 0

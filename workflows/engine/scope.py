@@ -14,10 +14,10 @@ import psycopg
 import sqlalchemy as sa
 from dbos import DBOS
 
-from workflows.engine.control import CHUNK, Queue
-from workflows.engine.reads import CANCELLED, DONE, FAILED, Reader, Row, ended
-from workflows.engine.rows import JobFailed
-from workflows.jobs import FlowJob, Job
+from workflows.engine.client import CHUNK, Queue
+from workflows.engine.jobs import FlowJob, Job
+from workflows.engine.reader import CANCELLED, DONE, FAILED, Reader, Row, ended
+from workflows.engine.serialization import JobFailed
 
 log = logging.getLogger("gnmreg")
 

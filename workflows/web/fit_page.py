@@ -24,7 +24,7 @@ from registration.report.heat_map import scale_limit_mm
 from registration.report.pictures import scale_colours
 from registration.types import Camera, Capture
 from workflows.web import panels
-from workflows.web.heads import still_head
+from workflows.web.glb import still_head
 from workflows.web.server import Served
 
 TO_SCAN, MOVED, PLAIN = "distance to the scan", "moved in this stage", "nothing"

@@ -15,11 +15,11 @@ from registration.report.pictures import scale_colours
 from registration.stabilize import stabilized_folder as disk
 from registration.stabilize.components import Components, Head
 from registration.stabilize.decisions import ACTIONS
-from workflows.stabilize_folder import read_decisions
-from workflows.stabilize_run import LOG, stabilize_run
+from workflows.records.run import read_decisions
+from workflows.steps.stabilize import LOG, stabilize_run
 from workflows.web import panels
-from workflows.web.decide import Review
-from workflows.web.heads import SWING, swinging_head
+from workflows.web.glb import SWING, swinging_head
+from workflows.web.review_state import Review
 from workflows.web.server import Served
 
 _APART = 0.15  # metres, each head from the middle

@@ -19,7 +19,7 @@ from registration.storage.registration_folder import FILES, load_registration
 from registration.types import Parameters, Registration
 from tests.registration.register.conftest import Beside, Run
 from tests.registration.register.synthetic import GAINS, MODEL
-from workflows.cli import main
+from workflows.cli.app import main
 
 VIEWS = 8
 

@@ -2,9 +2,9 @@
 
 from typing import Any
 
+from workflows.engine.jobs import EXPRESSION_PRIORITY, NEUTRAL_PRIORITY, STABILIZE_PRIORITY, FlowJob, Job
 from workflows.engine.scope import Scope
-from workflows.flows import batch
-from workflows.jobs import EXPRESSION_PRIORITY, NEUTRAL_PRIORITY, STABILIZE_PRIORITY, FlowJob, Job
+from workflows.farm.flows import batch
 
 
 async def graph(scope: Scope, *, subjects: int, expressions: int, folder: str, seconds: float) -> dict[str, Any]:

@@ -12,9 +12,9 @@ from pathlib import Path
 from typing import Any
 
 from tests.conftest import ROOT
-from workflows.engine.control import Queue
-from workflows.engine.durable import migrate
-from workflows.engine.reads import Reader
+from workflows.engine.client import Queue
+from workflows.engine.process import migrate
+from workflows.engine.reader import Reader
 
 QUICK = {"look_s": 0.3, "free_s": 1.0, "up_s": 0.0}
 

@@ -6,10 +6,10 @@ from pathlib import Path
 from typing import Any
 
 from registration.errors import InputError
-from workflows.engine.rows import JobFailed
-from workflows.flows import FLOWS
-from workflows.jobs import STEPS, FlowJob, Job, Unusable, check_id, checked, resolved_roots
-from workflows.slot import function_of
+from workflows.engine.child import function_of
+from workflows.engine.jobs import STEPS, FlowJob, Job, Unusable, check_id, checked, resolved_roots
+from workflows.engine.serialization import JobFailed
+from workflows.farm.flows import FLOWS
 
 
 class Inline:

@@ -6,9 +6,9 @@ from pathlib import Path
 
 from tests.workflows.farm.flows import FLOWS
 from tests.workflows.farm.steps import STEPS
-from workflows.engine.durable import Process, serve
+from workflows.engine.jobs import DRIVER, GPU, REBUILD, SUBJECTS
 from workflows.engine.liveness import Patience
-from workflows.jobs import DRIVER, GPU, REBUILD, SUBJECTS
+from workflows.engine.process import Process, serve
 
 if __name__ == "__main__":
     kind, name, url, folder, settings = sys.argv[1:]

@@ -10,8 +10,8 @@ from typing import Any
 
 from registration.errors import InputError
 from registration.progress import Progress
-from workflows.jobs import Step
-from workflows.store import Store
+from workflows.engine.jobs import Step
+from workflows.records.store import Store
 
 
 def work(store: str, key: str, seconds: float = 0.0, trace: str | None = None) -> dict[str, Any]:

@@ -16,8 +16,8 @@ import sqlalchemy as sa
 from bench.support.postgres_server import Server, programs, server
 from tests.workflows.farm.harness import QUICK, Farm, alive, children_of, farm
 from workflows.engine.database import checked_url, engine
-from workflows.jobs import FlowJob, Job
-from workflows.store import Store
+from workflows.engine.jobs import FlowJob, Job
+from workflows.records.store import Store
 
 pytestmark = pytest.mark.durability
 RESULTS = Path(os.environ.get("GNMREG_DURABILITY", "build/durability.txt"))

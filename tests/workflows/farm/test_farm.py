@@ -7,7 +7,7 @@ import pytest
 
 from registration.errors import InputError
 from tests.workflows.farm.harness import Farm, farm
-from workflows.jobs import FlowJob, Job
+from workflows.engine.jobs import FlowJob, Job
 
 
 @pytest.fixture(scope="module")

@@ -9,9 +9,9 @@ from typing import Any
 import pytest
 
 from tests.workflows.farm.inline import Inline
-from workflows.engine.rows import JobFailed
-from workflows.flows import coregister, subject
-from workflows.jobs import Job
+from workflows.engine.jobs import Job
+from workflows.engine.serialization import JobFailed
+from workflows.farm.flows import coregister, subject
 
 Told = dict[str, Any] | Exception
 

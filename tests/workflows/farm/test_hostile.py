@@ -22,9 +22,9 @@ import pytest
 from registration.errors import InputError
 from tests.conftest import FIXTURES
 from tests.registration.capture import small
-from workflows.jobs import MAX_BYTES, STEPS, checked, resolved_roots
-from workflows.slot import Slot
-from workflows.store import MANIFEST, Store
+from workflows.engine.child import Slot
+from workflows.engine.jobs import MAX_BYTES, STEPS, checked, resolved_roots
+from workflows.records.store import MANIFEST, Store
 
 MODEL = FIXTURES / "tiny_gnm.npz"
 
@@ -41,7 +41,7 @@ class Trap:
 
 @pytest.fixture(scope="module")
 def slot() -> Iterator[Slot]:
-    made = Slot(modules=("workflows.farm_steps",))
+    made = Slot(modules=("workflows.steps.register",))
     made.warm()
     yield made
     made.kill()
@@ -193,7 +193,7 @@ def test_a_job_with_a_foreign_place_never_reaches_the_child(root: Path, changed:
 
 
 def test_a_step_that_is_not_in_the_table_never_reaches_the_child(root: Path) -> None:
-    for step in ("os:system", "workflows.farm_steps:register_stored", "__import__", ""):
+    for step in ("os:system", "workflows.steps.register:register_stored", "__import__", ""):
         with pytest.raises(InputError, match="refused"):
             checked({"step": step, "arguments": {}}, STEPS, resolved_roots((root,)))
 

@@ -1,0 +1,299 @@
+import subprocess
+import sys
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+
+import registration.register
+import workflows.steps.subject
+from tests.conftest import FIXTURES
+from tests.registration.capture.small import make
+from workflows.cli.app import main
+from workflows.records.subject import Row, Subject
+
+TINY_MODEL = FIXTURES / "tiny_gnm.npz"
+HEAVY = {"torch", "mitsuba", "drjit", "numpy", "scipy", "cv2", "pycolmap", "kornia", "trimesh", "matplotlib", "viser"}
+
+
+@pytest.mark.parametrize(
+    "command",
+    [
+        *(
+            "",
+            "register",
+            "subject",
+            "evaluate",
+            "stabilize",
+            "stabilize review",
+            "coregister",
+            "dataset",
+            "dataset synth",
+            "capture",
+            "capture check",
+            "capture synth",
+            "capture spoil",
+        ),
+        *("model", "model info", "model evaluate", "model fetch", "model bootstrap"),
+    ],
+)
+def test_every_command_explains_itself(command: str, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as stop:
+        main([*command.split(), "--help"])
+    assert stop.value.code == 0
+    assert f"usage: gnmreg {command}".strip() in capsys.readouterr().out
+
+
+def test_help_imports_nothing_heavy() -> None:
+    code = """
+import sys
+from workflows.cli.app import main
+try:
+    main(["register", "--help"])
+finally:
+    print("MODULES", *sys.modules, file=sys.stderr)
+"""
+    run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert "--deterministic" in run.stdout
+    assert HEAVY.isdisjoint(run.stderr.split("MODULES")[1].split())
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    ["", "register", "register CAPTURE --model M", "subject S --model M", "capture", "register C --views x"],
+)
+def test_wrong_arguments_stop_with_code_2(arguments: str, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as stop:
+        main(arguments.split())
+    assert stop.value.code == 2
+    assert "gnmreg" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("pair", ["68", "68=", "=file.txt"])
+def test_input_error_is_told_without_a_traceback(pair: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = tmp_path / "out"
+    assert main(["register", str(tmp_path), "--model", "m.npz", "--out", str(out), "--landmarks", pair]) == 2
+    error = capsys.readouterr().err
+    assert "SCHEME=FILE" in error and pair in error and "fix:" in error
+    assert "Traceback" not in error
+    assert not out.exists()
+
+
+@pytest.mark.parametrize(
+    "flags, what",
+    [
+        ("--views 0", "number of cameras"),
+        ("--size 480 20000", "image size"),
+        ("--size 0 10", "image size"),
+        ("--views 500 --size 8000 8000", "too many and too large"),
+        ("--seed -1", "seed"),
+        ("--expression grin", "no such expression"),
+        ("--target nose", "NAME=WEIGHT"),
+        ("--target nose/nose-hump-incr=much", "NAME=WEIGHT"),
+        ("--target nose/nose-hump-incr=nan", "weight is out of range"),
+    ],
+)
+def test_bad_studios_are_told_before_any_work(
+    flags: str, what: str, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "empty"))
+    monkeypatch.setenv("PIP_NO_INDEX", "1")  # neither model nor population can be had: they must not be asked for
+    assert main(["capture", "synth", str(tmp_path / "capture"), *flags.split()]) == 2
+    error = capsys.readouterr().err
+    assert what in error and "fix:" in error and "Traceback" not in error
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_synthetic_capture_replaces_nothing(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "mine").write_text("mine")
+    assert main(["capture", "synth", str(tmp_path)]) == 2
+    assert "exists already" in capsys.readouterr().err
+    assert (tmp_path / "mine").read_text() == "mine"
+
+
+def test_a_seed_is_a_number(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as stop:
+        main(["capture", "synth", str(tmp_path / "capture"), "--seed", "abc"])
+    assert stop.value.code == 2
+    assert "--seed" in capsys.readouterr().err
+
+
+def test_model_info_tells_and_draws(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    picture = tmp_path / "model.png"
+    assert main(["model", "info", str(TINY_MODEL), "--out", str(picture)]) == 0
+    assert "vertices" in capsys.readouterr().out
+    assert picture.read_bytes().startswith(b"\x89PNG")
+
+
+@pytest.mark.parametrize(
+    "command",
+    [
+        "capture check {missing} --out {out}",
+        "model info {missing} --out {out}",
+        "evaluate {missing} --capture {missing}",
+    ],
+)
+def test_missing_input_is_told_and_nothing_is_written(
+    command: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    missing, out = tmp_path / "missing", tmp_path / "out.png"
+    arguments = command.format(missing=missing, out=out).split()
+    assert main(arguments) == 2
+    error = capsys.readouterr().err
+    assert str(missing) in error and "fix:" in error
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_missing_capture_of_a_registration(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    missing, out = tmp_path / "missing", tmp_path / "out"
+    assert main(["register", str(missing), "--model", str(TINY_MODEL), "--out", str(out)]) == 2
+    error = capsys.readouterr().err
+    assert "The capture folder is missing" in error and str(missing) in error and "fix:" in error
+    assert "Traceback" not in error
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_unknown_recipe_stops_with_code_2(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as stop:
+        main(["register", "C", "--model", "M", "--out", str(tmp_path / "out"), "--recipe", "drafty"])
+    assert stop.value.code == 2
+    error = capsys.readouterr().err
+    assert "drafty" in error and "draft" in error and "studio" in error
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_capture_check_tells_and_draws(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    capture, sheet = make(tmp_path / "capture"), tmp_path / "sheet.png"
+    assert main(["capture", "check", str(capture), "--out", str(sheet)]) == 0
+    told = capsys.readouterr().out
+    assert "5 views, all checks passed" in told and str(sheet) in told
+    assert sheet.read_bytes().startswith(b"\x89PNG")
+
+
+def test_capture_spoil_breaks_what_it_is_told_to(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    source, target = make(tmp_path / "source"), tmp_path / "target"
+    flags = ["--preset", "none", "--seed", "4", "--break", "cam3=shifted", "cam1=black", "cam3=exposure"]
+    assert main(["capture", "spoil", str(source), str(target), *flags]) == 0
+    assert capsys.readouterr().out == f"{target}\n"
+    assert main(["capture", "check", str(target)]) == 0
+    assert "preset none, seed 4; cam1 black; cam3 exposure shifted" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("pair", ["cam03", "cam03=", "=black"])
+def test_malformed_breaks_are_told(pair: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["capture", "spoil", str(tmp_path / "source"), str(tmp_path / "target"), "--break", pair]) == 2
+    error = capsys.readouterr().err
+    assert "VIEW=HOW" in error and pair in error and "fix:" in error and "Traceback" not in error
+
+
+def test_an_option_given_twice_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    flags = ["--break", "cam3=shifted", "--break=cam1=black"]
+    assert main(["capture", "spoil", str(tmp_path / "source"), str(tmp_path / "target"), *flags]) == 2
+    error = capsys.readouterr().err
+    assert "more than once" in error and "--break" in error and "fix:" in error
+
+
+def test_unknown_presets_stop_with_code_2(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    source = make(tmp_path / "source")
+    with pytest.raises(SystemExit) as stop:
+        main(["capture", "spoil", str(source), str(tmp_path / "target"), "--preset", "studioo"])
+    assert stop.value.code == 2
+    error = capsys.readouterr().err
+    assert "studioo" in error and "harsh" in error
+    assert list(tmp_path.iterdir()) == [source]
+
+
+@pytest.mark.parametrize("status, code", [("converged", 0), ("stopped", 0), ("failed", 1)])
+def test_register_passes_every_argument_on(
+    status: str, code: int, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The library's own work is tested in tests/register; here only what the command hands over and makes of it."""
+    heard = {}
+
+    def listen(capture: Path, **options) -> SimpleNamespace:
+        heard.update(options, capture=capture)
+        return SimpleNamespace(status=status, reason="because")
+
+    monkeypatch.setattr(registration.register, "register", listen)
+    flags = "--recipe studio --views 7 --seed 3 --neutral N --deterministic --force --variant cuda --landmarks 68=a 5=b"
+    assert main(["register", "C", "--model", "M.npz", "--out", "O", *flags.split()]) == code
+    heard.pop("progress").note("told")
+    assert heard == {
+        "capture": Path("C"),
+        "model_path": Path("M.npz"),
+        "out": Path("O"),
+        "recipe": "studio",
+        "views": 7,
+        "seed": 3,
+        "neutral": Path("N"),
+        "deterministic": True,
+        "force": True,
+        "variant": "cuda",
+        "landmark_files": {"68": Path("a"), "5": Path("b")},
+    }
+    told = capsys.readouterr()
+    assert told.out == f"{status}: because\nO\n"
+    assert "told" in told.err
+
+
+@pytest.mark.parametrize(
+    ("statuses", "code"),
+    [
+        (("converged", "stopped"), 0),
+        (("stopped", "failed"), 1),
+        (("converged", "error"), 1),
+        (("failed", "skipped"), 2),
+        (("error", "skipped"), 2),
+    ],
+)
+def test_subject_passes_every_argument_on(
+    statuses: tuple, code: int, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The loop itself is tested in test_subject.py."""
+    heard = {}
+
+    def listen(subject: Path, **options) -> Subject:
+        heard.update(options, subject=subject)
+        rows = tuple(Row(name=f"c{i}", expression="", status=s, reason="because") for i, s in enumerate(statuses))
+        return Subject(subject="anna", model="ab", recipe="draft", neutral="c0", rows=rows)
+
+    monkeypatch.setattr(workflows.steps.subject, "register_subject", listen)
+    flags = "--recipe studio --views 7 --seed 3 --neutral N --deterministic --force --variant cuda --landmarks 68=a 5=b"
+    assert main(["subject", "S", "--model", "M.npz", "--out", "O", *flags.split()]) == code
+    heard.pop("progress").note("told")
+    assert heard == {
+        "subject": Path("S"),
+        "model_path": Path("M.npz"),
+        "out": Path("O"),
+        "recipe": "studio",
+        "views": 7,
+        "seed": 3,
+        "neutral": "N",
+        "deterministic": True,
+        "force": True,
+        "variant": "cuda",
+        "landmark_files": {"68": Path("a"), "5": Path("b")},
+    }
+    told = capsys.readouterr()
+    assert told.out == f"c0: {statuses[0]}: because\nc1: {statuses[1]}: because\nO/index.html\n"
+    assert "told" in told.err
+
+
+def test_missing_subject(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    missing, out = tmp_path / "missing", tmp_path / "out"
+    assert main(["subject", str(missing), "--model", str(TINY_MODEL), "--out", str(out)]) == 2
+    error = capsys.readouterr().err
+    assert "The subject's folder is missing" in error and str(missing) in error and "fix:" in error
+    assert "Traceback" not in error
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_an_interrupt_is_told_without_a_traceback(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def interrupt(*args, **options) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(workflows.steps.subject, "register_subject", interrupt)
+    assert main(["subject", "S", "--model", "M", "--out", "O"]) == 130
+    assert capsys.readouterr().err == "interrupted\n"

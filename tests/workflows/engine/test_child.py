@@ -1,0 +1,125 @@
+import asyncio
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from tests.workflows.farm.harness import ROOT, alive, children_of
+from workflows.engine.child import Slot
+
+STEPS = "tests.workflows.farm.steps"
+
+
+@pytest.fixture(scope="module")
+def slot() -> Iterator[Slot]:
+    made = Slot(modules=(STEPS,))
+    made.warm()
+    yield made
+    made.kill()
+
+
+def run(slot: Slot, name: str, log: Path, hard_s: float = 30.0, **arguments: object) -> dict:
+    return asyncio.run(slot.run(f"{STEPS}:{name}", arguments, log=log, hard_s=hard_s))
+
+
+def test_everything_a_step_prints_lands_in_its_log(slot: Slot, tmp_path: Path) -> None:
+    log = tmp_path / "a" / "job.log"
+    outcome = run(slot, "talk", log, text="from a note")
+    assert (outcome["status"], outcome["result"]) == ("done", "from a note")
+    assert set(log.read_text().split("\n")) >= {"from a note", "from Python", "from C"}
+    assert '"done": 1' in log.with_suffix(".jsonl").read_text()
+
+
+def test_one_warm_process_serves_all_steps(slot: Slot, tmp_path: Path) -> None:
+    before = slot.warm()
+    run(slot, "talk", tmp_path / "log", text="")
+    run(slot, "fail", tmp_path / "log")
+    assert slot.warm() == before
+
+
+@pytest.mark.parametrize(
+    "name, arguments, status, reason",
+    [
+        ("refuse", {}, "bad input", "It is bad: here; expected good, got bad; mend it"),
+        ("fail", {}, "failed", "ValueError: as asked, at postgresql://me:***@host/db"),
+        ("leave", {}, "failed", "SystemExit: 0"),
+        ("return_an_object", {}, "failed", "the step's result is not JSON"),
+        ("return_much", {}, "failed", "more than 524288"),
+        ("talk", {"word": 1}, "bad input", "the step cannot be called so"),
+        ("nothing", {}, "bad input", "the step cannot be called so"),
+        ("crash", {}, "died", "was killed by SIGSEGV"),
+    ],
+)
+def test_what_goes_wrong_is_told_apart(
+    slot: Slot, tmp_path: Path, name: str, arguments: dict, status: str, reason: str
+) -> None:
+    outcome = run(slot, name, tmp_path / "log", **arguments)
+    assert outcome["status"] == status
+    assert reason in outcome["reason"]
+    assert "secret" not in (tmp_path / "log").read_text() + outcome["reason"]
+
+
+def test_a_step_that_takes_too_long_is_killed_though_it_holds_the_interpreter(slot: Slot, tmp_path: Path) -> None:
+    trace = tmp_path / "trace"
+    pid = slot.warm()
+    begun = time.monotonic()
+    outcome = run(slot, "hold_gil", tmp_path / "log", hard_s=0.5, seconds=60, trace=str(trace))
+    assert outcome["status"] == "timed out" and time.monotonic() - begun < 30
+    assert not alive(pid)
+    assert trace.read_text() == "begin gil 0\n"
+    assert "timed out" in (tmp_path / "log").read_text()
+
+
+def test_cancelling_kills_the_child(slot: Slot, tmp_path: Path) -> None:
+    pid = slot.warm()
+
+    async def cancelled() -> None:
+        arguments = {"store": str(tmp_path), "key": "k", "seconds": 60.0}
+        task = asyncio.create_task(slot.run(f"{STEPS}:work", arguments, log=tmp_path / "log", hard_s=90))
+        while not list(tmp_path.glob("k/attempt-*")):
+            await asyncio.sleep(0.05)
+        task.cancel()
+        await asyncio.wait({task})
+
+    asyncio.run(cancelled())
+    deadline = time.monotonic() + 20
+    while alive(pid) and time.monotonic() < deadline:
+        time.sleep(0.05)
+    assert not alive(pid)
+
+
+def test_a_child_that_dies_between_jobs_is_replaced(slot: Slot, tmp_path: Path) -> None:
+    pid = slot.warm()
+    os.kill(pid, signal.SIGKILL)
+    time.sleep(0.5)
+    assert run(slot, "talk", tmp_path / "log", text="again")["status"] == "done"
+    assert slot.warm() != pid
+
+
+def test_a_child_dies_with_its_parent(tmp_path: Path) -> None:
+    code = """
+import time
+from workflows.engine.child import Slot
+if __name__ == "__main__":
+    slot = Slot()
+    print(slot.warm(), flush=True)
+    time.sleep(60)
+"""
+    script = tmp_path / "parent.py"
+    script.write_text(code)
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    parent = subprocess.Popen([sys.executable, str(script)], stdout=subprocess.PIPE, env=environment, text=True)
+    assert parent.stdout is not None
+    child = int(parent.stdout.readline())
+    assert child in children_of(parent.pid) and alive(child)
+    parent.kill()
+    parent.wait()
+    deadline = time.monotonic() + 10
+    while alive(child) and time.monotonic() < deadline:
+        time.sleep(0.02)
+    assert not alive(child)

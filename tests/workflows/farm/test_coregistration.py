@@ -1,0 +1,44 @@
+"""A coregistration in the queue: put in once, and forgotten when it is put in anew."""
+
+from pathlib import Path
+
+import pytest
+
+from registration.errors import InputError
+from registration.progress import Silent
+from tests.workflows.rounds import MODEL, write_people
+from workflows.engine.client import Queue
+from workflows.engine.database import default_url
+from workflows.engine.jobs import Job
+from workflows.engine.process import migrate
+from workflows.engine.reader import Reader
+from workflows.farm.coregistration import PLAN, put_coregistration
+from workflows.farm.local import LocalFarm, run_until_done
+from workflows.records.coregistration import planned
+
+
+def test_a_run_that_goes_on_stays_and_one_that_ended_is_forgotten(capture: Path, tmp_path: Path) -> None:
+    dataset = write_people(capture, tmp_path / "dataset", 5)
+    url, out = default_url(tmp_path), tmp_path / "june"
+    plan = planned(dataset, model_path=MODEL, out=out, components=(2,))
+    with pytest.raises(InputError, match="There is no queue"):
+        put_coregistration(url, plan)
+    assert not out.exists()
+    migrate(url)
+    assert put_coregistration(url, plan) == "june"
+    queue, reader = Queue(url), Reader(url)
+    row = reader.rows(["june"])["june"]
+    assert row.state == "waiting"
+    assert row.spec == {"flow": "coregister", "arguments": {"plan": str(out / PLAN), "variant": "llvm"}}
+    queue.put([Job(id="june/it00/s00000/neutral", step="register")])
+    with pytest.raises(InputError, match="have not ended"):
+        put_coregistration(url, plan)
+    queue.cancel("june")
+    put_coregistration(url, plan)
+    assert reader.rows(["june"])["june"].state == "waiting" and not reader.counts("june", kind="job")
+
+
+def test_without_a_worker_nothing_starts(tmp_path: Path) -> None:
+    farm = LocalFarm(url=default_url(tmp_path), folder=tmp_path, roots=(), workers=0)
+    with pytest.raises(InputError, match="no worker"):
+        run_until_done(farm, "june", Silent())

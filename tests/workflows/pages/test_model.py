@@ -1,0 +1,37 @@
+"""The page of a built model, with real pictures."""
+
+import numpy as np
+
+from coregister.next_model.build import build
+from coregister.next_model.training_data import Mesh, Subject
+from registration.model import gnm_npz
+from tests.workflows.rounds import MODEL, head
+from workflows.pages import model
+
+
+def test_components_tables_and_what_was_left_out(monkeypatch):
+    data = gnm_npz.read(MODEL)
+
+    def mesh(name: str, vertices: np.ndarray) -> Mesh:
+        sure = np.ones(len(vertices), np.float32)
+        shape = vertices.astype(np.float32)
+        return Mesh(name=name, label=name, vertices=shape, confidence=sure, triangles=data.triangles)
+
+    subjects = []
+    for seed in range(7):
+        neutral = head(data, seed)
+        neutral = neutral + (np.random.default_rng(0).normal(0, 8e-3, neutral.shape) if seed == 3 else 0)
+        smile = mesh("smile", neutral + data.expression_basis[3])
+        tags = {"age": 20 + 10 * seed, "gender": "female"}
+        subjects.append(Subject(name=f"p<{seed}>", neutral=mesh("neutral", neutral), expressions=(smile,), tags=tags))
+    built = build(subjects, data)
+    for name, value in {"IDENTITY": 2, "EXPRESSION": 1, "SIZE": (48, 52)}.items():
+        monkeypatch.setattr(model, name, value)
+    page = model.write_model_page(built.data, built.manifest)
+    drawn = page.count('class="zoom"')
+    assert drawn == 2 * 2 * (2 + len(built.manifest["expression"]))  # sides, ends, components
+    for text in ("head_000, +2", "lower_face_region_000, −2", "p&lt;3&gt;", "20-29", "smile", "<svg"):
+        assert text in page
+    assert "<3>" not in page and 'src="http' not in page and 'href="http' not in page
+    one, two = page.split('class="zoom"')[1:3]
+    assert one != two

@@ -1,0 +1,184 @@
+import json
+import os
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from registration.errors import InputError
+from workflows.records.store import MANIFEST, Store
+
+
+@pytest.fixture(scope="module")
+def bucket() -> Iterator[str]:
+    """An S3 server over HTTP, with one bucket."""
+    import boto3
+    from moto.server import ThreadedMotoServer
+
+    settings = {
+        "AWS_ACCESS_KEY_ID": "test",
+        "AWS_SECRET_ACCESS_KEY": "test",
+        "AWS_DEFAULT_REGION": "us-east-1",
+        "AWS_ENDPOINT_URL": "",
+    }
+    former = {name: os.environ.get(name) for name in settings}
+    server = ThreadedMotoServer(ip_address="127.0.0.1", port=0, verbose=False)
+    server.start()
+    host, port = server.get_host_and_port()
+    os.environ.update(settings | {"AWS_ENDPOINT_URL": f"http://{host}:{port}"})
+    boto3.client("s3").create_bucket(Bucket="results")
+    yield "s3://results"
+    server.stop()
+    for name, value in former.items():
+        os.environ.pop(name) if value is None else os.environ.update({name: value})
+
+
+@pytest.fixture(params=["folder", "s3"])
+def store(request: pytest.FixtureRequest, tmp_path: Path) -> Store:
+    if request.param == "folder":
+        return Store(tmp_path / "store")
+    return Store(f"{request.getfixturevalue('bucket')}/{tmp_path.name}")
+
+
+def write(folder: Path) -> dict[str, object]:
+    (folder / "sub").mkdir()
+    (folder / "mesh.ply").write_bytes(b"mesh")
+    (folder / "sub" / "page.html").write_bytes(b"page")
+    return {"mm": 0.5}
+
+
+def never(folder: Path) -> dict[str, object]:
+    raise AssertionError("made again")
+
+
+def spoil(store: Store, name: str, content: bytes | None) -> None:
+    """Overwrite or delete a file behind the store's back."""
+    path = store._path(name)
+    if content is None:
+        store._fs.rm_file(path)
+        return
+    store._fs.makedirs(path.rpartition("/")[0], exist_ok=True)
+    store._fs.pipe_file(path, content)
+
+
+def test_what_is_made_is_found_and_fetched(store: Store, tmp_path: Path) -> None:
+    assert store.find("run/a") is None
+    made = store.produce("run/a", wanted="hash", make=write)
+    assert store.find("run/a") == made
+    assert made.about == {"mm": 0.5} and set(made.files) == {"mesh.ply", "sub/page.html"}
+    assert store.fetch("run/a", tmp_path / "got") == made
+    assert (tmp_path / "got" / "sub" / "page.html").read_bytes() == b"page"
+    assert store.open("run/a", "mesh.ply").read() == b"mesh"
+    assert list(store.keys()) == ["run/a"]
+
+
+def test_the_same_input_returns_at_once_and_another_is_made(store: Store) -> None:
+    first = store.produce("a", wanted="one", make=write)
+    assert store.produce("a", wanted="one", make=never) == first
+    second = store.produce("a", wanted="two", make=write)
+    assert second.input_hash == "two" and second.attempt != first.attempt
+    assert second.content_id == first.content_id
+    assert len(store.verify().orphaned) == 2
+
+
+def test_a_file_that_vanished_makes_it_again(store: Store) -> None:
+    first = store.produce("a", wanted="one", make=write)
+    spoil(store, f"a/{first.attempt}/mesh.ply", None)
+    assert store.produce("a", wanted="one", make=write).attempt != first.attempt
+
+
+def test_a_maker_that_fails_publishes_nothing(store: Store) -> None:
+    def half(folder: Path) -> dict[str, object]:
+        (folder / "half").write_text("x")
+        raise ValueError("broken")
+
+    with pytest.raises(ValueError, match="broken"):
+        store.produce("a", wanted="one", make=half)
+    assert store.find("a") is None
+    assert store.verify().artifacts == 0 and not store.verify().orphaned
+
+
+def test_two_attempts_at_a_time_disturb_nobody(store: Store) -> None:
+    """A thawed zombie publishes after its successor: one whole artifact is left, whichever."""
+
+    def meanwhile(folder: Path) -> dict[str, object]:
+        store.produce("a", wanted="one", make=write)
+        return write(folder)
+
+    last = store.produce("a", wanted="one", make=meanwhile)
+    assert store.find("a") == last
+    found = store.verify()
+    assert found.sound and found.artifacts == 1 and len(found.orphaned) == 2
+
+
+def test_verify_names_what_is_missing_altered_and_orphaned(store: Store) -> None:
+    a = store.produce("run/a", wanted="one", make=write)
+    b = store.produce("run/b", wanted="one", make=write)
+    assert store.verify().sound and store.verify().artifacts == 2
+    spoil(store, f"run/a/{a.attempt}/mesh.ply", b"mush")
+    spoil(store, f"run/b/{b.attempt}/sub/page.html", None)
+    spoil(store, "run/c/attempt-1/left", b"over")
+    spoil(store, f"run/d/{MANIFEST}", b"{}")
+    found = store.verify()
+    assert found.altered == (f"run/a/{a.attempt}/mesh.ply",)
+    assert found.missing == (f"run/b/{b.attempt}/sub/page.html",)
+    assert found.orphaned == ("run/c/attempt-1/left",)
+    assert list(found.unreadable) == [f"run/d/{MANIFEST}"]
+    assert not found.sound
+
+
+def test_an_altered_file_is_not_fetched(store: Store, tmp_path: Path) -> None:
+    a = store.produce("a", wanted="one", make=write)
+    spoil(store, f"a/{a.attempt}/mesh.ply", b"mush")
+    with pytest.raises(InputError, match="artifact cannot be used"):
+        store.fetch("a", tmp_path)
+
+
+@pytest.mark.parametrize("name", ["../../outside", "/etc/passwd", "sub/../../x"])
+def test_a_manifest_that_points_outside_is_refused(store: Store, tmp_path: Path, name: str) -> None:
+    store.produce("a", wanted="one", make=write)
+    value = json.loads(store._fs.cat_file(store._path("a", MANIFEST)))
+    value["files"] = {name: {"sha256": "0", "bytes": 1}}
+    spoil(store, f"a/{MANIFEST}", json.dumps(value).encode())
+    with pytest.raises(InputError) as refused:
+        store.fetch("a", tmp_path / "got")
+    assert "inside the attempt" in refused.value.expected
+
+
+@pytest.mark.parametrize(
+    "content", [b"", b"[]", b"{}", b"[" * 99_999, b'{"kind": "gnm-artifact", "schema": 1}', b"\xff"]
+)
+def test_a_manifest_that_is_none_is_refused(store: Store, content: bytes) -> None:
+    spoil(store, f"a/{MANIFEST}", content)
+    with pytest.raises(InputError):
+        store.find("a")
+
+
+def test_old_iterations_are_retired(store: Store) -> None:
+    for key in ("run/it00/a", "run/it01/a", "run/it01/s/b", "run/it02/a", "run/final", "other/it00/a"):
+        store.produce(key, wanted="one", make=write)
+    assert store.retire("run", keep=2) == ["run/it00"]
+    assert list(store.keys()) == ["other/it00/a", "run/final", "run/it01/a", "run/it01/s/b", "run/it02/a"]
+    assert not store.verify().orphaned
+    assert store.retire("run", keep=2) == []
+
+
+def test_tidying_removes_what_nobody_published_and_spares_the_young(store: Store) -> None:
+    store.produce("a", wanted="one", make=write)
+    store.produce("a", wanted="two", make=write)
+    assert store.tidy(older_than_s=3600) == 0
+    time.sleep(1.1)  # object storage tells whole seconds
+    assert store.tidy(older_than_s=0.01) == 2
+    assert store.verify().sound and not store.verify().orphaned
+    assert store.find("a") is not None
+
+
+def test_no_password_reaches_a_manifest(store: Store) -> None:
+    store.produce("a", wanted="one", make=lambda folder: {"from": "postgresql://me:secret@host/db"})
+    assert b"secret" not in store._fs.cat_file(store._path("a", MANIFEST))
+
+
+def test_a_foreign_scheme_is_refused() -> None:
+    with pytest.raises(InputError):
+        Store("nonsense://x")

@@ -1,0 +1,90 @@
+"""Folders and settings of a subject that cannot be used."""
+
+import shutil
+from pathlib import Path
+
+import pytest
+
+from registration.errors import InputError
+from tests.workflows.conftest import MODEL, FakeRegister, change
+from workflows.steps.subject import register_subject
+
+
+def files(folder: Path) -> list[Path]:
+    return sorted(folder.rglob("*"))
+
+
+def nothing(subject: Path) -> dict:
+    return {}
+
+
+def other(capture: str, old: str, new: str):
+    def do(subject: Path) -> dict:
+        change(subject / capture, old, new)
+        return {}
+
+    return do
+
+
+def filled(name: str):
+    def do(subject: Path) -> dict:
+        place = subject.parent / "out" / name
+        place.mkdir(parents=True)
+        (place / "mine.txt").write_text("mine")
+        if name != ".":
+            (place.parent / "subject.json").write_text('{"kind": "gnm-subject", "subject": "ball"}')
+        return {}
+
+    return do
+
+
+def without(*names: str):
+    def do(subject: Path) -> dict:
+        for name in names:
+            shutil.rmtree(subject / name)
+        return {}
+
+    return do
+
+
+def unreadable(name: str, **options):
+    def do(subject: Path) -> dict:
+        shutil.rmtree(subject / name / "sparse")
+        return options
+
+    return do
+
+
+@pytest.mark.parametrize(
+    ("prepare", "options", "what", "got"),
+    [
+        (lambda subject: {"subject_dir": subject / "nowhere"}, {}, "folder is missing", "no such folder"),
+        (lambda subject: {"subject_dir": subject / "notes.txt"}, {}, "folder is missing", "a file"),
+        (lambda subject: {"subject_dir": subject / "notes"}, {}, "no captures", "none"),
+        (lambda subject: {"subject_dir": subject / "rest"}, {}, "no captures", "a capture"),
+        (without("rest"), {}, "no neutral", "jaw2: jaw, jaw10: jaw, smile: smile"),
+        (unreadable("rest"), {}, "no neutral", "rest: cannot be read"),
+        (unreadable("rest", neutral="rest"), {}, "COLMAP model is missing", "no such folder"),
+        (other("smile", '"smile"', '"neutral"'), {}, "two neutrals", "rest, smile"),
+        (nothing, {"neutral": "notes"}, "no such capture", "notes"),
+        (other("smile", '"ball"', '"cube"'), {}, "several subjects", "smile: cube"),
+        (filled("."), {}, "output folder", "other things"),
+        (filled("smile"), {}, "output folder", "mine.txt"),
+        (lambda subject: {"out": subject}, {}, "output folder", "other things"),
+        (lambda subject: {"out": subject / "smile" / "out"}, {}, "output folder", "inside the capture smile"),
+        (lambda subject: {"out": subject / "smile"}, {}, "output folder", "inside the capture smile"),
+        (lambda subject: {"out": subject / "notes.txt"}, {}, "output folder", "a file"),
+        (lambda subject: (subject / "smile").rename(subject / "index.html") and {}, {}, "output", "named index.html"),
+        (nothing, {"recipe": "drafty"}, "no such recipe", "drafty"),
+        (nothing, {"landmark_files": {"68": Path("nowhere.txt")}}, "cannot be read", "nowhere.txt"),
+        (nothing, {"model_path": Path("nowhere.npz")}, "", "nowhere.npz"),
+    ],
+)
+def test_bad_input_is_told_before_any_work(prepare, options, what, got, subject: Path, fake: FakeRegister):
+    options = {**options, **(prepare(subject) or {})}
+    before = files(subject.parent)
+    folder = options.pop("subject_dir", subject)
+    with pytest.raises(InputError) as refused:
+        register_subject(folder, **{"model_path": MODEL, "out": subject.parent / "out", **options})
+    assert what in refused.value.what and got in str(refused.value)
+    assert fake.calls == [] and files(subject.parent) == before

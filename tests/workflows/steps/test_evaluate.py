@@ -1,0 +1,232 @@
+"""`gnmreg model evaluate`: what it reads, the folder and page it writes, what it refuses before any work."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import workflows.steps.evaluate
+from coregister.evaluate.evaluation import Settings
+from registration.errors import InputError
+from registration.model import gnm_npz
+from registration.stabilize import stabilized_folder as stabilized
+from registration.stabilize.pipeline import StabilizedSubject
+from tests.coregister.spectrum import heads, spectrum_model, with_identity
+from tests.registration.capture import small
+from tests.registration.stabilize.runs import write_subject
+from workflows.cli.app import main
+from workflows.records.held_out import read_held_out
+from workflows.steps.evaluate import evaluate_models
+
+SETTINGS = Settings(components=(2, 4), samples=3, draws=200)
+NAMES = ("anna", "ben", "cleo")
+LABELS = ("neutral", "jaw_open", "smile")
+
+
+def meshes(model) -> dict[str, np.ndarray]:
+    """Three meshes of each of three people; subjects are mixed and neutrals do not come first."""
+    rng = np.random.default_rng(0)
+    neutrals = heads(model, rng.standard_normal((3, 12)))
+    acts = np.tensordot(rng.standard_normal((2, 12)), model.expression_basis, 1)
+    rows = [(s, label) for label in LABELS[::-1] for s in range(3)]
+    moves = {"neutral": 0, "jaw_open": acts[0], "smile": acts[1]}
+    return {
+        "vertices": np.stack([neutrals[s] + moves[label] for s, label in rows]).astype(np.float32),
+        "triangles": model.triangles,
+        "subjects": np.array([NAMES[s] for s, _ in rows]),
+        "labels": np.array([label for _, label in rows]),
+        "categories": np.array([{"jaw_open": "jaw", "smile": "flexing"}.get(label, label) for _, label in rows]),
+        "tag_age": np.array([(30, 41, 42)[s] for s, _ in rows]),
+        "tag_gender": np.array([("female", "male", "female")[s] for s, _ in rows]),
+    }
+
+
+@pytest.fixture(scope="module")
+def model():
+    return spectrum_model()
+
+
+@pytest.fixture(scope="module")
+def place(model, tmp_path_factory) -> Path:
+    """Two models and an NPZ file of people of the first one."""
+    folder = tmp_path_factory.mktemp("evaluate")
+    gnm_npz.write(model, folder / "own.npz")
+    gnm_npz.write(with_identity(model, np.roll(model.vertex_identity_basis, -1, 0)), folder / "weak.npz")
+    np.savez(folder / "people.npz", **meshes(model))
+    return folder
+
+
+@pytest.fixture(scope="module")
+def out(place) -> Path:
+    paths = [place / "weak.npz", place / "own.npz"]
+    evaluate_models(paths, held_out=place / "people.npz", out=place / "out", settings=SETTINGS)
+    return place / "out"
+
+
+def test_a_file_of_meshes_is_read_by_subject(place, model):
+    arrays = meshes(model)
+    found = read_held_out(place / "people.npz")
+    assert [one.subject for one in found.subjects] == list(NAMES)
+    for number, one in enumerate(found.subjects):
+        np.testing.assert_array_equal(one.neutral, arrays["vertices"][6 + number])
+        np.testing.assert_array_equal(one.expressions, arrays["vertices"][[number, 3 + number]])
+        assert one.categories == ("flexing", "jaw")
+        assert one.tags == {"age": (30, 41, 42)[number], "gender": ("female", "male", "female")[number]}
+    assert gnm_npz.topology_hash(found.triangles) == gnm_npz.topology_hash(model.triangles)
+
+
+def spoil(arrays, **changes):
+    arrays = {name: value for name, value in {**arrays, **changes}.items() if value is not None}
+    return arrays
+
+
+BAD_FILES = {
+    "no labels": (lambda a: spoil(a, labels=None), "incomplete"),
+    "a tag too short": (lambda a: spoil(a, tag_age=a["tag_age"][:-1]), "incomplete"),
+    "flat vertices": (lambda a: spoil(a, vertices=a["vertices"].reshape(9, -1)), "no meshes"),
+    "whole vertices": (lambda a: spoil(a, vertices=a["vertices"].astype(int)), "no meshes"),
+    "quads": (lambda a: spoil(a, triangles=np.zeros((5, 4), int)), "no meshes"),
+    "two neutrals": (lambda a: spoil(a, labels=np.where(a["labels"] == "smile", "neutral", a["labels"])), "not one"),
+    "no neutral": (lambda a: spoil(a, labels=np.where(a["labels"] == "neutral", "rest", a["labels"])), "not one"),
+    "objects": (lambda a: spoil(a, labels=a["labels"].astype(object)), "cannot be read"),
+}
+
+
+@pytest.mark.parametrize("name", BAD_FILES)
+def test_files_that_cannot_be_used_are_refused(model, tmp_path, name):
+    change, what = BAD_FILES[name]
+    np.savez(tmp_path / "bad.npz", **change(meshes(model)))
+    with pytest.raises(InputError) as error:
+        read_held_out(tmp_path / "bad.npz")
+    assert what in error.value.what and str(tmp_path) in error.value.where
+
+
+def test_what_is_no_file_is_refused(tmp_path):
+    (tmp_path / "text.npz").write_text("none")
+    for path in (tmp_path / "text.npz", tmp_path / "missing.npz", tmp_path):
+        with pytest.raises(InputError):
+            read_held_out(path)
+
+
+def test_the_folder_holds_figures_distances_and_a_page_of_its_own(out, model):
+    manifest = json.loads((out / "manifest.json").read_text())
+    assert manifest["kind"] == "gnm-evaluation" and manifest["figures"]["subjects"] == list(NAMES)
+    own = manifest["figures"]["models"]["own"]
+    assert own["identity"]["components"] == [2, 4, 12] and own["identity"]["intervals"][-1]["mean"] < 1e-3
+    assert {row["kind"] for row in own["rows"]} == {"region", "category", "age", "gender"}
+    assert [gain["components"] for gain in manifest["figures"]["gains"]] == [2, 4]
+    with np.load(out / "vertices.npz") as archive:
+        assert archive["models"].tolist() == ["weak", "own"]
+        assert archive["distance_mm"].shape == (2, len(model.template_vertex_positions))
+    page = (out / "index.html").read_text()
+    assert 'src="http' not in page and 'href="http' not in page
+    assert page.count("<svg") == 2 and page.count("<img") == 7  # three sides of two models; the dialog's
+    for text in ("own", "weak", "lower face", "40 to 49", "one subject", "flexing"):
+        assert text in page
+    assert sorted(path.name for path in out.iterdir()) == ["index.html", "manifest.json", "vertices.npz"]
+    assert not list(out.parent.glob(".*.tmp"))
+
+
+def test_the_same_again_is_left_alone_and_another_seed_is_not(place, out, monkeypatch):
+    calls = []
+    real = workflows.steps.evaluate.evaluate
+    monkeypatch.setattr(workflows.steps.evaluate, "evaluate", lambda *a: calls.append(1) or real(*a))
+    paths = [place / "weak.npz", place / "own.npz"]
+    told = json.loads((out / "manifest.json").read_text())
+    again = evaluate_models(paths, held_out=place / "people.npz", out=out, settings=SETTINGS)
+    assert again == told and not calls
+    other = Settings(components=(2, 4), samples=3, draws=200, seed=1)
+    changed = evaluate_models(paths, held_out=place / "people.npz", out=out, settings=other)
+    assert len(calls) == 1 and changed["input_hash"] != told["input_hash"]
+    back = evaluate_models(paths, held_out=place / "people.npz", out=out, settings=SETTINGS)
+    assert back == told
+
+
+def test_the_command_tells_the_figures(place, tmp_path, capsys):
+    arguments = ["model", "evaluate", str(place / "weak.npz"), str(place / "own.npz"), "--held-out"]
+    options = ["--components", "2", "4", "--samples", "2"]
+    assert main([*arguments, str(place / "people.npz"), "--out", str(tmp_path / "out"), *options]) == 0
+    told = capsys.readouterr().out
+    assert "own, 12 components: generalization 0.000 mm" in told
+    assert "own, 4 components: gain" in told and str(tmp_path / "out" / "index.html") in told
+
+
+@pytest.mark.parametrize("options", [["--components", "2", "13"], ["--components", "4", "2"], ["--samples", "-1"]])
+def test_bad_settings_end_before_anything_is_written(place, tmp_path, capsys, options):
+    arguments = ["model", "evaluate", str(place / "own.npz"), "--held-out", str(place / "people.npz")]
+    assert main([*arguments, "--out", str(tmp_path / "out"), *options]) == 2
+    assert "fix:" in capsys.readouterr().err and not (tmp_path / "out").exists()
+
+
+def test_folders_of_others_and_models_that_come_twice_are_refused(place, tmp_path):
+    (tmp_path / "notes.txt").write_text("mine")
+    for paths, out in (([place / "own.npz"], tmp_path), ([place / "own.npz"] * 2, tmp_path / "out")):
+        with pytest.raises(InputError):
+            evaluate_models(paths, held_out=place / "people.npz", out=out, settings=SETTINGS)
+    assert (tmp_path / "notes.txt").read_text() == "mine"
+
+
+@pytest.fixture
+def run(model, tmp_path) -> Path:
+    """Registrations of two people; one has an expression."""
+    neutrals = meshes(model)["vertices"][6:8]
+    seen = np.ones(len(neutrals[0]))
+    anna = {"rest": ("neutral", neutrals[0], seen), "jaw": ("jaw_open", neutrals[0] + 1e-3, seen)}
+    write_subject(tmp_path / "run" / "subject_10", "ben", model, {"rest": ("neutral", neutrals[1], seen)})
+    write_subject(tmp_path / "run" / "subject_2", "anna", model, anna)
+    return tmp_path / "run"
+
+
+def test_a_run_gives_its_neutrals_and_what_was_stabilized(model, run):
+    neutrals = meshes(model)["vertices"][6:8]
+    found = read_held_out(run)
+    assert [one.subject for one in found.subjects] == ["anna", "ben"]  # by folder, numbers as numbers
+    for one, neutral in zip(found.subjects, neutrals, strict=True):
+        np.testing.assert_allclose(one.neutral, neutral, atol=1e-7)
+        assert len(one.expressions) == 0
+    place = run / "stabilized"
+    (place / "subjects").mkdir(parents=True)
+    steady = StabilizedSubject(
+        subject="anna",
+        names=("jaw",),
+        labels=("jaw_open",),
+        neutral=neutrals[0],
+        T_neutral_expression=np.eye(4)[None],
+        vertices=neutrals[:1] + np.float32(2e-3),
+        confidence_map=np.ones(len(neutrals[0]), np.float32),
+        residual_mm=np.zeros((1, 5), np.float32),
+        T_head_world=np.eye(4),
+    )
+    stabilized.write_subject(steady, place, 0)
+    stabilized.write_manifest({"subjects": ["anna"]}, place)
+    anna, ben = read_held_out(run).subjects
+    np.testing.assert_array_equal(anna.expressions, steady.vertices)
+    assert anna.categories == ("jaw_open",) and len(ben.expressions) == 0
+
+
+def test_captures_add_tags_and_the_scans_face(run, tmp_path):
+    for folder in ("subject_2", "subject_10"):
+        small.make(tmp_path / "captures" / folder / "rest")
+    found = read_held_out(run, tmp_path / "captures")
+    for one in found.subjects:
+        assert one.tags["age"] == 30
+        assert one.scan is not None and 10 < len(one.scan)
+    assert {"capture anna", "capture ben"} <= set(found.inputs)
+    assert found.inputs["held_out"] != read_held_out(run).inputs["held_out"]
+    (tmp_path / "captures" / "subject_2" / "rest" / "capture.toml").unlink()
+    with pytest.raises(InputError):
+        read_held_out(run, tmp_path / "captures")
+
+
+def test_runs_that_cannot_be_used_are_refused(run):
+    record = run / "subject_2" / "subject.json"
+    entries = json.loads(record.read_text())
+    entries["captures"][0]["status"] = "failed"
+    record.write_text(json.dumps(entries))
+    with pytest.raises(InputError) as error:
+        read_held_out(run)
+    assert "no neutral" in error.value.what
+    record.write_text("{}")
+    with pytest.raises(InputError):
+        read_held_out(run)

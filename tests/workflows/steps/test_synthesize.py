@@ -1,0 +1,162 @@
+"""`gnmreg dataset synth`: one seed is one population, whether interrupted or not. Pictures are stand-ins."""
+
+import json
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import workflows.steps.synthesize
+from coregister.synthetic import subject as subjects
+from coregister.synthetic.capture import Studio
+from registration.errors import InputError
+from registration.storage.hashing import hash_file
+from workflows.cli.app import main
+from workflows.processes import side_by_side
+from workflows.records.dataset import read_dataset, split
+from workflows.steps.synthesize import Population, photograph, synth_dataset
+
+ACTS = ("smile", "jaw_open")
+
+
+class Photographs:
+    """Stands in for `subjects.capture`: a folder with what it was asked for and a truth drawn by the seed."""
+
+    def __init__(self) -> None:
+        self.made: list[str] = []
+        self.trouble: BaseException | None = None  # at the fifth capture
+
+    def __call__(self, root: Path, *, seed: int, expression: str, tags: dict, studio: Studio) -> Path:
+        if self.trouble is not None and len(self.made) == 4:
+            raise self.trouble
+        assert studio.seed == seed
+        root.mkdir(parents=True)
+        lines = [f'subject = "{root.parent.name}"', f'expression = "{expression}"', 'units = "m"']
+        lines += [f"{name} = {json.dumps(value)}" for name, value in tags.items()]
+        (root / "capture.toml").write_text("\n".join(lines) + "\n")
+        np.save(root / "truth.npy", np.random.default_rng([seed, *expression.encode()]).normal(size=5))
+        self.made.append(f"{root.parent.name}/{expression}")
+        return root
+
+
+@pytest.fixture
+def photographs(monkeypatch) -> Photographs:
+    found = Photographs()
+    monkeypatch.setattr(subjects, "capture", found)
+
+    def here(function, calls, jobs) -> Iterator[tuple[str, str]]:
+        yield from ((name, function(**call)) for name, call in calls.items())
+
+    monkeypatch.setattr(workflows.steps.synthesize, "side_by_side", here)
+    return found
+
+
+def contents(out: Path) -> dict[str, str]:
+    return {str(path.relative_to(out)): hash_file(path) for path in sorted(out.rglob("*")) if path.is_file()}
+
+
+def test_one_seed_is_one_population_resumed_or_not(photographs, tmp_path):
+    population = Population(subjects=3, expressions=ACTS, seed=2, held_out=1)
+    photographs.trouble = KeyboardInterrupt()
+    with pytest.raises(KeyboardInterrupt):
+        synth_dataset(tmp_path / "a", population)
+    assert json.loads((tmp_path / "a/dataset.json").read_text())["complete"] is False
+    before = contents(tmp_path / "a")
+    photographs.trouble = None
+    told = synth_dataset(tmp_path / "a", population)
+    assert len(photographs.made) == 9 == len(set(photographs.made))
+    after = contents(tmp_path / "a")
+    assert len(before) == 9 and all(after[name] == before[name] for name in before if name != "dataset.json")
+    assert told["seeds"] == {"synth_2000": 2000, "synth_2001": 2001, "synth_2002": 2002}
+    assert told["held_out"] == ["synth_2002"] and told["complete"] is True and told["versions"]["numpy"]
+    assert told["categories"] == {"smile": "flexing", "jaw_open": "jaw"}
+    synth_dataset(tmp_path / "b", population)
+    assert contents(tmp_path / "a") == contents(tmp_path / "b")
+    written = (tmp_path / "a/dataset.json").stat().st_mtime_ns
+    synth_dataset(tmp_path / "a", population)
+    assert len(photographs.made) == 18 and (tmp_path / "a/dataset.json").stat().st_mtime_ns == written
+    other = Population(subjects=3, seed=3)
+    assert not set(other.seeds.values()) & set(population.seeds.values())
+
+
+def test_the_loop_takes_what_it_makes(photographs, tmp_path, monkeypatch):
+    synth_dataset(tmp_path / "a", Population(subjects=4, expressions=("smile",), held_out=2))
+    monkeypatch.setattr("workflows.records.subject.read", lambda root: read_toml(root))
+    found = read_dataset(tmp_path / "a")
+    assert found.categories == {"smile": "flexing"} and found.closed
+    assert split(found).held_out == ("synth_0002", "synth_0003")
+
+
+def read_toml(root: Path):
+    """A capture's header alone: there are no pictures."""
+    import tomllib
+
+    from registration.types import Capture
+
+    told = tomllib.loads((root / "capture.toml").read_text())
+    subject, expression, _ = (told.pop(name) for name in ("subject", "expression", "units"))
+    return Capture(root=root, subject=subject, expression=expression, views=(), tags=told)
+
+
+def test_a_capture_that_fails_is_told_after_all_others_were_tried(photographs, tmp_path):
+    photographs.trouble = InputError("The lamp is out", where="lamp", expected="light", got="none", fix="change it")
+    with pytest.raises(InputError, match="of 6 captures could not be made"):
+        synth_dataset(tmp_path / "a", Population(subjects=6))
+    assert json.loads((tmp_path / "a/dataset.json").read_text())["complete"] is False
+    photographs.trouble = None
+    assert synth_dataset(tmp_path / "a", Population(subjects=6))["complete"]
+
+
+@pytest.mark.parametrize(
+    ("options", "what"),
+    [
+        ("--subjects 0", "number of subjects"),
+        ("--subjects 2 --held-out 3", "More are held out"),
+        ("--subjects 2 --expressions smile,grin", "no such expression"),
+        ("--subjects 2 --expressions neutral", "each once"),
+        ("--subjects 2 --views 0", "number of cameras"),
+        ("--subjects 2 --seed -1", "seed"),
+    ],
+)
+def test_bad_settings_end_before_any_work(options, what, photographs, tmp_path, capsys):
+    assert main(["dataset", "synth", str(tmp_path / "a"), *options.split()]) == 2
+    assert what in capsys.readouterr().err and not (tmp_path / "a").exists() and not photographs.made
+
+
+def test_other_folders_are_refused(photographs, tmp_path):
+    synth_dataset(tmp_path / "a", Population(subjects=2))
+    with pytest.raises(InputError, match="cannot be used"):
+        synth_dataset(tmp_path / "a", Population(subjects=3))
+    (tmp_path / "mine").mkdir()
+    shutil.copy(tmp_path / "a" / "dataset.json", tmp_path / "mine" / "notes.json")
+    with pytest.raises(InputError, match="cannot be used"):
+        synth_dataset(tmp_path / "mine", Population(subjects=2))
+
+
+def test_one_trouble_in_another_process_does_not_stop_the_others(tmp_path):
+    bad = Studio(cameras=0)
+    calls = {
+        "ann": {"root": tmp_path / "ann", "seed": 0, "expression": "neutral", "tags": {}, "studio": bad},
+        "bob": {"place": tmp_path / "bob"},
+    }
+    found = dict(side_by_side(photograph, calls, jobs=2))
+    assert "number of cameras" in found["ann"] and found["bob"].startswith("TypeError")
+
+
+@pytest.mark.slow
+def test_real_photographs_of_a_person_and_an_expression(tmp_path):
+    from coregister.first_model import makehuman
+
+    try:
+        makehuman.fetch()
+    except InputError as error:
+        pytest.skip(f"{error.what}: {error.got}")
+    studio = Studio(cameras=2, size_px=(96, 96), texture_size=256)
+    synth_dataset(tmp_path / "a", Population(subjects=2, expressions=("smile",), held_out=1, studio=studio), jobs=2)
+    found = read_dataset(tmp_path / "a")
+    assert list(found.subjects) == ["synth_0000", "synth_0001"]
+    assert {"age", "gender", "ethnicity"} <= set(found.tags("synth_0000"))
+    truths = [np.load(path)["vertices"] for path in sorted((tmp_path / "a").glob("*/neutral/ground_truth.npz"))]
+    assert truths[0].shape == truths[1].shape and np.abs(truths[0] - truths[1]).max() > 1e-3

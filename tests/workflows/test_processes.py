@@ -1,0 +1,66 @@
+"""Processes beside this one: their share of the cores, and what is left when the caller goes."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import pytest
+
+from tests.workflows.farm.harness import ROOT, alive, interruptible
+from workflows.processes import ending_with_us, share_of_cores, side_by_side
+
+
+def test_processes_are_warm_and_share_the_cores(monkeypatch):
+    monkeypatch.delenv("OMP_NUM_THREADS", raising=False)
+    monkeypatch.setattr(os, "cpu_count", lambda: 8)
+    for jobs, threads in ((4, "2"), (1, None)):
+        with share_of_cores(jobs), ending_with_us(jobs) as pool:
+            assert pool.schedule(os.getenv, ("OMP_NUM_THREADS",)).result() == threads
+    assert "OMP_NUM_THREADS" not in os.environ
+    monkeypatch.setenv("OMP_NUM_THREADS", "3")
+    with share_of_cores(4), ending_with_us(1) as pool:
+        assert pool.schedule(os.getenv, ("OMP_NUM_THREADS",)).result() == "3"
+        assert len({pool.schedule(os.getpid).result() for _ in range(3)}) == 1
+
+
+def test_one_death_does_not_stop_the_others():
+    calls = {"ann": {"key": "NO_SUCH", "default": ""}, "bob": {"key": "NO_SUCH", "default": "tired"}}
+    assert dict(side_by_side(os.getenv, calls, jobs=2)) == {"ann": "", "bob": "tired"}
+    assert dict(side_by_side(os._exit, {"cleo": {"status": 3}}, jobs=1)) == {"cleo": "its process died"}
+
+
+SLEEPER = """
+import os, time
+from workflows.processes import ending_with_us
+if __name__ == "__main__":
+    with ending_with_us(1) as pool:
+        print(pool.schedule(os.getpid).result(), flush=True)
+        pool.schedule(time.sleep, (600,)).result()
+"""
+
+
+@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGINT])
+def test_they_end_with_a_parent_that_is_killed_or_interrupted(tmp_path, number):
+    (tmp_path / "sleeper.py").write_text(SLEEPER)
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    command = [sys.executable, str(tmp_path / "sleeper.py")]
+    parent = subprocess.Popen(
+        command,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.DEVNULL,
+        text=True,
+        env=environment,
+        preexec_fn=interruptible,
+    )
+    assert parent.stdout is not None
+    child = int(parent.stdout.readline())
+    time.sleep(0.5)
+    parent.send_signal(number)
+    parent.wait(timeout=30)
+    for _ in range(100):
+        if not alive(child):
+            return
+        time.sleep(0.1)
+    raise AssertionError("the child is still there")

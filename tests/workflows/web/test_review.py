@@ -1,0 +1,138 @@
+"""The review page in a headless Chromium with software WebGL: what is done there is what the function call does."""
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from bench.support import performances
+from registration.errors import InputError
+from registration.stabilize import stabilized_folder as disk
+from registration.stabilize.decisions import Decision
+from registration.stabilize.pipeline import stabilize
+from tests.coregister.conftest import anatomy, model, model_file, source, wheel  # noqa: F401  fixtures
+from tests.registration.stabilize import runs
+from tests.workflows.browser import CHROMIUM, FLAGS, needs_browser
+from workflows.records.run import read_decisions, read_run
+from workflows.steps.stabilize import stabilize_run
+from workflows.web.glb import swinging_head
+from workflows.web.review import Page, review
+from workflows.web.review_state import Review
+
+NAMES = ("smile", "jaw_open", "brows_up")
+
+
+@pytest.fixture(scope="module")
+def run(anatomy, model, tmp_path_factory) -> Path:  # noqa: F811
+    truths = [performances.perform(anatomy, number, NAMES) for number in range(2)]
+    seens = [performances.seen(truth, number, unseen=0.02) for number, truth in enumerate(truths)]
+    return runs.write_run(tmp_path_factory.mktemp("review"), model, truths, seens)
+
+
+@pytest.fixture
+def page(run, model_file) -> Iterator[Page]:  # noqa: F811
+    (run / "decisions.jsonl").unlink(missing_ok=True)
+    served = review(run, model_path=model_file, port=0)
+    yield served
+    served.close()
+
+
+@needs_browser
+def test_a_person_steps_subtracts_undoes_and_saves(page, run, model, model_file, tmp_path):  # noqa: F811
+    sync_api = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
+    with sync_api.sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=list(FLAGS))
+        tab = browser.new_page(viewport={"width": 1360, "height": 900})
+        asked, sockets = [], []
+        tab.on("request", lambda request: asked.append(request.url))
+        tab.on("websocket", lambda socket: sockets.append(socket.url))
+        tab.goto(f"http://127.0.0.1:{page.port}")
+        see = sync_api.expect
+        see(tab.get_by_text("6 expressions of 2 subjects")).to_be_visible(timeout=60_000)
+        tab.set_default_timeout(15_000)
+        see(tab.get_by_text("Coefficients by expression")).to_be_attached()
+        see(tab.get_by_text("The ten samples it moves most")).to_be_attached()
+        see(tab.locator("canvas").first).to_be_visible()
+
+        first = tab.get_by_text("energy of the region").locator("..").inner_text()
+        tab.get_by_role("button", name="next", exact=True).click()
+        see(tab.get_by_text(first.split("\t")[-1], exact=True)).to_have_count(0)  # another share of energy
+        unsaved = tab.get_by_text("decisions not saved").locator("..")
+        tab.get_by_role("textbox").last.fill("it turns")
+        tab.get_by_role("button", name="subtract", exact=True).click()
+        see(unsaved).to_contain_text("1")
+        tab.get_by_role("button", name="drop", exact=True).click()
+        see(unsaved).to_contain_text("2")
+        assert page.review.change.rms_mm > 0
+        tab.get_by_role("button", name="Undo").click()
+        see(tab.get_by_text("Undone.")).to_be_visible()
+        see(unsaved).to_contain_text("1")
+        tab.get_by_role("button", name="Save decisions").click()
+        see(tab.get_by_text("1 decisions saved")).to_be_visible()
+        picture = tab.screenshot()
+        browser.close()
+    assert len(picture) > 20_000
+    own = (f"http://127.0.0.1:{page.port}/", f"blob:http://127.0.0.1:{page.port}/", "data:")
+    assert asked and all(url.startswith(own) for url in asked)  # nothing from anywhere else
+    assert sockets == [f"ws://127.0.0.1:{page.port}/"] or sockets == [f"ws://127.0.0.1:{page.port}"]
+
+    log = run / "decisions.jsonl"
+    decided = read_decisions(log, page.review.dataset)
+    assert decided == [Decision(region="left_periocular", component=1, action="subtract", reason="it turns")]
+    replayed = stabilize_run(run, model_path=model_file, out=tmp_path / "out", decisions=log)
+    expected = stabilize(read_run(run, model).meshes(), model, decisions=decided)
+    for number, subject in enumerate(expected.subjects):
+        found = disk.read_subject(replayed.out, number)
+        np.testing.assert_allclose(found.vertices, subject.vertices, atol=1e-6)
+        np.testing.assert_allclose(found.T_neutral_expression, subject.T_neutral_expression, atol=1e-9)
+
+
+def test_a_review_goes_on_from_its_log(page, run, model_file):  # noqa: F811
+    before: Review = page.review
+    before.decide("nose", 0, "subtract", "moves as one")
+    before.decide("mouth", 0, "drop", "")
+    assert before.undo().region == "mouth" and before.unsaved == 1  # type: ignore[union-attr]
+    assert before.save() == 1 and before.save() == 0 and before.undo() is None
+    with pytest.raises(InputError, match="about nothing"):
+        before.decide("nose", 99, "drop", "")
+    again = review(run, model_path=model_file, port=0)
+    try:
+        assert again.review.action("nose", 0) == "subtract" and again.review.unsaved == 0
+        assert again.review.change.rms_mm == before.change.rms_mm > 0
+        motion_before, motion_after = again.review.motions("nose", 0)
+        np.testing.assert_array_equal(motion_before, again.review.stored.along["nose"][0])
+        assert np.abs(motion_before - motion_after).max() > 1e-6
+    finally:
+        again.close()
+
+
+def test_looking_again_leaves_what_was_decided(page, run, model_file):  # noqa: F811
+    page.review.decide("nose", 0, "subtract", "moves as one")
+    page.review.save()
+    decided = stabilize_run(run, model_path=model_file, decisions=run / "decisions.jsonl")
+    written = disk.read_manifest(decided.out)
+    review(run, model_path=model_file, port=0).close()
+    assert disk.read_manifest(decided.out) == written and len(written["decisions"]) == 1
+
+
+def test_a_taken_port_is_told(page, run, model_file):  # noqa: F811
+    with pytest.raises(InputError, match="cannot be served"):
+        review(run, model_path=model_file, port=page.port)
+
+
+def test_a_swinging_head_is_a_glb():
+    """Read back by trimesh, an independent reader; it knows no morph targets."""
+    import io
+
+    import trimesh
+
+    rng = np.random.default_rng(0)
+    sphere = trimesh.creation.icosphere(subdivisions=2)
+    blob = swinging_head(
+        sphere.vertices, rng.normal(size=sphere.vertices.shape), sphere.faces, 255 * (sphere.vertices > 0)
+    )
+    assert len(blob) % 4 == 0 and int.from_bytes(blob[8:12], "little") == len(blob)
+    (found,) = trimesh.load(io.BytesIO(blob), file_type="glb", process=False).geometry.values()
+    np.testing.assert_allclose(found.vertices, sphere.vertices, atol=1e-6)
+    np.testing.assert_array_equal(found.faces, sphere.faces)

@@ -1,0 +1,7 @@
+"""`python -m workflows.cli` is `gnmreg`."""
+
+import sys
+
+from workflows.cli.app import main
+
+sys.exit(main())

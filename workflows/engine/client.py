@@ -1,0 +1,208 @@
+"""The queue from outside: put jobs in, cancel a run, retry what failed, forget old iterations. No process is needed."""
+
+import json
+import re
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from itertools import islice
+from typing import Any
+
+import sqlalchemy as sa
+from dbos import DBOSClient, EnqueueOptions
+
+from registration.errors import InputError
+from workflows.engine.database import BELOW, below, checked_url, engine, require_queue, table
+from workflows.engine.jobs import MAX_BYTES, FlowJob, Job, check_id
+from workflows.engine.serialization import APPLICATION, VERSION, Json
+
+CHUNK = 1000  # jobs that are put in with one transaction
+ACTIVE = ("ENQUEUED", "PENDING", "DELAYED")
+FAILED = ("ERROR", "MAX_RECOVERY_ATTEMPTS_EXCEEDED")
+_ITERATION = re.compile(r"^[^/]+/(it[0-9]+)(?:/|$)")
+
+
+class Queue:
+    """A connection to the queue's database."""
+
+    def __init__(self, url: str, *, known: bool = False) -> None:
+        """Raises InputError if there is no queue at the URL, unless one is `known` to be there: `migrate` makes it."""
+        self.url = checked_url(url)
+        if not known:
+            require_queue(self.url)
+        self._engine = engine(self.url)
+        self._client = DBOSClient(
+            system_database_engine=self._engine,
+            serializer=Json(),
+            application_name=APPLICATION,
+            use_listen_notify=False,
+        )
+
+    def close(self) -> None:
+        self._client.destroy()
+        self._engine.dispose()
+
+    def put(self, jobs: Iterable[Job | FlowJob]) -> int:
+        """Put jobs in; one whose id is there already is left as it is. Returns how many there were.
+
+        Raises:
+            InputError: an id that cannot be used, or arguments that are not JSON or too large.
+        """
+        count = 0
+        for chunk in _chunks(jobs):
+            for job in chunk:
+                _check(job)
+            with self._engine.begin() as connection:
+                for job in chunk:
+                    self._client.enqueue_in_transaction(connection, _options(job), job.spec(), queue=job.queue)
+            count += len(chunk)
+        return count
+
+    def cancel(self, run: str) -> int:
+        """End a run, or a part of it: nothing more of it starts, and what is running is stopped. Returns how many.
+
+        The driver is cancelled first, so that nothing puts new jobs in; looked for again until nothing is left.
+        """
+        gone = 0
+        while ids := self._ids(run, ACTIVE):
+            for chunk in _chunks(ids):
+                self._client.cancel_workflows(chunk)
+            gone += len(ids)
+        return gone
+
+    def again(self, ids: Sequence[str]) -> list[str]:
+        """Let flows that have ended begin anew, in place. Returns those that had."""
+        ended = [i for i in ids for row in [self._rows(i).get(i)] if row is not None and row["status"] not in ACTIVE]
+        queues = self._queues(ended)
+        for identity in ended:
+            self._client.rewind_workflow(identity, start_step=1, queue_name=queues[identity])
+        return ended
+
+    def retry(self, run: str, *, failed: bool = True, cancelled: bool = False) -> list[str]:
+        """Put what failed in a run into its queue again, in place, and what followed from it. Returns the ids.
+
+        What followed: the flows above a failed job, from their beginning, and those of their jobs that were put in
+        after it ended, a subject's record after an expression for one. What has the same input as before returns at
+        once. Of a run with iterations the last one is retried only: the others' models are superseded.
+        """
+        rows = self._rows(check_id(run))
+        iterations = [row["iteration"] for row in rows.values() if row["iteration"]]
+        last = max(iterations, default="")
+        wanted = (*(FAILED if failed else ()), *(("CANCELLED",) if cancelled else ()))
+        found = {i: r for i, r in rows.items() if r["status"] in wanted and r["iteration"] in ("", last)}
+        chosen = set(found)
+        for identity, row in found.items():
+            above = [i for i in _ancestors(identity) if i in rows]
+            chosen |= {i for i in above if rows[i]["status"] not in ACTIVE}
+            chosen |= {
+                i
+                for i, r in rows.items()
+                if r["name"] == "job"
+                and r["status"] == "SUCCESS"
+                and r["created"] >= (row["ended"] or 0)
+                and _nearest(i, rows) in above
+            }
+        ordered = sorted(chosen, key=lambda i: (-i.count("/"), i))  # jobs before the flows that wait for them
+        queues = self._queues(ordered)
+        for identity in ordered:
+            self._client.rewind_workflow(identity, start_step=1, queue_name=queues[identity])
+        return ordered
+
+    def forget(self, part: str) -> int:
+        """Delete the rows of a run or of an iteration of it that has ended. Returns how many.
+
+        Raises:
+            InputError: some of it has not ended.
+        """
+        if running := self._ids(part, ACTIVE):
+            raise InputError(
+                "The jobs have not ended",
+                where=part,
+                expected="a run or an iteration that is over",
+                got=f"{len(running)} that wait or run",
+                fix="wait, or cancel it first",
+            )
+        ids = self._ids(part, ())
+        for chunk in _chunks(ids):
+            self._client.delete_workflows(chunk)
+        return len(ids)
+
+    def _ids(self, run: str, statuses: Sequence[str]) -> list[str]:
+        """Ids of a run in the given states (none: in any), the shortest first."""
+        rows = self._rows(check_id(run))
+        found = [i for i, row in rows.items() if not statuses or row["status"] in statuses]
+        return sorted(found, key=lambda i: (len(i), i))
+
+    def _rows(self, run: str) -> dict[str, dict[str, Any]]:
+        query = sa.text(
+            f"SELECT workflow_uuid, name, status, created_at, completed_at FROM {table(self.url, 'workflow_status')} "
+            f"WHERE {BELOW}"
+        )
+        with self._engine.connect() as connection:
+            return {
+                identity: {
+                    "name": name,
+                    "status": status,
+                    "created": created,
+                    "ended": ended,
+                    "iteration": found[0] if (found := _ITERATION.findall(identity)) else "",
+                }
+                for identity, name, status, created, ended in connection.execute(query, below(run))
+            }
+
+    def _queues(self, ids: Sequence[str]) -> dict[str, str]:
+        """The queue of each job, as its input says: from dead letters and cancelled jobs it was taken."""
+        found = {}
+        query = sa.text(
+            f"SELECT w.workflow_uuid, coalesce(i.inputs, w.inputs) FROM {table(self.url, 'workflow_status')} w "
+            f"LEFT JOIN {table(self.url, 'workflow_input')} i ON i.workflow_uuid = w.workflow_uuid "
+            "WHERE w.workflow_uuid IN :ids"
+        ).bindparams(sa.bindparam("ids", expanding=True))
+        with self._engine.connect() as connection:
+            for chunk in _chunks(ids):
+                for identity, inputs in connection.execute(query, {"ids": chunk}):
+                    found[identity] = json.loads(inputs)["kwargs"]["queue"]
+        return found
+
+
+def _ancestors(identity: str) -> list[str]:
+    """The ids above an id, the nearest first."""
+    parts = identity.split("/")
+    return ["/".join(parts[:n]) for n in range(len(parts) - 1, 0, -1)]
+
+
+def _nearest(identity: str, rows: Mapping[str, Any]) -> str | None:
+    """The flow that a job belongs to."""
+    return next((i for i in _ancestors(identity) if i in rows), None)
+
+
+def _options(job: Job | FlowJob) -> EnqueueOptions:
+    return {
+        "workflow_name": "job" if isinstance(job, Job) else "flow",
+        "queue_name": job.queue,
+        "workflow_id": job.id,
+        "app_version": VERSION,
+        "priority": job.priority,
+    }
+
+
+def _check(job: Job | FlowJob) -> None:
+    check_id(job.id)
+    try:
+        size = len(json.dumps(job.spec(), allow_nan=False))
+    except (TypeError, ValueError) as error:
+        size, problem = 0, str(error)
+    else:
+        problem = f"{size} bytes" if size > MAX_BYTES else ""
+    if problem:
+        raise InputError(
+            "The job cannot be put into the queue",
+            where=job.id,
+            expected=f"arguments as JSON of at most {MAX_BYTES} bytes",
+            got=problem,
+            fix="hand over paths, not data",
+        )
+
+
+def _chunks(items: Iterable[Any]) -> Iterator[list[Any]]:
+    iterator = iter(items)
+    while chunk := list(islice(iterator, CHUNK)):
+        yield chunk

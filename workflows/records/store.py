@@ -1,0 +1,352 @@
+"""Where artifacts live: below a folder or an object storage's URL, each under a key, told by its manifest.
+
+    <store>/<key>/artifact.json          what was made, from what, and the digest of every file
+    <store>/<key>/attempt-<uuid>/...     the files of the attempt that the manifest names
+
+An attempt writes only below its own folder and is published by writing the manifest, which is atomic: two workers that
+make the same thing at the same time disturb nobody, and one that dies leaves an orphan that `verify` names.
+"""
+
+import hashlib
+import json
+import posixpath
+import shutil
+import tempfile
+import time
+import uuid
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field
+from importlib.metadata import version
+from pathlib import Path, PurePosixPath
+from typing import Any
+
+import fsspec
+
+from registration.errors import InputError
+from registration.storage.registration_folder import swap_in
+from workflows.engine.jobs import check_id, redacted
+
+SCHEMA = 1
+KIND = "gnm-artifact"
+MANIFEST = "artifact.json"
+ATTEMPT = "attempt-"
+_BLOCK = 2**20
+
+
+@dataclass(frozen=True, kw_only=True)
+class Artifact:
+    """What a manifest says."""
+
+    key: str
+    input_hash: str  # of all that decides the result
+    content_id: str  # sha256 over the names and digests of the files
+    attempt: str  # the folder of the files, below the key
+    files: Mapping[str, Mapping[str, Any]]  # name below the attempt -> {"sha256", "bytes"}
+    about: Mapping[str, Any]  # figures and the like, small, JSON
+
+    def brief(self) -> dict[str, Any]:
+        """What a step returns to the queue about it."""
+        return {"key": self.key, "content_id": self.content_id, "about": dict(self.about)}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Verified:
+    """What re-hashing a whole store found; names are relative to the store."""
+
+    artifacts: int
+    missing: tuple[str, ...] = ()
+    altered: tuple[str, ...] = ()
+    orphaned: tuple[str, ...] = ()  # files that no manifest names; a running attempt's are among them
+    unreadable: Mapping[str, str] = field(default_factory=dict)  # manifest -> why
+
+    @property
+    def sound(self) -> bool:
+        return not (self.missing or self.altered or self.unreadable)
+
+
+class Store:
+    """Artifacts below one folder or URL (`s3://bucket/prefix`)."""
+
+    def __init__(self, url: str | Path) -> None:
+        """Nothing is read or created yet. Raises InputError for a scheme that fsspec or this installation lacks."""
+        self.url = str(url)
+        try:
+            self._fs, root = fsspec.core.url_to_fs(self.url, **_options(self.url))
+        except (ValueError, ImportError) as error:
+            raise InputError(
+                "The store cannot be used",
+                where=redacted(self.url),
+                expected="a folder or an s3:// URL",
+                got=redacted(str(error)),
+                fix="correct the URL; for s3:// install the extra: pip install 'gnm-registration[s3]'",
+            ) from None
+        self._root = root.rstrip("/")
+        self.local = Path(root) if "file" in _protocols(self._fs) else None
+
+    def find(self, key: str) -> Artifact | None:
+        """The published artifact of a key, or None.
+
+        Raises:
+            InputError: the manifest is not ours, cannot be read, or names a file outside its attempt.
+        """
+        path = self._path(key, MANIFEST)
+        try:
+            content = self._fs.cat_file(path)
+        except FileNotFoundError:
+            return None
+        return _parsed(content, where=f"{redacted(self.url)}/{key}/{MANIFEST}", key=key)
+
+    def produce(self, key: str, *, wanted: str, make: Callable[[Path], Mapping[str, Any]]) -> Artifact:
+        """The artifact of `key` made from the input that hashes to `wanted`: the published one, or a fresh one.
+
+        `make` fills the empty folder that it is handed and returns what the manifest shall say about it.
+        """
+        found = self.find(check_id(key))
+        if found is not None and found.input_hash == wanted and self._complete(found):
+            return found
+        attempt = f"{ATTEMPT}{uuid.uuid4().hex}"
+        if self.local is not None:
+            folder = self.local / key / attempt
+            folder.mkdir(parents=True)
+            try:
+                about = make(folder)
+            except BaseException:
+                shutil.rmtree(folder, ignore_errors=True)
+                raise
+            return self._published(key, attempt, wanted, folder, about)
+        with tempfile.TemporaryDirectory(prefix="gnmreg-") as name:
+            about = make(Path(name))
+            for file in _files(Path(name)):
+                self._fs.put_file(str(file), self._path(key, attempt, file.relative_to(name).as_posix()))
+            return self._published(key, attempt, wanted, Path(name), about)
+
+    def fetch(self, key: str, to: Path) -> Artifact:
+        """Copy an artifact's files into the folder `to`, checking every digest.
+
+        Raises:
+            InputError: there is none, or a file is missing or altered.
+        """
+        artifact = self.find(key)
+        if artifact is None:
+            raise _unusable(f"{redacted(self.url)}/{key}", expected="a published artifact", got="none")
+        for name, told in artifact.files.items():
+            target = to / name
+            target.parent.mkdir(parents=True, exist_ok=True)
+            try:
+                self._fs.get_file(self._path(key, artifact.attempt, name), str(target))
+            except FileNotFoundError:
+                raise _unusable(f"{key}/{name}", expected="the file that the manifest names", got="none") from None
+            if _digest(target.open("rb")) != told["sha256"]:
+                raise _unusable(f"{key}/{name}", expected=f"sha256 {told['sha256']}", got="another file")
+        return artifact
+
+    def open(self, key: str, name: str) -> Any:
+        """A published file, opened for reading bytes."""
+        artifact = self.find(key)
+        if artifact is None or name not in artifact.files:
+            raise _unusable(f"{redacted(self.url)}/{key}/{name}", expected="a published file", got="none")
+        return self._fs.open(self._path(key, artifact.attempt, name), "rb")
+
+    def keys(self, below: str = "") -> Iterator[str]:
+        """Keys of the published artifacts at and below a key, sorted."""
+        for name in sorted(self._names(below)):
+            if posixpath.basename(name) == MANIFEST and not _in_attempt(name):
+                yield posixpath.dirname(name)
+
+    def verify(self) -> Verified:
+        """Read every file of the store and compare it with the manifests."""
+        names, missing, altered, unreadable = set(self._names()), [], [], {}
+        manifests = {name for name in names if posixpath.basename(name) == MANIFEST and not _in_attempt(name)}
+        known = set(manifests)
+        for manifest in sorted(manifests):
+            key = posixpath.dirname(manifest)
+            try:
+                artifact = self.find(key)
+            except InputError as error:
+                unreadable[manifest] = f"expected {error.expected}, got {error.got}"
+                continue
+            for name, told in artifact.files.items() if artifact else ():
+                place = posixpath.join(key, artifact.attempt, name) if artifact else ""
+                known.add(place)
+                if place not in names:
+                    missing.append(place)
+                elif _digest(self._fs.open(self._path(place), "rb")) != told["sha256"]:
+                    altered.append(place)
+        return Verified(
+            artifacts=len(manifests),
+            missing=tuple(missing),
+            altered=tuple(altered),
+            orphaned=tuple(sorted(names - known)),
+            unreadable=unreadable,
+        )
+
+    def tidy(self, older_than_s: float = 24 * 3600.0) -> int:
+        """Delete the files of attempts that were never published or are superseded; returns how many.
+
+        Younger ones may belong to a running job and stay.
+        """
+        gone = 0
+        for name in self.verify().orphaned:
+            if _in_attempt(name) and time.time() - self._written(name) > older_than_s:
+                self._fs.rm_file(self._path(name))
+                gone += 1
+        if self.local is not None:
+            _remove_empty(self.local)
+        return gone
+
+    def delete(self, below: str) -> int:
+        """Delete all artifacts at and below a key, manifests first; returns how many there were."""
+        keys = list(self.keys(check_id(below)))
+        for key in keys:
+            self._fs.rm_file(self._path(key, MANIFEST))
+        if self._fs.exists(self._path(below)):
+            self._fs.rm(self._path(below), recursive=True)
+        return len(keys)
+
+    def retire(self, run: str, keep: int) -> list[str]:
+        """Delete the artifacts of a run's iterations (`it00`, `it01` ...) but the last `keep`; returns their keys."""
+        parts = {key.split("/")[1] for key in self.keys(run) if key.startswith(f"{run}/it")}
+        old = sorted(parts)[: len(parts) - keep] if keep > 0 else []
+        for part in old:
+            self.delete(f"{run}/{part}")
+        return [f"{run}/{part}" for part in old]
+
+    def _published(self, key: str, attempt: str, wanted: str, folder: Path, about: Mapping[str, Any]) -> Artifact:
+        files = {
+            file.relative_to(folder).as_posix(): {"sha256": _digest(file.open("rb")), "bytes": file.stat().st_size}
+            for file in _files(folder)
+        }
+        artifact = Artifact(
+            key=key,
+            input_hash=wanted,
+            content_id=_content_id(files),
+            attempt=attempt,
+            files=files,
+            about=dict(about),
+        )
+        self._write(self._path(key, MANIFEST), _text(artifact))
+        return artifact
+
+    def _write(self, path: str, text: str) -> None:
+        """One file, atomically: object storage shows whole objects only, a folder needs a rename."""
+        if self.local is None:
+            self._fs.pipe_file(path, text.encode())
+            return
+        swap_in(Path(path), text)
+
+    def _complete(self, artifact: Artifact) -> bool:
+        """Whether all files are there in their length; `verify` is for more."""
+        try:
+            return all(
+                self._fs.size(self._path(artifact.key, artifact.attempt, name)) == told["bytes"]
+                for name, told in artifact.files.items()
+            )
+        except FileNotFoundError:
+            return False
+
+    def _names(self, below: str = "") -> Iterator[str]:
+        self._fs.invalidate_cache()
+        for path in self._fs.find(self._path(below)):
+            yield path.removeprefix(self._root).lstrip("/")
+
+    def _written(self, name: str) -> float:
+        modified = self._fs.modified(self._path(name))
+        return float(modified.timestamp())
+
+    def _path(self, *parts: str) -> str:
+        return "/".join((self._root, *(part for part in parts if part)))
+
+
+def _options(url: str) -> dict[str, Any]:
+    # A listing must show what other machines wrote since.
+    return {"use_listings_cache": False} if url.startswith("s3://") else {}
+
+
+def _protocols(fs: Any) -> tuple[str, ...]:
+    return (fs.protocol,) if isinstance(fs.protocol, str) else tuple(fs.protocol)
+
+
+def _files(folder: Path) -> list[Path]:
+    return sorted(path for path in folder.rglob("*") if path.is_file())
+
+
+def _digest(stream: Any) -> str:
+    """sha256 of all that a stream of bytes holds; closes it."""
+    digest = hashlib.sha256()
+    with stream:
+        while block := stream.read(_BLOCK):
+            digest.update(block)
+    return digest.hexdigest()
+
+
+def _in_attempt(name: str) -> bool:
+    return any(part.startswith(ATTEMPT) for part in posixpath.dirname(name).split("/"))
+
+
+def _content_id(files: Mapping[str, Mapping[str, Any]]) -> str:
+    lines = [f"{name} {told['sha256']}\n" for name, told in sorted(files.items())]
+    return hashlib.sha256("".join(lines).encode()).hexdigest()
+
+
+def _text(artifact: Artifact) -> str:
+    value = {
+        "kind": KIND,
+        "schema": SCHEMA,
+        "key": artifact.key,
+        "input_hash": artifact.input_hash,
+        "content_id": artifact.content_id,
+        "attempt": artifact.attempt,
+        "files": dict(artifact.files),
+        "about": dict(artifact.about),
+        "version": version("gnm-registration"),
+    }
+    return redacted(json.dumps(value, indent=1, allow_nan=False)) + "\n"
+
+
+def _parsed(content: bytes, *, where: str, key: str) -> Artifact:
+    """A manifest. Others may write into a store, so its names are checked like anything else from outside."""
+    try:
+        value = json.loads(content)
+    except (ValueError, RecursionError) as error:
+        raise _unusable(where, expected="JSON", got=error) from None
+    if not isinstance(value, dict) or value.get("kind") != KIND or value.get("schema") != SCHEMA:
+        raise _unusable(where, expected=f'"kind": "{KIND}", "schema": {SCHEMA}', got="something else")
+    try:
+        artifact = Artifact(
+            key=key,
+            input_hash=str(value["input_hash"]),
+            content_id=str(value["content_id"]),
+            attempt=str(value["attempt"]),
+            files={str(n): {"sha256": str(f["sha256"]), "bytes": int(f["bytes"])} for n, f in value["files"].items()},
+            about=dict(value["about"]),
+        )
+    except (KeyError, TypeError, ValueError, AttributeError) as error:
+        raise _unusable(where, expected="the entries of an artifact", got=repr(error)) from None
+    for name in artifact.files:
+        path = PurePosixPath(name)
+        if path.is_absolute() or ".." in path.parts or not path.parts or "\0" in name:
+            raise _unusable(where, expected="names inside the attempt's folder", got=repr(name))
+    if not artifact.attempt.startswith(ATTEMPT) or "/" in artifact.attempt:
+        raise _unusable(where, expected=f'an attempt named "{ATTEMPT}..."', got=repr(artifact.attempt))
+    if _content_id(artifact.files) != artifact.content_id:
+        raise _unusable(where, expected=f"content id {artifact.content_id}", got="other files")
+    return artifact
+
+
+def _remove_empty(root: Path) -> None:
+    for folder in sorted((path for path in root.rglob(f"{ATTEMPT}*") if path.is_dir()), reverse=True):
+        for below in sorted((path for path in folder.rglob("*") if path.is_dir()), reverse=True):
+            if not any(below.iterdir()):
+                below.rmdir()
+        if not any(folder.iterdir()):
+            folder.rmdir()
+
+
+def _unusable(where: object, *, expected: object, got: object) -> InputError:
+    return InputError(
+        "The artifact cannot be used",
+        where=where,
+        expected=expected,
+        got=got,
+        fix="`gnmreg store verify` tells what is damaged; delete the manifest to have it made again",
+    )

@@ -1,0 +1,119 @@
+"""`gnmreg model evaluate`: models and held-out subjects in, a folder with figures and a page out."""
+
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from coregister.evaluate.evaluation import Evaluation, Settings, check, evaluate
+from registration.errors import InputError
+from registration.model import gnm_npz
+from registration.model.gnm_npz import GNMData
+from registration.progress import Progress
+from registration.storage.hashing import input_hash, plain, versions
+from registration.storage.registration_folder import fresh_folder, manifest_of_kind, refuse_foreign
+from workflows.pages.evaluation import write_evaluate_page
+from workflows.records.held_out import read_held_out
+
+SCHEMA = 1
+KIND = "gnm-evaluation"
+MANIFEST, PAGE, VERTICES = "manifest.json", "index.html", "vertices.npz"
+_FILES = (MANIFEST, PAGE, VERTICES)
+
+
+def evaluate_models(
+    model_paths: Sequence[Path] | Mapping[str, Path],
+    *,
+    held_out: Path,
+    out: Path,
+    captures: Path | None = None,
+    settings: Settings | None = None,
+    force: bool = False,
+    progress: Progress | None = None,
+) -> dict[str, Any]:
+    """Evaluate model files on held-out subjects and write the folder `out` (docs/formats.md); returns its manifest.
+
+    A folder made from the same inputs is left as it is, unless `force`. Others are compared with the first model.
+    Models are named as in the mapping, or after their files.
+
+    Raises:
+        InputError: as `read_held_out`, `evaluation.check` and `check_out`, before anything is computed.
+    """
+    settings = settings or Settings()
+    check_out(out)
+    named = model_paths if isinstance(model_paths, Mapping) else _named(model_paths)
+    models = {name: gnm_npz.read(path) for name, path in named.items()}
+    found = read_held_out(held_out, captures)
+    check(models, found.subjects, found.triangles, settings)
+    inputs = {**{f"model {name}": gnm_npz.content_hash(data) for name, data in models.items()}, **found.inputs}
+    wanted = input_hash(inputs, plain(settings))
+    known = None if force else manifest_of_kind(Path(out) / MANIFEST, KIND)
+    if known is not None and known.get("input_hash") == wanted and known.get("schema") == SCHEMA:
+        return known
+    evaluation = evaluate(models, found.subjects, found.triangles, settings, progress)
+    manifest: dict[str, Any] = plain(
+        {
+            "kind": KIND,
+            "schema": SCHEMA,
+            "input_hash": wanted,
+            "figures": evaluation.figures,
+            "config": settings,
+            "inputs": inputs,
+            "versions": versions(),
+        }
+    )
+    _write(manifest, evaluation, models, Path(out))
+    return manifest
+
+
+def lines(manifest: Mapping[str, Any]) -> list[str]:
+    """The figures for a terminal: a line each model and number of components, then what models gain on the first."""
+    figures, found = manifest["figures"], []
+    for name, one in figures["models"].items():
+        rows = zip(one["identity"]["components"], one["identity"]["intervals"], strict=True)
+        for number, (count, distance) in enumerate(rows):
+            random = one["specificity"] and one["specificity"]["intervals"][number]["mean"]
+            told = f", specificity {random:.3f} mm" if random is not None else ""
+            span = f"{distance['low']:.3f} to {distance['high']:.3f}"
+            found.append(f"{name}, {count} components: generalization {distance['mean']:.3f} mm ({span}){told}")
+    for gain in figures["gains"]:
+        share = gain["gain"]
+        span = f"{100 * share['low']:.1f} to {100 * share['high']:.1f}"
+        found.append(f"{gain['model']}, {gain['components']} components: gain {100 * share['mean']:.1f} % ({span})")
+    return found
+
+
+def check_out(out: Path) -> None:
+    """Refuse, before any work, a folder that is not ours to replace. Raises InputError."""
+    refuse_foreign(Path(out), kind=KIND, command="model evaluate", files=_FILES)
+
+
+def _named(paths: Sequence[Path]) -> dict[str, Path]:
+    """By the files' names without suffix, or by their paths where these are equal."""
+    stems = [Path(path).stem for path in paths]
+    named = {stem if stems.count(stem) == 1 else str(path): Path(path) for stem, path in zip(stems, paths, strict=True)}
+    if len(named) < len(paths):
+        raise InputError(
+            "A model comes twice",
+            where="models",
+            expected="different files",
+            got=", ".join(str(path) for path in paths),
+            fix="give each once",
+        )
+    return named
+
+
+def _write(manifest: Mapping[str, Any], evaluation: Evaluation, models: Mapping[str, GNMData], out: Path) -> None:
+    """The folder appears, or is replaced, in one rename."""
+    with fresh_folder(out) as fresh:
+        (fresh / MANIFEST).write_text(json.dumps(manifest, indent=1, allow_nan=False) + "\n", encoding="utf-8")
+        distances = {name: one.vertex_mm.astype(np.float32) for name, one in evaluation.models.items()}
+        np.savez(
+            fresh / VERTICES,
+            allow_pickle=False,
+            models=np.array(list(distances)),
+            distance_mm=np.stack(list(distances.values())),
+        )
+        (fresh / PAGE).write_text(write_evaluate_page(evaluation, models, manifest), encoding="utf-8")

@@ -1,0 +1,168 @@
+"""`gnmreg stabilize`: both stages over a run's registrations, subject after subject on disk."""
+
+from collections.abc import Collection, Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from registration.errors import InputError
+from registration.model import gnm_npz
+from registration.model.gnm_npz import GNMData
+from registration.progress import Progress, Silent
+from registration.stabilize import stabilized_folder as disk
+from registration.stabilize.components import LEAST_SAMPLES, Components, Head
+from registration.stabilize.decisions import Change, Decision, change
+from registration.stabilize.pipeline import (
+    Displacements,
+    Stabilization,
+    StabilizedSubject,
+    automatic_stage,
+    corrected,
+    regional_stage,
+)
+from registration.stabilize.stabilized_folder import StoredComponents
+from registration.storage.hashing import input_hash, plain, versions
+from workflows.pages.stabilization import write_stabilize_page
+from workflows.records.run import Run, read_decisions, read_run
+
+OUT, LOG = "stabilized", "decisions.jsonl"  # within the run
+
+
+@dataclass(frozen=True, kw_only=True)
+class Outcome:
+    """What a run of the command made, or found."""
+
+    out: Path
+    dataset: str  # id of registrations, model and settings: decisions are about it
+    figures: dict[str, Any]
+
+
+def stabilize_run(
+    run: Path,
+    *,
+    model_path: Path,
+    out: Path | None = None,
+    decisions: Path | None = None,
+    settings: Stabilization | None = None,
+    skip_failed: bool = False,
+    only: Collection[str] | None = None,
+    force: bool = False,
+    whatever_decided: bool = False,
+    progress: Progress | None = None,
+) -> Outcome:
+    """Stabilize all registrations of a run and write the folder `out` (docs/formats.md), by default RUN/stabilized.
+
+    The same as `stabilize` of the registrations, or of `only` the subjects in folders of these names. A folder made
+    from the same inputs is left as it is, unless `force`; with `whatever_decided` also one that other decisions made:
+    its components are the same.
+
+    Raises:
+        InputError: as `read_run`, `read_decisions`, `check_out`; fewer than two expressions. Nothing is written then.
+    """
+    progress, settings = progress or Silent(), settings or Stabilization()
+    out = Path(run) / OUT if out is None else Path(out)
+    data = gnm_npz.read(model_path)
+    head = Head.of(data)
+    found = read_run(run, data, skip_failed=skip_failed, only=only)
+    disk.check_out(out)
+    _check_count(found, run)
+    dataset = input_hash(found.inputs, plain(settings))
+    decided = [] if decisions is None else read_decisions(decisions, dataset)
+    wanted = input_hash(found.inputs, {"settings": plain(settings), "decisions": plain(decided)})
+    if not force and disk.is_stabilized(out):
+        manifest = disk.read_manifest(out)
+        if manifest["input_hash"] == wanted or (whatever_decided and manifest["dataset"] == dataset):
+            return Outcome(out=out, dataset=dataset, figures=manifest["figures"])
+    with disk.fresh_set(out) as fresh:
+        ids, components, moved = _write_subjects(fresh, found, data, head, settings, decided, progress)
+        figures = _figures(components, moved, fresh, len(found.subjects))
+        manifest = {
+            "content_id": input_hash(ids, {}),
+            "input_hash": wanted,
+            "dataset": dataset,
+            "subjects": [one.subject for one in found.subjects],
+            "left_out": {one.subject: one.left_out for one in found.subjects if one.left_out},
+            "decisions": decided,
+            "figures": figures,
+            "config": settings,
+            "inputs": found.inputs,
+            "versions": versions(),
+        }
+        disk.write_manifest(manifest, fresh)
+        subjects = (disk.read_subject(fresh, k) for k in range(len(found.subjects)))
+        page = write_stabilize_page(manifest, components, subjects, head)
+        (fresh / disk.PAGE).write_text(page, encoding="utf-8")
+    return Outcome(out=out, dataset=dataset, figures=figures)
+
+
+def _write_subjects(
+    fresh: Path,
+    run: Run,
+    data: GNMData,
+    head: Head,
+    settings: Stabilization,
+    decisions: Sequence[Decision],
+    progress: Progress,
+) -> tuple[dict[str, str], list[Components], Change]:
+    """Both stages; content ids by file, the components, and by how much the second stage moves the skin."""
+    count = len(run.subjects)
+    for number, meshes in enumerate(run.meshes()):
+        progress.at(number, count, f"the skull of {meshes.subject}")
+        disk.write_subject(automatic_stage(meshes, head, run.skin, settings), fresh, number)
+
+    def steady() -> Iterator[StabilizedSubject]:
+        return (disk.read_subject(fresh, k) for k in range(count))
+
+    progress.at(count, count, "components of all subjects")
+    components, correction = regional_stage(steady, head, settings, decisions)
+    names = [(s.subject, name, label) for s in steady() for name, label in zip(s.names, s.labels, strict=True)]
+    subjects, files, labels = (tuple(row[k] for row in names) for k in range(3))
+    moves = along(Displacements(steady), components)
+    stored = StoredComponents(components=tuple(components), subjects=subjects, names=files, labels=labels, along=moves)
+    ids = {disk.COMPONENTS: disk.write_components(stored, fresh)}
+    first = 0
+    for number in range(count):
+        subject = disk.read_subject(fresh, number)
+        ids[f"{number:04d}"] = disk.write_subject(corrected(subject, correction, first), fresh, number)
+        first += len(subject.names)
+    return ids, components, change(correction, head)
+
+
+def along(displacements: Iterable[np.ndarray], components: Sequence[Components]) -> dict[str, np.ndarray]:
+    """What the whole head does, on average, along with a coefficient of one: coefficients have a mean square of one."""
+    sums: dict[str, np.ndarray] = {}
+    count = 0
+    for count, displacement in enumerate(displacements, 1):
+        for part in components:
+            step = part.coefficients[count - 1][:, None, None] * displacement
+            sums[part.region] = sums[part.region] + step if part.region in sums else step
+    return {region: total / count for region, total in sums.items()}
+
+
+def _figures(components: Sequence[Components], moved: Change, fresh: Path, count: int) -> dict[str, Any]:
+    residual = np.concatenate([disk.read_subject(fresh, k).residual_mm for k in range(count)])
+    return {
+        "samples": len(residual),
+        "residual_first_median_mm": float(np.median(residual[:, 0])),
+        "residual_median_mm": float(np.median(residual[:, -1])),
+        "residual_p95_mm": float(np.percentile(residual[:, -1], 95)),
+        "components": {part.region: len(part.energy) for part in components},
+        "flagged": {part.region: np.flatnonzero(part.flagged).tolist() for part in components},
+        "regional_rms_mm": moved.rms_mm,
+        "regional_most_mm": moved.most_mm,
+        "regional_turn_deg": moved.turn_deg,
+    }
+
+
+def _check_count(run: Run, where: Path) -> None:
+    count = sum(len(one.expressions) for one in run.subjects)
+    if count < LEAST_SAMPLES:
+        raise InputError(
+            "There is only one expression to stabilize",
+            where=where,
+            expected=f"at least {LEAST_SAMPLES} expressions of all subjects together",
+            got=count,
+            fix="register more expressions; `stabilize_subject` alone aligns a single one",
+        )

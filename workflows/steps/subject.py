@@ -1,0 +1,252 @@
+"""The captures of a subject, one after the other: a plain loop over the library's public calls."""
+
+import traceback
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import TypeVar
+
+import numpy as np
+
+from registration.capture.scan import read_truth
+from registration.errors import InputError
+from registration.evaluate.evaluation import evaluate
+from registration.fit.recipes import recipe_named
+from registration.model import gnm_npz
+from registration.model.landmarks import read_scheme
+from registration.progress import Named, Progress, Silent
+from registration.register import register
+from registration.render.backend import Variant
+from registration.storage.registration_folder import update_figures
+from registration.types import Capture, Registration
+from workflows.pages.subject import thumbnail, write_subject_page
+from workflows.records.subject import MANIFEST, Captures, Row, Subject, check_subject_out, read_captures, save_subject
+
+HEADLINE = ("scan_to_mesh", "drift")  # of a manifest's figures, those of the face
+
+
+def register_subject(
+    subject_dir: Path,
+    *,
+    model_path: Path,
+    out: Path,
+    recipe: str = "draft",
+    views: int | None = None,
+    seed: int = 0,
+    neutral: str | None = None,
+    deterministic: bool = False,
+    force: bool = False,
+    variant: Variant = "llvm",
+    landmark_files: Mapping[str, Path] | None = None,
+    leave: Mapping[str, str] | None = None,
+    progress: Progress | None = None,
+) -> Subject:
+    """Register all captures of a subject: the neutral, then every expression from it, each by `register`.
+
+    Every registration goes into the folder of `out` that is named as its capture's; what is there already is kept, as
+    `register` does. `out/subject.json` and `out/index.html` are replaced after every capture. A capture that fails
+    does not stop the others, but without a neutral no expression is tried.
+
+    Args:
+        subject_dir: its sub-folders that hold a capture.toml are the captures.
+        neutral: the name of the neutral's sub-folder; None: the one whose expression is "neutral".
+        leave: captures that are not to be tried, and why: their rows are errors.
+        model_path, recipe, views, seed, deterministic, force, variant, landmark_files, progress: as for `register`.
+
+    Returns:
+        What became of each capture.
+
+    Raises:
+        InputError: `read_captures` or `check_subject_out` refuses a folder, there is no such recipe, or the model or
+            a landmark file cannot be read; nothing is computed or written.
+    """
+    progress = progress or Silent()
+    subject_dir, out, model_path = Path(subject_dir), Path(out), Path(model_path)
+    landmark_files = {name: Path(file) for name, file in (landmark_files or {}).items()}
+    captures, start = _begun(subject_dir, model_path, out, recipe, neutral, landmark_files)
+    one = partial(
+        register,
+        model_path=model_path,
+        recipe=recipe,
+        views=views,
+        seed=seed,
+        deterministic=deterministic,
+        force=force,
+        variant=variant,
+        landmark_files=landmark_files,
+    )
+    return _loop(captures.captures, one, _Record(start, out), leave or {}, progress)
+
+
+def begin_subject(subject_dir: Path, *, model_path: Path, out: Path, recipe: str) -> None:
+    """Write the record of a subject of which nothing is registered yet, so that registrations may be put beside it.
+
+    One that is there stays. Raises InputError as `register_subject`.
+    """
+    _, start = _begun(subject_dir, model_path, out, recipe, None, {})
+    if not (out / MANIFEST).exists():
+        _Record(start, out)
+
+
+def _begun(
+    subject_dir: Path,
+    model_path: Path,
+    out: Path,
+    recipe: str,
+    neutral: str | None,
+    landmark_files: Mapping[str, Path],
+) -> tuple[Captures, Subject]:
+    """A subject's captures, and what is known before the first is registered. Everything is checked."""
+    recipe_named(recipe)
+    captures = read_captures(subject_dir, neutral)
+    check_subject_out(out, captures)
+    start = Subject(
+        subject=captures.subject,
+        model=_checked_model(model_path, landmark_files),
+        recipe=recipe,
+        neutral=captures.captures[0].root.name,
+        rows=_waiting(captures),
+    )
+    return captures, start
+
+
+class _Record:
+    """What is known so far; every change lies on disk at once."""
+
+    def __init__(self, subject: Subject, out: Path):
+        self.subject, self.out = subject, out
+        self._thumbnails: dict[str, str] = {}  # row -> picture as a data URI
+        self._save()
+
+    def row(self, capture: Capture) -> Row:
+        return next(row for row in self.subject.rows if row.name == capture.root.name)
+
+    def put(self, row: Row, picture: str | None = None) -> None:
+        if picture is not None:
+            self._thumbnails[row.name] = picture
+        rows = tuple(row if old.name == row.name else old for old in self.subject.rows)
+        self.subject = replace(self.subject, rows=rows)
+        self._save()
+
+    def _save(self) -> None:
+        save_subject(self.subject, self.out, write_subject_page(self.subject, self._thumbnails))
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Neutral:
+    registration: Registration
+    capture: Capture
+    folder: Path
+
+
+def _loop(
+    captures: tuple[Capture, ...],
+    one: Callable[..., Registration],
+    record: _Record,
+    leave: Mapping[str, str],
+    progress: Progress,
+) -> Subject:
+    """Register the first capture, the neutral, and each other one from it. `one` is `register` with its settings."""
+    neutral: _Neutral | None = None
+    for number, capture in enumerate(captures, 1):
+        row = record.row(capture)
+        if row.name in leave:
+            record.put(replace(row, status="error", reason=leave[row.name]))
+            continue
+        if number > 1 and neutral is None:
+            reason = f"the neutral failed: {record.row(captures[0]).reason}"
+            record.put(replace(row, status="skipped", reason=reason))
+            continue
+        told = Named(progress, f"{row.name} ({number} of {len(captures)})")
+        told.note("registering")
+        row, result = _registered(row, capture, record.out / row.name, one, neutral, told)
+        picture = None if result is None else _attempt(partial(thumbnail, result), told)[0]
+        record.put(row, picture)
+        told.note(f"{row.status}: {row.reason}")
+        if number == 1 and result is not None and row.usable:
+            neutral = _Neutral(registration=result, capture=capture, folder=record.out / row.name)
+    return record.subject
+
+
+def _registered(
+    row: Row,
+    capture: Capture,
+    folder: Path,
+    one: Callable[..., Registration],
+    neutral: _Neutral | None,
+    progress: Progress,
+) -> tuple[Row, Registration | None]:
+    """One capture's row, filled in, and its registration if there is one."""
+    start = neutral.folder if neutral else None
+    result, reason = _attempt(partial(one, capture.root, out=folder, neutral=start, progress=progress), progress)
+    if result is None:
+        return replace(row, status="error", reason=reason), None
+    reason = result.reason
+    if neutral is not None:
+        measured, trouble = _attempt(partial(_with_drift, result, capture, folder, neutral), progress)
+        result = measured or result
+        reason += f"; the drift could not be measured: {trouble}" if trouble else ""
+    row = replace(
+        row,
+        status=result.status,
+        reason=reason,
+        figures={name: {"face": face} for name in HEADLINE if (face := result.figures.get(name, {}).get("face"))},
+        seconds=sum(result.seconds.values()),
+        folder=folder.name,
+    )
+    return row, result
+
+
+def _with_drift(result: Registration, capture: Capture, folder: Path, neutral: _Neutral) -> Registration:
+    """The registration with the figures of `evaluate`, which join its manifest: where the two truths can be compared.
+
+    Figures that are there already stay if they are newer than the neutral.
+    """
+    if not _comparable(capture, neutral.capture) or not np.isfinite(result.vertices).all():
+        return result
+    written, start = ((path / "manifest.json").stat().st_mtime_ns for path in (folder, neutral.folder))
+    if "drift" in result.figures and written >= start:
+        return result
+    figures = evaluate(result, capture, neutral=neutral.registration, neutral_capture=neutral.capture).figures
+    update_figures(folder, figures)
+    return replace(result, figures={**result.figures, **figures})
+
+
+def _comparable(capture: Capture, neutral: Capture) -> bool:
+    """Whether both have a scan, and truths of one topology."""
+    truths = [moment.ground_truth for moment in (capture, neutral) if moment.scan is not None]
+    shapes = [read_truth(truth).shape for truth in truths if truth is not None]
+    return len(shapes) == 2 and shapes[0] == shapes[1]
+
+
+T = TypeVar("T")
+
+
+def _attempt(action: Callable[[], T], progress: Progress) -> tuple[T | None, str]:
+    """What the action returns, or None and why: whatever happens to one capture, the others are to be tried."""
+    try:
+        return action(), ""
+    except InputError as error:
+        return None, error.line
+    except Exception as error:
+        progress.note(traceback.format_exc())
+        first, *_ = str(error).splitlines() or [""]  # the log has it all
+        return None, f"{type(error).__name__}: {first}"
+
+
+def _waiting(captures: Captures) -> tuple[Row, ...]:
+    """A row for each capture, the neutral's first; those that cannot be read are told as errors."""
+    rows = [Row(name=capture.root.name, expression=capture.expression) for capture in captures.captures]
+    broken = [
+        Row(name=name, expression="", status="error", reason=error.line) for name, error in captures.broken.items()
+    ]
+    return (*rows, *broken)
+
+
+def _checked_model(model_path: Path, landmark_files: Mapping[str, Path]) -> str:
+    """The model's content hash. Raises InputError for what `register` would refuse with every capture."""
+    data = gnm_npz.read(model_path)
+    for name, file in landmark_files.items():
+        read_scheme(file, len(data.template_vertex_positions), name)
+    return gnm_npz.content_hash(data)

@@ -1,0 +1,164 @@
+"""`gnmreg dataset synth`: a population of synthetic subjects as a dataset; one seed is one population."""
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from coregister.synthetic import expressions, subject
+from coregister.synthetic.capture import Studio, check
+from registration.errors import InputError
+from registration.progress import Progress, Silent
+from registration.storage.hashing import plain, versions
+from registration.storage.registration_folder import swap_in
+from workflows.processes import side_by_side
+from workflows.records.dataset import HELD_OUT, KIND, MANIFEST, SCHEMA
+from workflows.records.subject import NEUTRAL
+
+MOST = 1000  # subjects of one seed, so that populations of two seeds share nobody
+
+
+@dataclass(frozen=True, kw_only=True)
+class Population:
+    """What a dataset is made from, resolved."""
+
+    subjects: int
+    expressions: tuple[str, ...] = ()  # beside the neutral
+    seed: int = 0
+    held_out: int = 0  # of the subjects, the last ones
+    studio: Studio = Studio()  # its seed is each subject's own
+
+    @property
+    def seeds(self) -> dict[str, int]:
+        """Folder name -> the seed that draws this subject."""
+        return {f"synth_{seed:04d}": seed for seed in range(MOST * self.seed, MOST * self.seed + self.subjects)}
+
+    @property
+    def held(self) -> tuple[str, ...]:
+        names = tuple(self.seeds)
+        return names[len(names) - self.held_out :]
+
+
+def synth_dataset(
+    out: Path, population: Population, *, jobs: int = 1, progress: Progress | None = None
+) -> dict[str, Any]:
+    """Photograph a population (`coregister.synthetic.subject.capture`, people of any age and build) into `out`.
+
+    `out/SUBJECT/EXPRESSION` are captures, each whole or not there; called again it goes on where it was interrupted.
+    `out/dataset.json` tells the seeds, who is held out, and whether all is there. Held-out subjects' captures have the
+    tag `held_out`. Returns what `dataset.json` holds.
+
+    Raises:
+        InputError: settings out of range, unknown expressions, a folder that holds anything but this dataset, before
+            anything is drawn; captures that could not be made, after all others were tried.
+    """
+    progress, out = progress or Silent(), Path(out)
+    _check(population)
+    told = _told(population)
+    _check_out(out, told)
+    calls: dict[str, dict[str, Any]] = {}
+    for name, seed in population.seeds.items():
+        for act in (NEUTRAL, *population.expressions):
+            root = out / name / act
+            if not root.exists():
+                tags = {HELD_OUT: True} if name in population.held else {}
+                studio = replace(population.studio, seed=seed)
+                settings = {"seed": seed, "expression": act, "tags": tags, "studio": studio}
+                calls[f"{name}, {act}"] = {"root": root, **settings}
+    out.mkdir(parents=True, exist_ok=True)
+    if calls:
+        _save(out, told, complete=False)
+    lost = {}
+    for done, (name, trouble) in enumerate(side_by_side(photograph, calls, jobs), 1):
+        progress.at(done, len(calls), name)
+        if trouble:
+            lost[name] = trouble
+    if lost:
+        first, reason = next(iter(lost.items()))
+        raise InputError(
+            f"{len(lost)} of {len(calls)} captures could not be made",
+            where=first,
+            expected="a capture",
+            got=reason,
+            fix="run the same command again: it makes what is missing",
+        )
+    return _save(out, told, complete=True)
+
+
+def photograph(**settings: Any) -> str:
+    """One capture. Returns its trouble, "" if there was none."""
+    try:
+        subject.capture(**settings)
+    except InputError as error:
+        return error.line
+    except Exception as error:
+        return f"{type(error).__name__}: {error}"
+    return ""
+
+
+def _told(population: Population) -> dict[str, Any]:
+    categories = {name: expressions.named(name).category for name in population.expressions}
+    told: dict[str, Any] = plain(
+        {
+            "kind": KIND,
+            "schema": SCHEMA,
+            "seeds": population.seeds,
+            "held_out": population.held,
+            "expressions": population.expressions,
+            "categories": categories,
+            "studio": population.studio,
+        }
+    )
+    return told
+
+
+def _save(out: Path, told: Mapping[str, Any], complete: bool) -> dict[str, Any]:
+    """Written only if it says anything new: a dataset that is there stays as it is."""
+    file, whole = out / MANIFEST, {**told, "complete": complete, "versions": versions()}
+    if _read(file) != whole:
+        swap_in(file, json.dumps(whole, indent=1, allow_nan=False) + "\n")
+    return whole
+
+
+def _read(file: Path) -> Any:
+    try:
+        return json.loads(file.read_text("utf-8"))
+    except (OSError, ValueError):
+        return None
+
+
+def _check(population: Population) -> None:
+    check(Path("/nowhere/at/all"), population.studio)
+    for name in population.expressions:
+        expressions.named(name)
+    acts = population.expressions
+    if NEUTRAL in acts or len(set(acts)) < len(acts):
+        raise _wrong("The expressions are not each once", "expressions", "names beside the neutral", ", ".join(acts))
+    if not 1 <= population.subjects <= MOST:
+        raise _wrong("The number of subjects is out of range", "subjects", f"1 to {MOST}", population.subjects)
+    if population.seed < 0:
+        raise _wrong("The seed is out of range", "seed", "a whole number from 0", population.seed)
+    if not 0 <= population.held_out <= population.subjects:
+        expected = f"0 to {population.subjects}"
+        raise _wrong("More are held out than there are", "held-out", expected, population.held_out)
+
+
+def _check_out(out: Path, told: Mapping[str, Any]) -> None:
+    if not out.exists() or (out.is_dir() and not any(out.iterdir())):
+        return
+    found = _read(out / MANIFEST) if out.is_dir() else None
+    ours = isinstance(found, dict) and {name: found.get(name) for name in told} == dict(told)
+    if not ours:
+        got = "another dataset" if found else "other things"
+        raise InputError(
+            "The dataset's folder cannot be used",
+            where=out,
+            expected="a new or empty folder, or one with a dataset of the same settings",
+            got=got,
+            fix="choose another folder, or the arguments that it was made with",
+        )
+
+
+def _wrong(what: str, where: object, expected: object, got: object) -> InputError:
+    return InputError(what, where=where, expected=expected, got=got, fix="change it")
