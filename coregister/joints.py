@@ -1,4 +1,4 @@
-"""Joints: how the first model's skin hangs on them, and where they are for a given surface (paper, Head Identity)."""
+"""Joints: how the first model's skin hangs on them, and where they are for a given surface [GNM, Head Identity]."""
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -19,7 +19,7 @@ _SPREAD = 3e-4  # metres: how much accuracy the regressor gives for spreading it
 
 
 def head_weight(vertices: Float[np.ndarray, "V 3"]) -> Float[np.ndarray, "V"]:
-    """Share of the head joint in the skin's motion; the neck joint, the root, has the rest (paper, Fig. Template)."""
+    """Share of the head joint in the skin's motion; the neck joint, the root, has the rest [GNM, Head Identity]."""
     return smoothstep((vertices[:, 1] + _SLOPE * vertices[:, 2] - _NECK) / (_SKULL - _NECK))
 
 

@@ -1,4 +1,4 @@
-"""What head models are worth on people that they were not made from (paper, Intrinsic Evaluation; algorithms.md 10).
+"""What head models are worth on people that they were not made from [GNM, Intrinsic Evaluation of GNM].
 
 Generalization (how near a model comes to a held-out head), compactness (how few components hold its variance) and
 specificity (how near its random heads come to real ones), against the number of components, with intervals over

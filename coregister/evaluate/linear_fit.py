@@ -1,8 +1,9 @@
-"""How near a linear model comes to heads that it was not made from (algorithms.md sections 7 and 10).
+"""How near a linear model comes to heads that it was not made from (docs/algorithms.md, "Generalization").
 
 Where vertices correspond, coefficients and rigid motion together are a small least-squares problem, solved to the end:
 nothing is regularised and nothing depends on a step length. Bases are not orthogonal, across regions nor on a part of
-the mesh, so every projection solves normal equations. The paper runs Adam for 5,000 steps to the same minimum.
+the mesh, so every projection solves normal equations. [GNM,
+Generalization to Novel Shapes] runs Adam for 5,000 steps to the same minimum.
 """
 
 from collections.abc import Sequence
@@ -80,7 +81,7 @@ def surface_part(data: GNMData) -> LinearPart:
 
 
 def whole_part(data: GNMData) -> LinearPart:
-    """Identity and expression together on the head's skin, as the paper's fits of single scans use them."""
+    """Identity and expression together on the head's skin, as in [GNM, Generalization to Novel Shapes]."""
     return _part(data, regions.head_skin(data), data.vertex_identity_basis, data.expression_basis)
 
 

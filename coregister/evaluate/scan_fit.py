@@ -1,9 +1,9 @@
 """The head of a linear model nearest to a scan: surface to surface, for no vertex corresponds to a scan's point.
 
 Squared distances of the scan's points from the surface are minimised over coefficients and rigid motion together (no
-scale, no regulariser; paper, Generalization to Novel Shapes, stage 2). To first order a distance changes with the
+scale, no regulariser; [GNM, Generalization to Novel Shapes], stage 2). To first order a distance changes with the
 surface along its own direction only, so a Levenberg-Marquardt step needs that one row per point; a step that does not
-bring the points nearer is not taken. The paper runs 5,000 steps of Adam instead; here the end is where no step helps
+bring the points nearer is not taken. [GNM] runs 5,000 steps of Adam; here the end is where no step helps
 any more, and is told.
 """
 

@@ -1,4 +1,4 @@
-"""How near a model's random heads come to real ones (paper, Specificity of GNM; algorithms.md section 10).
+"""How near a model's random heads come to real ones [GNM, Specificity of GNM]; docs/algorithms.md, "Specificity".
 
 Generalization rewards a model that can be anything; this is the other pan of the scales: neither is told without the
 other.

@@ -171,7 +171,7 @@ class Anatomy:
     def _lids_shift(
         self, side: int, moved_skin: Float[np.ndarray, "N 3"], delta: Float[np.ndarray, "B 3"]
     ) -> Float[np.ndarray, "3"]:
-        """The translation that changes the lids' distances to the eyeball least (paper, Head Identity)."""
+        """The translation that changes the lids' distances to the eyeball least [GNM, Head Identity]."""
         lids, helper = self._lids[side], self.source.group(("helper-l-eye", "helper-r-eye")[side])
         outward = self.parts["skin"].vertices[lids] - self.eye_centres[side]
         outward /= np.linalg.norm(outward, axis=1, keepdims=True)
@@ -187,7 +187,10 @@ class Anatomy:
         return np.asarray(_homogeneous(points - middle) @ map_)
 
     def _turned(self, helper: str, delta: np.ndarray, points: Float[np.ndarray, "N 3"]) -> Float[np.ndarray, "N 3"]:
-        """The helper's motion as w x + t, an infinitesimal turn, so that it is linear (algorithms: first placement)."""
+        """The helper's motion as w x + t, an infinitesimal rotation, which is linear.
+
+        See docs/algorithms.md, "Placement of teeth and tongue".
+        """
         rows = self.source.group(helper)
         middle = self.base[rows].mean(0)
         own = self.base[rows] - middle

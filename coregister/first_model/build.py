@@ -1,4 +1,4 @@
-"""The first model, from nothing but MakeHuman's CC0 head (paper, Head Registration: "a custom parametric model derived
+"""The first model, from nothing but MakeHuman's CC0 head [GNM, Head Registration] ("a custom parametric model derived
 from curated 3D head meshes"). Everything is deterministic; the result is an official GNM file with landmark schemes."""
 
 import hashlib

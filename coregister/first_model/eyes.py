@@ -1,6 +1,6 @@
 """The eyeball: two closed surfaces of revolution, their identity basis and the basis vector of the pupil.
 
-The two-sphere model of the GNM paper ("Eyeball Model Formulation"): a sclera of fixed radius and a smaller corneal
+The two-sphere model of [GNM, Eyeball Model Formulation]: a sclera of fixed radius and a smaller corneal
 sphere that meet at the limbus, smoothed there. One outline, rows (distance from the axis, z), turns about the optical
 axis +Z; each of its points is a ring of `SEGMENTS` mesh vertices or, on the axis, a pole. Metres throughout.
 """

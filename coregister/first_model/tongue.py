@@ -1,4 +1,4 @@
-"""The tongue: its motions, as samples for its own basis (paper, Tongue Modeling; algorithms, section 7).
+"""The tongue: its motions, as samples for its own basis [GNM, Tongue Modeling and Articulation].
 
 The samples are made, not captured: MakeHuman's protrusion target times random bends, twists and changes of width.
 """

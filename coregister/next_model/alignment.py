@@ -1,5 +1,5 @@
 """Neutral heads laid upon one another: generalised Procrustes alignment, and a test of who does not belong
-(paper, Head Identity; Gower 1975; algorithms, section 7)."""
+[GNM, Head Identity], [Gower 1975]; docs/algorithms.md, "Alignment of neutrals"."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -1,4 +1,4 @@
-"""Many registrations and the previous model -> the next model, with how it came about (paper, GNM).
+"""Many registrations and the previous model -> the next model, with how it came about [GNM, GNM].
 
     built = build(subjects, previous)
     provenance.write(built.data, built.manifest, built.coefficients, path, previous_path)

@@ -1,4 +1,4 @@
-"""Expression basis by region: uncentred principal components under soft masks (paper, Head Expression)."""
+"""Expression basis by region: uncentred principal components under soft masks [GNM, Head Expression]."""
 
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
@@ -121,7 +121,7 @@ def regional_bases(
 
     `displacements` of expressions from their neutrals, in the frame of the model `data`, whose template is the new one
     and whose expression basis the previous; read several times. Their skin counts, and in the lower face their lower
-    teeth (paper, Head Expression: "the motion of the jaw together with the lower teeth"). `weights` balance subjects.
+    teeth ("the motion of the jaw together with the lower teeth", [GNM, Head Expression]). `weights` balance subjects.
     """
     settings = settings or Expressions()
     masks, mirror = dict(zip(REGIONS, regional_masks(data), strict=True)), data.mirror_indices
@@ -142,10 +142,10 @@ def regional_bases(
 
 def with_jaw(basis: Float[np.ndarray, "K V 3"], data: GNMData) -> Float[np.ndarray, "K V 3"]:
     """The motion w x p + t of the lower teeth in each component, everywhere: linear in the coefficient, as a full turn
-    would not be (algorithms, section 7).
+    would not be (docs/algorithms.md, "Placement of teeth and tongue").
 
-    The paper places teeth by the skin of chin and lower lip, once, as long as nothing tells their own motion. It is no
-    measure of it: of MakeHuman's open jaw, which moves the lower teeth by 22 mm, the chin alone misses 4.
+    [GNM, Initial Placement of Teeth and Tongue] places teeth by the skin of chin and lower lip while their own motion
+    is unknown. That measures it badly: when MakeHuman's open jaw moves the lower teeth by 22 mm, the chin misses 4 mm.
     """
     points = data.template_vertex_positions.astype(np.float64)
     area = vertex_areas(points, data.triangles) * regions.lower_teeth(data)

@@ -1,5 +1,5 @@
 """Eyeballs between their lids: where they stand in a new template and how they follow every identity component
-(paper, Head Identity; algorithms, section 7)."""
+[GNM, Head Identity]; docs/algorithms.md, "Eyeballs and eyelids"."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -111,7 +111,7 @@ def rested(
     """The basis with lids that stay on eyeballs which move by `shifts`, to first order in the coefficient.
 
     No translation fits all of a rim: what the gaps at +-BOUND differ by is taken out along the gaps' directions, fading
-    into the skin around. What remains is second order: lids that slide along the ball. The paper leaves it all.
+    into the skin around. What remains is second order: lids that slide along the ball. [GNM] leaves it all.
     """
     known = np.zeros(len(template), bool)
     wanted = np.zeros((len(template), len(basis), 3))

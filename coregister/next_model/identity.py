@@ -1,4 +1,6 @@
-"""Identity basis: centred principal components of aligned neutral heads (paper, Head Identity)."""
+"""Identity basis: centred principal components of aligned neutral heads [GNM, Head Identity].
+
+See docs/algorithms.md, "Covariance shrinkage"."""
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
@@ -66,7 +68,8 @@ def head_identity(
     known, with N. Every component is symmetric or antisymmetric.
 
     The template is the heads' mean alone; eyeballs are placed to fit its lids. Teeth and tongue are the registrations'
-    as the skin is, of next to no weight; only of a first model would they follow the lips (paper, Initial Placement).
+    as the skin is, of next to no weight; only of a first model would they follow the lips [GNM, Initial Placement
+    of Teeth and Tongue].
     """
     settings = settings or Identity()
     left, right = regions.eyeballs(data)

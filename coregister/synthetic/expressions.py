@@ -1,4 +1,5 @@
-"""Named expressions of synthetic subjects, in the ten categories of the paper's capture protocol (Data Foundation)."""
+"""Named expressions of synthetic subjects, in the ten categories of the capture protocol
+[GNM, Data Foundation & Acquisition]."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field

@@ -14,7 +14,7 @@ from registration.types import Rendered, Targets
 _GREY = 0.25  # linear; what a texel shows before any view has been unwrapped to it
 _STEP = 0.5  # share of a texel's error that one update takes away
 _LEAST_DENSITY = 1e-3
-# Priors of a camera's gain and bias, against pixel noise over some hundred independent patches (algorithms: 0.1, 0.02).
+# Priors of a camera's gain and bias, against pixel noise over 100 independent patches (docs/algorithms.md).
 _GAIN_SIGMA, _BIAS_SIGMA, _NOISE = 0.1, 0.02, 0.05 / np.sqrt(100)
 
 

@@ -51,7 +51,7 @@ class AdamBlock:
 class AdamUniformBlock:
     """Adam with one step size for all vertices (Nicolet 2021), so that a field's direction is kept.
 
-    The paper divides by the largest second moment; here by a high quantile, since one wild vertex would rule it.
+    [Nicolet 2021] divides by the largest second moment; here by a high quantile, since one wild vertex would rule it.
     Vertices may be told apart in `groups`, each with a step size of its own times its `pace`: where images pull
     weakly everywhere, vertices would else hardly move.
     """

@@ -106,7 +106,7 @@ def principal_components(
 
     Centred: about the weighted mean, the sum divided by W - sum(w^2) / W (N - 1 for equal weights); else about zero, by
     W. The largest entry of each component is positive. Three ways, the first that `memory_gb` allows unless `method`
-    names one (algorithms, section 7):
+    names one (docs/algorithms.md, "Principal components"):
 
     - samples: the N x N products of samples, which are held, if there are no more than D; exact
     - covariance: the D x D products of entries, float32 blocks summed in float64; exact to 3e-6

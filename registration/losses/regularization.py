@@ -29,10 +29,10 @@ def strengths(
 
 
 class Elasticity:
-    """The three penalties of FLAME and the paper on one mesh: L2, edge coupling, squared Laplacian.
+    """The three penalties of [GNM, Head Registration] on one mesh: L2, edge coupling [FLAME], squared Laplacian.
 
     In bind space the displaced mesh and the model's share everything but the offsets, so that the change of an edge
-    (FLAME 2017, coupling) is linear in the offsets. Derivatives are taken at each vertex' own spacing.
+    [FLAME] is linear in the offsets. Derivatives are taken at each vertex' own spacing.
     """
 
     def __init__(

@@ -41,7 +41,7 @@ class GNM(torch.nn.Module):
         keep("expression_basis", data.expression_basis, -1, 3 * vertices)
         keep("joint_template", data.template_joint_positions, 3 * joints)
         keep("joint_basis", data.joint_identity_basis, -1, 3 * joints)
-        # The paper's inverse homogeneous map divides by the sum of a vertex' weights.
+        # The inverse homogeneous map [GNM, Model Formulation] divides by the sum of a vertex' weights.
         weights = data.skinning_weights.astype(np.float64)
         keep("weights", (weights / weights.sum(0)).T, vertices, joints)
         # Released models ship zeros here; a product with them would cost as much as a tenth of the bases.
@@ -80,7 +80,7 @@ class GNM(torch.nn.Module):
         return self.skin(bind, joints, rotations)
 
     def bind(self, identity: Float[Tensor, "*B I"], expression: Float[Tensor, "*B E"]) -> Float[Tensor, "*B V 3"]:
-        """The bind pose: template plus both bases (paper, equation `gnm_feedforward`), without pose correctives."""
+        """The bind pose: template plus both bases [GNM, Model Formulation], without pose correctives."""
         flat = self.template + identity @ self.identity_basis + expression @ self.expression_basis
         return flat.unflatten(-1, (-1, 3))
 
@@ -89,7 +89,7 @@ class GNM(torch.nn.Module):
         return (self.joint_template + identity @ self.joint_basis).unflatten(-1, (-1, 3))
 
     def correctives(self, rotations: Float[Tensor, "*B J 3 3"]) -> Float[Tensor, "*B V 3"]:
-        """What the rotations add to the bind pose before skinning; in the released file, not in the paper."""
+        """What the rotations add to the bind pose before skinning; in the released file, not in [GNM]."""
         if self.corrective_basis is None:
             return self.template.new_zeros(*rotations.shape[:-3], *self.weights.shape[:1], 3)
         turned = rotations - torch.eye(3, dtype=rotations.dtype, device=rotations.device)

@@ -17,7 +17,7 @@ def evaluate(
     scale: float = 1.0,
     offsets: Float[np.ndarray, "V 3"] | None = None,
 ) -> Float[np.ndarray, "V 3"]:
-    """Posed vertices in world metres; arguments as in `types.Parameters`, one sample (paper, Model Formulation)."""
+    """Posed vertices in world metres; arguments as in `types.Parameters`, one sample [GNM, Model Formulation]."""
     bind = data.template_vertex_positions.astype(np.float64)
     for coefficient, mode in zip(identity, data.vertex_identity_basis, strict=True):
         bind = bind + coefficient * mode

@@ -264,7 +264,7 @@ STEADY_REGIONS = ("nose", "neck_back")  # of `stabilization_regions`: where expr
 
 
 def stabilization_regions(data: GNMData) -> dict[str, Bool[np.ndarray, "V"]]:
-    """The five regions in which a person looks for motion of the whole head (paper, Head Expression); all exterior.
+    """The five regions in which a person looks for motion of the whole head [GNM, Head Expression]; all exterior.
 
     They may overlap, where cheeks meet lower lids, and leave ears and forehead out.
     """

@@ -1,4 +1,6 @@
-"""The automatic stage: the skull's motion between a subject's neutral and its expressions (algorithms, section 6).
+"""The automatic stage: the skull's motion between a subject's neutral and its expressions.
+
+See docs/algorithms.md, "Stabilization".
 
 A confidence map tells which skin stays with the skull: what moves least over all of a subject's expressions. Each
 expression is then aligned by it, robustly, since even the steadiest skin moves in some.
@@ -16,7 +18,7 @@ from registration.stabilize.subject_meshes import SkullSkin, SubjectMeshes
 
 @dataclass(frozen=True, kw_only=True)
 class Automatic:
-    """How the stage goes about it; the values of section 6."""
+    """How the stage goes about it (docs/algorithms.md, "Stabilization")."""
 
     still_mm: float = 0.5  # a vertex that moves by this much is trusted half
     rounds: int = 4  # of map and alignment in turn
@@ -43,7 +45,7 @@ def stabilize_subject(meshes: SubjectMeshes, skin: SkullSkin, settings: Automati
     rigid alignment to the neutral; then aligns each expression alone by iteratively reweighted least squares with Geman
     and McClure's kernel. Weights are times the registrations' confidence, so that unseen vertices carry none.
 
-    Beyond section 6, measured by `bench.stabilization`: weights are also times the area that a vertex stands for, since
+    Measured by `bench.stabilization`: weights are also times the area that a vertex stands for, since
     models are dense where faces move (lids, lips); that halves the errors. The neck does not take part.
 
     `meshes` as `subject_meshes` returns them. Never fails: with little skin seen in common the motion is a poor one.

@@ -1,5 +1,5 @@
 """The regional stage's view of a dataset: principal components per region, and how much each looks like motion of the
-whole head (paper, end of Head Expression; algorithms, section 6)."""
+whole head [GNM, Head Expression]; docs/algorithms.md, "Stabilization"."""
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
@@ -21,7 +21,7 @@ LEAST_SAMPLES = 2
 
 @dataclass(frozen=True, kw_only=True)
 class Regional:
-    """How the stage goes about it; the values of section 6."""
+    """How the stage goes about it (docs/algorithms.md, "Stabilization")."""
 
     share: float = 0.99  # of a region's energy, held by the components that are looked at
     rigid: float = 0.5  # flagged: `score` above this,
@@ -131,7 +131,7 @@ def label_part(coefficients: Float[np.ndarray, "S K"], labels: Sequence[str]) ->
 def free_of_label(coefficients: Float[np.ndarray, "S K"], labels: Sequence[str]) -> Float[np.ndarray, "K"]:
     """S3: one minus the share of variance that labels explain, corrected for what chance lets them explain.
 
-    Section 6 has 1 - eta^2, which falls with the number of labels though nothing depends on them: here it is
+    1 - eta^2 falls with the number of labels though nothing depends on them: here it is
     1 - epsilon^2 (Kelley 1935), 1 on average then. With one sample a label nothing can be told: 0.
     """
     group, _, counts, within = _by_label(coefficients, labels)

@@ -1,4 +1,4 @@
-"""What is done about components, and the set that is rebuilt from it (algorithms, section 6)."""
+"""What is done about components, and the set that is rebuilt from it (docs/algorithms.md, "Stabilization")."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -98,8 +98,8 @@ def corrections(
     """What the actions take from every sample.
 
     *Subtract*: the rigid parts of these components, all regions', are one motion of one head: the rigid motion that
-    fits them best over their regions' skin is undone for the whole head, and the face keeps its shape. Section 6
-    subtracts c r region by region instead. Against known truth (injected motions, `python -m bench.stabilization`)
+    fits them best over their regions' skin is undone for the whole head, and the face keeps its shape. To subtract
+    c r region by region instead is worse. Against known truth (injected motions, `python -m bench.stabilization`)
     that removes less of the spurious motion, 74 to 96 % against 85 to 99 %, since the jaw hides the mouth's share; and
     it takes up to a quarter of a small expression (brows) along, against 7 %. Of the coefficients, what the labels
     explain is not subtracted (`label_part`): that is expression, which chance correlation mixes into a component.

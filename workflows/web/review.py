@@ -1,5 +1,5 @@
-"""`gnmreg stabilize review`: a page in the browser on which a person decides about components (paper, end of Head
-Expression)."""
+"""`gnmreg stabilize review`: a page in the browser on which a person decides about components [GNM,
+Head Expression]."""
 
 import threading
 from pathlib import Path
