@@ -1,8 +1,8 @@
-"""Makes docs/stabilization.jpg: the review page, of the first model's population, in a headless Chromium.
+"""Renders docs/stabilization.jpg: the review page on the synthetic population, in a headless Chromium.
 
-    python -m docs.stabilization_picture
+    python -m docs.pictures.stabilization
 
-Needs Debian's `chromium`. Two kinds of motion of the head are put into a third of the samples.
+Needs Debian's `chromium`. Two kinds of head motion are added to a third of the samples.
 """
 
 import shutil
@@ -25,12 +25,13 @@ from workflows.steps.stabilize import along
 from workflows.web.review import Page
 from workflows.web.review_state import Review
 
-PICTURE = Path(__file__).with_name("stabilization.jpg")
+PICTURE = Path(__file__).parents[1] / "stabilization.jpg"
 SIZE = {"width": 1500, "height": 960}
-WAIT_MS = 6000  # until the heads are somewhere in their swing
+WAIT_MS = 6000  # until the animation has started
 
 
 def stored(head: Head) -> StoredComponents:
+    """Return the components of true expressions with added head motion."""
     anatomy = anatomy_of.make(makehuman.read(makehuman.fetch()), population.mean_person())
     truths = [performances.perform(anatomy, 1000 + number) for number in range(16)]
     rng = np.random.default_rng(5)

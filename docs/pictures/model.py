@@ -1,6 +1,6 @@
-"""Draws the pictures of docs/model.md from a first model: `python docs/model_pictures.py MODEL.npz docs/model`.
+"""Renders the images of docs/model.md from a first model: `python -m docs.pictures.model MODEL.npz docs/model`.
 
-MODEL.npz is what `gnmreg model bootstrap` made; MakeHuman's head, for the face units, is taken from the cache.
+MODEL.npz is built by `gnmreg model bootstrap`; the face units come from MakeHuman's head in the cache.
 """
 
 import argparse
@@ -22,9 +22,9 @@ from registration.model.regions import group
 from registration.report.pictures import PAPER
 from registration.types import Camera
 
-SMOOTHING = 2  # pictures are drawn this many times larger and shrunk
+SMOOTHING = 2  # images are rendered this many times larger and reduced
 QUALITY = 82
-COLOURS = {  # later ones win
+COLOURS = {  # later ones override
     "skin": (222, 190, 168),
     "upper_lip": (200, 132, 122),
     "lower_lip": (200, 132, 122),
@@ -37,7 +37,7 @@ COLOURS = {  # later ones win
     "irises": (96, 134, 160),
     "pupils": (20, 20, 22),
 }
-REGIONS = (  # of the texture map and of the template, in colours told apart
+REGIONS = (  # of the texture map and of the template, in distinct colours
     *("forehead", "left_brow", "middle_brow", "right_brow", "left_temple", "right_temple", "left_orbital"),
     *("right_orbital", "left_zygomatic", "right_zygomatic", "nose", "left_parotid", "right_parotid"),
     *("left_infraorbital", "right_infraorbital", "left_cheek", "right_cheek", "upper_lip", "lower_lip", "chin"),
@@ -54,11 +54,11 @@ Picture = UInt8[np.ndarray, "H W 3"]
 
 @dataclass(frozen=True, kw_only=True)
 class Shot:
-    """Where a picture is taken from: metres, the model's frame."""
+    """A camera position; metres, the model's frame."""
 
     target: tuple[float, float, float]
     direction: tuple[float, float, float]  # from the target to the camera
-    width: float  # what the picture shows at the target
+    width: float  # visible at the target
     size: tuple[int, int]  # px: width, height
     distance: float = 1.2
 
@@ -83,7 +83,7 @@ def draw(
     *,
     lines: bool = False,
 ) -> Picture:
-    """The mesh in soft light; back sides are darker and red. `lines` shows the quads."""
+    """Render the mesh in soft light; back sides are darker and red. `lines` shows the quads."""
     camera = shot.camera()
     vertices, triangles = vertices.astype(np.float64), triangles.astype(np.int64)
     face, weight = rasterize(vertices, triangles, camera)
@@ -108,20 +108,20 @@ def draw(
 
 
 def dots(picture: Picture, points: Float[np.ndarray, "L 3"], shot: Shot, *, numbered: bool = False) -> Picture:
-    """The picture with points on it, whatever lies before them."""
+    """Draw points on an image, also hidden ones."""
     camera = shot.camera()
-    places, _ = camera.project(points)
+    pixels, _ = camera.project(points)
     drawn = cv2.resize(picture, (camera.width_px, camera.height_px), interpolation=cv2.INTER_NEAREST)
-    for number, (x, y) in enumerate(np.round(places).astype(int).tolist()):
+    for number, (x, y) in enumerate(np.round(pixels).astype(int).tolist()):
         cv2.circle(drawn, (x, y), 2 * SMOOTHING, (190, 30, 60), -1, cv2.LINE_AA)
         if numbered:
-            text, place = str(number), (x + 3 * SMOOTHING, y - 2 * SMOOTHING)
-            cv2.putText(drawn, text, place, cv2.FONT_HERSHEY_SIMPLEX, 0.62, (20, 40, 120), 1, cv2.LINE_AA)
+            text, corner = str(number), (x + 3 * SMOOTHING, y - 2 * SMOOTHING)
+            cv2.putText(drawn, text, corner, cv2.FONT_HERSHEY_SIMPLEX, 0.62, (20, 40, 120), 1, cv2.LINE_AA)
     return cv2.resize(drawn, shot.size, interpolation=cv2.INTER_AREA)
 
 
 def captioned(picture: Picture, text: str) -> Picture:
-    """A picture with a line of text below it."""
+    """Add a line of text below an image."""
     strip = np.full((24, picture.shape[1], 3), 255, np.uint8)
     left = (picture.shape[1] - cv2.getTextSize(text, cv2.FONT_HERSHEY_SIMPLEX, 0.42, 1)[0][0]) // 2
     cv2.putText(strip, text, (left, 16), cv2.FONT_HERSHEY_SIMPLEX, 0.42, (60, 60, 60), 1, cv2.LINE_AA)
@@ -129,7 +129,7 @@ def captioned(picture: Picture, text: str) -> Picture:
 
 
 def colours_of(data: GNMData) -> Float[np.ndarray, "V 3"]:
-    """Each vertex in its part's colour, sRGB in [0, 255]."""
+    """Return the colour of each vertex' part, sRGB in [0, 255]."""
     colours = np.zeros((len(data.template_vertex_positions), 3))
     for name, colour in COLOURS.items():
         colours[group(data, name) > 0.5] = colour
@@ -137,11 +137,11 @@ def colours_of(data: GNMData) -> Float[np.ndarray, "V 3"]:
 
 
 def without_corneas(data: GNMData) -> Bool[np.ndarray, "F"]:
-    """All triangles but those of the eyes' clear fronts, through which the iris would be seen."""
+    """Return a mask of all triangles but those of the transparent corneas, which would hide the iris."""
     clear = np.zeros(len(data.template_vertex_positions), bool)
     for joint, side in ((2, "left_eye"), (3, "right_eye")):
-        away = data.template_vertex_positions - data.template_joint_positions[joint]
-        angle = np.arctan2(np.linalg.norm(away[:, :2], axis=1), away[:, 2])
+        offset = data.template_vertex_positions - data.template_joint_positions[joint]
+        angle = np.arctan2(np.linalg.norm(offset[:, :2], axis=1), offset[:, 2])
         outer = (group(data, side) > 0.5) & (group(data, "eye_exteriors") > 0.5)
         clear |= outer & (angle < np.arcsin(eyes.LIMBUS_RADIUS / eyes.SCLERA_RADIUS) + 0.05)
     return ~clear[data.triangles].any(1)
@@ -166,9 +166,9 @@ def mouth(data: GNMData, faces: Int[np.ndarray, "F 3"], opened: Float[np.ndarray
         for d in views.values()
     ]
     left = (data.template_vertex_positions[:, 0] > -1e-5)[faces].all(1)
-    for title, places in (("cut, at rest", data.template_vertex_positions), ("cut, jaw open", vertices)):
+    for title, positions in (("cut, at rest", data.template_vertex_positions), ("cut, jaw open", vertices)):
         shot = Shot(target=(0, 0.232, 0.075), direction=(-1, 0, 0), width=0.15, size=(330, 330))
-        pictures.append(draw(places, faces[left], colours, shot))
+        pictures.append(draw(positions, faces[left], colours, shot))
         views[title] = SIDE
     return _row(pictures, list(views))
 
@@ -217,7 +217,7 @@ def landmarks(
     colours, rest = colours_of(data) * 0.45 + 130, data.template_vertex_positions.astype(np.float64)
     close = Shot(target=(0, 0.266, 0.06), direction=FRONT, width=0.175, size=(470, 500))
     pictures = [dots(draw(rest, faces, colours, close), schemes["68"].points(rest), close, numbered=True)]
-    # `dense` is all around the head: of two points that hide each other only the nearer is drawn.
+    # `dense` surrounds the head: only points that face the camera are drawn.
     for direction in (FRONT, SIDE):
         shot = Shot(target=HEAD, direction=direction, width=0.29, size=(400, 500))
         facing = schemes["dense"].points(_normals(rest, data.triangles)) @ np.array(direction) > 0.05
@@ -235,7 +235,7 @@ def _normals(vertices: Float[np.ndarray, "V 3"], triangles: Int[np.ndarray, "F 3
 
 
 def maps(data: GNMData) -> Picture:
-    """The texture maps of skin, left eye, upper teeth and tongue: quads, the skin's in its regions' colours."""
+    """Render the texture maps of skin (in the colours of its regions), left eye, upper teeth and tongue as quads."""
     hues = np.linspace(0, 179, len(REGIONS), endpoint=False)[np.argsort(np.arange(len(REGIONS)) * 7 % len(REGIONS))]
     region = [cv2.cvtColor(np.array([[[hue, 70, 235]]], np.uint8), cv2.COLOR_HSV2RGB)[0, 0] for hue in hues]
     colours = colours_of(data)
@@ -265,12 +265,12 @@ def _row(pictures: list[Picture], titles: list[str]) -> Picture:
 
 
 def units(data: GNMData) -> dict[str, Float[np.ndarray, "V 3"]]:
-    """MakeHuman's face units as near as the model's expression basis comes to them."""
+    """Project MakeHuman's face units onto the model's expression basis."""
     source = makehuman.read(makehuman.fetch())
-    made = assembly.make(source, population.mean_person())
+    head = assembly.make(source, population.mean_person())
     basis, _ = np.linalg.qr(data.expression_basis.reshape(len(data.expression_basis), -1).T.astype(np.float64))
-    wanted = {name: made.expression(source.target(f"faceunits/{name}")) for name in UNITS}
-    return {name: (basis @ (basis.T @ unit.ravel())).reshape(unit.shape) for name, unit in wanted.items()}
+    displacements = {name: head.expression(source.target(f"faceunits/{name}")) for name in UNITS}
+    return {name: (basis @ (basis.T @ unit.ravel())).reshape(unit.shape) for name, unit in displacements.items()}
 
 
 def main() -> None:

@@ -1,4 +1,7 @@
-"""Draws docs/registration.jpg from what `make demo` leaves: `python docs/registration_picture.py CAPTURE REG`."""
+"""Renders docs/registration.jpg from the output of `make demo`.
+
+    python -m docs.pictures.registration CAPTURE REGISTRATION
+"""
 
 import argparse
 from pathlib import Path
@@ -18,7 +21,8 @@ from registration.report.pictures import PAPER, scale_colours
 from registration.storage.registration_folder import load_registration
 from registration.types import Registration, View
 
-HEIGHT_PX = 430  # of a panel; each is drawn twice as large
+HEIGHT_PX = 430  # of a panel; each is rendered twice as large
+OUT = Path(__file__).parents[1] / "registration.jpg"
 LIMIT_MM = 0.1
 CAPTIONS = ("capture (1 of {} views)", "registration", "mesh", "normals", "distance to the scan, 0 to 0.1 mm")
 LIGHT = np.array([-0.45, -0.65, -0.61])  # from the camera's upper left
@@ -26,8 +30,8 @@ Picture = Float[np.ndarray, "H W 3"]  # sRGB in [0, 255]
 
 
 def panels(view: View, registration: Registration, scan: Surface) -> list[Picture]:
-    """The photograph and four drawings of the registration from the same camera."""
-    photograph = cv2.imread(str(view.image))[..., ::-1].astype(float)
+    """Return the captured image and four renderings of the registration from the same camera."""
+    image = cv2.imread(str(view.image))[..., ::-1].astype(float)
     camera = view.camera.scaled(2 * view.camera.width_px, 2 * view.camera.height_px)
     vertices, triangles = registration.vertices.astype(np.float64), registration.triangles.astype(np.int64)
     face, weight = rasterize(vertices, triangles, camera)
@@ -46,14 +50,15 @@ def panels(view: View, registration: Registration, scan: Surface) -> list[Pictur
     distance = np.zeros(len(vertices))
     distance[used] = distances_mm(vertices[used], scan)
     heat = scale_colours((weight * distance[corners]).sum(1) / LIMIT_MM) * shading[:, None]
-    drawings = [255 * linear_to_srgb(_texels(registration.texture, uv)), mesh, 127.5 * (normal * (1, -1, -1) + 1), heat]
-    found = [photograph]
-    for values in drawings:
+    colour = 255 * linear_to_srgb(_texels(registration.texture, uv))
+    renderings = [colour, mesh, 127.5 * (normal * (1, -1, -1) + 1), heat]
+    results = [image]
+    for values in renderings:
         picture = np.empty((*shown.shape, 3))
         picture[:] = PAPER
         picture[shown] = values
-        found.append(cv2.resize(picture, photograph.shape[1::-1], interpolation=cv2.INTER_AREA))
-    return found
+        results.append(cv2.resize(picture, image.shape[1::-1], interpolation=cv2.INTER_AREA))
+    return results
 
 
 def _texels(texture: Float[np.ndarray, "R R 3"], uv: Float[np.ndarray, "P 2"]) -> Float[np.ndarray, "P 3"]:
@@ -63,7 +68,7 @@ def _texels(texture: Float[np.ndarray, "R R 3"], uv: Float[np.ndarray, "P 2"]) -
 
 
 def labelled(panel: Picture, text: str) -> np.ndarray:
-    """A panel at its final size, 8 bits, with its caption below."""
+    """Return a panel at its final size, 8 bits, with its caption below."""
     scale = HEIGHT_PX / panel.shape[0]
     small = cv2.resize(panel, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
     label = np.full((26, small.shape[1], 3), 255, np.uint8)
@@ -78,16 +83,15 @@ def main() -> None:
     parser.add_argument("capture", type=Path)
     parser.add_argument("registration", type=Path)
     parser.add_argument("--view", default="cam11")
-    given = parser.parse_args()
-    capture, registration = native.read(given.capture), load_registration(given.registration)
-    view = next(v for v in capture.views if v.name == given.view)
+    arguments = parser.parse_args()
+    capture, registration = native.read(arguments.capture), load_registration(arguments.registration)
+    view = next(v for v in capture.views if v.name == arguments.view)
     raw = read_scan(capture.scan)
     drawn = panels(view, registration, Surface(vertices=raw.vertices, triangles=raw.triangles))
     captions = [caption.format(len(capture.views)) for caption in CAPTIONS]
     picture = np.concatenate([labelled(panel, text) for panel, text in zip(drawn, captions, strict=True)], 1)
-    out = Path(__file__).with_name("registration.jpg")
-    cv2.imwrite(str(out), picture[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 88])
-    print(out)
+    cv2.imwrite(str(OUT), picture[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 88])
+    print(OUT)
 
 
 if __name__ == "__main__":
