@@ -151,11 +151,15 @@ def test_srgb_integers_are_written_as_they_are(tmp_path: Path) -> None:
 
 
 @needs_shared
-def test_shared_captures_read(tmp_path: Path) -> None:
+def test_shared_captures_read() -> None:
     folders = sorted(path.parent for path in (SHARED / "data" / "captures").glob("*/*/capture.toml"))
     assert folders
     for folder in folders:
         capture = native.read(folder)
+        if folder.parent.name == "real_two_view":  # photographs and a scan, nothing extracted from them
+            assert len(capture.views) == 2 and capture.scan and not capture.classes
+            assert not any(view.mask or view.normals or view.segmentation or view.landmarks for view in capture.views)
+            continue
         assert len(capture.views) in (7, 22) and len(capture.classes) == 9
         assert all(
             view.mask and view.normals and view.segmentation and "68" in view.landmarks for view in capture.views
