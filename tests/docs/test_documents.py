@@ -212,6 +212,21 @@ def test_glossary_is_alphabetic_and_says_each_term_once():
     assert terms == sorted(set(terms))
 
 
+def test_ten_minutes_lists_every_room():
+    """The list names each package with the folders directly inside it, no other."""
+    text = (ROOT / "docs" / "ten_minutes.md").read_text("utf-8")
+    (block,) = [block for _, block in FENCE.findall(text) if "registration    " in block]
+    listed, package = set(), ""
+    for line in block.splitlines():
+        name = line.split()[0]
+        package = package if line.startswith(" ") else name
+        listed.add(f"{package}/{name}" if line.startswith(" ") else name)
+    rooms = {path.rsplit("/", 1)[0] for path in tracked() if path.endswith("/__init__.py") and path.count("/") <= 2}
+    rooms = {room for room in rooms if room.split("/")[0] in ("registration", "coregister", "workflows")}
+    assert {name for name in listed if not name.endswith(".py")} == rooms
+    assert {name for name in listed if name.endswith(".py")} <= tracked()
+
+
 def sources() -> dict[str, str]:
     """Documents and Python files, with all white space and comment signs as one blank."""
     files = [ROOT / name for name in tracked() if name.startswith(PACKAGES) and name.endswith(".py")]
