@@ -38,9 +38,11 @@ from registration.render.studio.shoot import Quality
 from workflows.engine.database import default_url
 from workflows.engine.process import migrate
 from workflows.farm.coregistration import coregister
-from workflows.records.coregistration import FIRST, planned
+from workflows.farm.plan import make_plan
+from workflows.records.coregistration import FIRST
 from workflows.records.held_out import read_held_out
-from workflows.steps import coregistration
+from workflows.steps.build import builder
+from workflows.steps.hold_out import PEOPLE
 from workflows.steps.synthesize import Population, synth_dataset
 
 COMPONENTS = (10, 20, 40)
@@ -117,7 +119,7 @@ def main() -> None:
     with shown() as progress:
         synth_dataset(options.out / "dataset", people, jobs=options.jobs, progress=progress)
         captured = time.perf_counter()
-        plan = planned(
+        plan = make_plan(
             options.out / "dataset",
             model_path=first,
             out=options.out / "rounds",
@@ -134,10 +136,10 @@ def main() -> None:
     if "stopped" in told:
         sys.exit(told["stopped"])
     print(f"captures {count} seconds {captured - begun:.0f}; rounds {time.perf_counter() - captured:.0f}")
-    people = read_held_out(options.out / "rounds" / "held_out" / coregistration.PEOPLE).subjects
+    people = read_held_out(options.out / "rounds" / "held_out" / PEOPLE).subjects
     models = {name: gnm_npz.read(Path(file)) for name, file in told["models"].items()}
     samples = own_samples(models[FIRST], options.training, options.seed)
-    models[CONTROL] = build(samples, models[FIRST], coregistration.builder()).data
+    models[CONTROL] = build(samples, models[FIRST], builder()).data
     figures = {}
     for measure, (distance_mm, part_of) in MEASURES.items():
         print(f"{measure:44}" + "".join(f"{k:>9} mm" for k in COMPONENTS))

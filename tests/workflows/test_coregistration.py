@@ -10,6 +10,7 @@ import pytest
 
 import workflows.farm.coregistration
 import workflows.pages.coregistration
+import workflows.steps.build
 import workflows.steps.evaluate
 import workflows.steps.register
 import workflows.steps.stabilize
@@ -26,11 +27,10 @@ from workflows.engine.serialization import JobFailed
 from workflows.farm.coregistration import begin
 from workflows.farm.flows import coregister
 from workflows.farm.local import Ended, LocalFarm
+from workflows.farm.plan import make_plan
 from workflows.pages import model
-from workflows.records.coregistration import planned
 from workflows.records.dataset import read_dataset, split
 from workflows.records.training_subjects import Registered
-from workflows.steps import coregistration
 
 TWICE = Rule(rounds=2, failures=1.0, early=False)
 
@@ -58,7 +58,7 @@ def dataset(capture: Path, tmp_path: Path) -> Path:
 
 def go(dataset: Path, out: Path, **options) -> dict:
     settings = dict(model_path=MODEL, rule=TWICE, components=(2,), samples=2)
-    plan = begin(planned(dataset, out=out, **{**settings, **options}))
+    plan = begin(make_plan(dataset, out=out, **{**settings, **options}))
     scope = Inline("run", really((dataset, MODEL.parent, out)), [])
     asyncio.run(coregister(scope, plan=str(plan)))
     return told(out)
@@ -111,7 +111,7 @@ def test_two_rounds_without_those_who_are_held_out(dataset, finds, tmp_path):
 @pytest.mark.parametrize("where", ["registering", "building", "evaluating"])
 def test_a_killed_loop_goes_on_without_computing_anything_twice(dataset, finds, tmp_path, monkeypatch, where):
     out, built = tmp_path / "out", []
-    real, evaluated = coregistration.build_model, coregistration.evaluate_models
+    real, evaluated = workflows.steps.build.build_model, workflows.steps.evaluate.evaluate_models
 
     def build(*arguments):
         built.append(1)
@@ -126,8 +126,8 @@ def test_a_killed_loop_goes_on_without_computing_anything_twice(dataset, finds, 
         return evaluated(*arguments, **options)
 
     stopped: list[int] = []
-    monkeypatch.setattr(coregistration, "build_model", build)
-    monkeypatch.setattr(coregistration, "evaluate_models", evaluate)
+    monkeypatch.setattr(workflows.steps.build, "build_model", build)
+    monkeypatch.setattr(workflows.steps.evaluate, "evaluate_models", evaluate)
     if where == "registering":
         finds.outcomes["p1/smile"] = KeyboardInterrupt()
     with pytest.raises(KeyboardInterrupt):
@@ -217,8 +217,10 @@ def test_expressions_reach_the_builder_in_the_neutrals_own_frame(dataset, finds,
     """Captures turn heads at will; the builder gets the displacement on the unposed neutral, and its confidence."""
     run, data = tmp_path / "run", gnm_npz.read(MODEL)
     for name in ("p0", "p1"):
-        coregistration.register_subject(subject_dir=str(dataset / name), model=str(MODEL), out=str(run / name))
-    still = coregistration.stabilize(run=str(run), names=["p0", "p1"], model=str(MODEL), out=str(run / "stabilized"))
+        workflows.steps.subject.collect_subject(subject_dir=str(dataset / name), model=str(MODEL), out=str(run / name))
+    still = workflows.steps.stabilize.stabilize_subjects(
+        run=str(run), names=["p0", "p1"], model=str(MODEL), out=str(run / "stabilized")
+    )
     subjects = list(Registered(run=run, names=["p0", "p1"], model=data, steady=Path(still["out"])))
     assert [subject.name for subject in subjects] == ["p0", "p1"]
     for seed, subject in enumerate(subjects):
@@ -320,7 +322,7 @@ def test_who_is_held_out(dataset, tmp_path):
 
 def test_the_command(dataset, finds, tmp_path, capsys, monkeypatch):
     """Processes have stand-ins too, which do the queue's one flow here; `make demo-batch` starts them."""
-    monkeypatch.setitem(planned.__kwdefaults__, "samples", 2)
+    monkeypatch.setitem(make_plan.__kwdefaults__, "samples", 2)
     out, roots = tmp_path / "out", (dataset, MODEL.parent, tmp_path / "out")
     arguments = ["coregister", str(dataset), "--model", str(MODEL), "--out", str(out), "--components", "2"]
     assert main([*arguments, "--folder", str(tmp_path)]) == 2

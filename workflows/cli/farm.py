@@ -44,8 +44,8 @@ def worker(
         queue: Which jobs to take: gpu (registrations), rebuild (models: much memory), or both.
     """
     os.environ["CUDA_VISIBLE_DEVICES"] = "" if gpu is None else str(gpu)  # before anything looks for a GPU
-    from workflows.engine.jobs import STEPS
     from workflows.engine.process import Process, known_queues, names, serve
+    from workflows.steps.table import STEPS
 
     serve(
         Process(
@@ -196,9 +196,10 @@ def coregister(
     from workflows.engine.process import migrate
     from workflows.farm.coregistration import coregister, put_coregistration
     from workflows.farm.local import gpus_here
-    from workflows.records.coregistration import PAGE, planned
+    from workflows.farm.plan import make_plan
+    from workflows.records.coregistration import PAGE
 
-    plan = planned(
+    plan = make_plan(
         dataset,
         model_path=model,
         out=out,
@@ -252,7 +253,7 @@ def logs(
         folder: The farm's folder, on the machine that ran it or shared.
         db: The queue's database, as for worker.
     """
-    from workflows.engine.jobs import check_id
+    from workflows.ids import check_id
 
     row = _row(folder, db, job)
     print(f"{row.id}: {row.state}" + (f" on {row.executor}" if row.executor else ""))

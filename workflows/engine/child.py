@@ -27,7 +27,8 @@ from typing import Any
 from pebble import ProcessExpired, ProcessPool
 
 from registration.errors import InputError
-from workflows.engine.jobs import MAX_BYTES, Unusable, redacted
+from workflows.engine.jobs import MAX_BYTES, PermanentStepError
+from workflows.ids import redact
 from workflows.processes import warm_pool
 
 Outcome = dict[str, Any]
@@ -137,11 +138,11 @@ def _call(dotted: str, arguments: dict[str, Any], log: str) -> Outcome:
         except InputError as error:
             print(error, flush=True)
             return _outcome("bad input", error.line)
-        except Unusable as error:
+        except PermanentStepError as error:
             print(error, flush=True)
             return _outcome("unusable", str(error))
         except BaseException as error:  # also SystemExit: nothing that a step does may look like success
-            print(redacted(traceback.format_exc()), flush=True)
+            print(redact(traceback.format_exc()), flush=True)
             first, *_ = str(error).splitlines() or [""]
             return _outcome("failed", f"{type(error).__name__}: {first}")
 
@@ -157,7 +158,7 @@ def _done(result: Any) -> Outcome:
 
 
 def _outcome(status: str, reason: str) -> Outcome:
-    return {"status": status, "reason": redacted(reason)[:2000]}
+    return {"status": status, "reason": redact(reason)[:2000]}
 
 
 def _how(exitcode: int) -> str:

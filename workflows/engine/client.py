@@ -11,8 +11,9 @@ from dbos import DBOSClient, EnqueueOptions
 
 from registration.errors import InputError
 from workflows.engine.database import BELOW, below, checked_url, engine, require_queue, table
-from workflows.engine.jobs import MAX_BYTES, FlowJob, Job, check_id
+from workflows.engine.jobs import MAX_BYTES, FlowJob, Job
 from workflows.engine.serialization import APPLICATION, VERSION, Json
+from workflows.ids import check_id
 
 CHUNK = 1000  # jobs that are put in with one transaction
 ACTIVE = ("ENQUEUED", "PENDING", "DELAYED")

@@ -19,10 +19,11 @@ from dbos import DBOS, DBOSConfig
 from registration.errors import InputError
 from workflows.engine.child import RETRIED, Outcome, Slot
 from workflows.engine.database import ENVIRONMENT, checked_url, prepare
-from workflows.engine.jobs import DRIVER, GPU, REBUILD, SUBJECTS, Step, check_id, checked, redacted, resolved_roots
+from workflows.engine.jobs import DRIVER, GPU, REBUILD, SUBJECTS, Step, checked
 from workflows.engine.liveness import Liveness, Patience
 from workflows.engine.scope import Scope
 from workflows.engine.serialization import APPLICATION, VERSION, JobFailed, Json
+from workflows.ids import check_id, redact, resolve_roots
 
 log = logging.getLogger("gnmreg")
 
@@ -114,7 +115,7 @@ def _config(url: str, name: str) -> DBOSConfig:
 
 def _registered(process: Process, url: str, slot: Slot | None) -> None:
     """Make the two kinds of workflows known: `job` runs one step, `flow` is a function that makes jobs and waits."""
-    roots = resolved_roots(process.roots)
+    roots = resolve_roots(process.roots)
 
     async def attempt(spec: Any, number: int) -> Outcome:
         assert slot is not None
@@ -155,9 +156,9 @@ class _Redacting(logging.Filter):
     def filter(self, record: logging.LogRecord) -> bool:
         if record.exc_info and isinstance(record.exc_info[1], JobFailed):  # told in the job's row and log
             return False
-        record.msg, record.args = redacted(record.getMessage()), None
+        record.msg, record.args = redact(record.getMessage()), None
         if record.exc_info:
-            record.exc_text = redacted(logging.Formatter().formatException(record.exc_info))
+            record.exc_text = redact(logging.Formatter().formatException(record.exc_info))
             record.exc_info = None
         return True
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from workflows.engine.database import BELOW, Ask, below, checked_url, reading, require_queue, table
-from workflows.engine.jobs import check_id
+from workflows.ids import check_id
 
 DAY_S = 24 * 3600.0
 WAITING, RUNNING, DONE, FAILED, CANCELLED = "waiting", "running", "done", "failed", "cancelled"

@@ -6,8 +6,10 @@ from pathlib import Path, PurePosixPath
 from typing import Any
 
 from registration.errors import InputError
-from workflows.engine.jobs import DRIVER, FlowJob, Job, check_id, redacted
+from workflows.engine.jobs import DRIVER, FlowJob, Job
+from workflows.ids import check_id, redact
 from workflows.records.remote import is_remote, local_path
+from workflows.steps import table
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -35,7 +37,7 @@ def batch_jobs(captures: Sequence[str], *, model: str, out: str, run: str | None
     jobs = tuple(
         Job(
             id=check_id(f"{name}/{key}"),
-            step="register stored",
+            step=table.REGISTER_STORED,
             arguments={"capture": place, "model": _absolute(model), "store": _absolute(out), "key": key, **settings},
         )
         for key, place in names.items()
@@ -90,4 +92,4 @@ def _absolute(place: str) -> str:
 
 
 def _wrong(what: str, *, where: object, expected: str, got: object) -> InputError:
-    return InputError(what, where=redacted(str(where)), expected=expected, got=got, fix="correct the command")
+    return InputError(what, where=redact(str(where)), expected=expected, got=got, fix="correct the command")

@@ -7,10 +7,11 @@ from typing import Any
 
 from registration.progress import Progress, Silent
 from workflows.engine.client import Queue
-from workflows.engine.jobs import DRIVER, FlowJob, check_id
+from workflows.engine.jobs import DRIVER, FlowJob
 from workflows.farm.local import LocalFarm, run_until_done
-from workflows.records.coregistration import FIRST, MANIFEST, Plan, State, save
-from workflows.steps.register import write_plan
+from workflows.ids import check_id
+from workflows.pages.coregistration import write_coregistration_page
+from workflows.records.coregistration import FIRST, MANIFEST, Plan, State, write_plan, write_state
 
 PLAN = "plan.json"  # in the output folder: what coordinators and workers read
 
@@ -39,7 +40,7 @@ def put_coregistration(url: str, plan: Plan, *, run: str | None = None, variant:
 def begin(plan: Plan) -> Path:
     """Write the record without rounds, and the plan, whose file is returned."""
     plan = replace(plan, dataset=plan.dataset.resolve(), model=plan.model.resolve(), out=plan.out.resolve())
-    save(State(plan=plan, models={FIRST: str(plan.model)}))
+    write_state(State(plan=plan, models={FIRST: str(plan.model)}), write_coregistration_page)
     write_plan(plan, plan.out / PLAN)
     return plan.out / PLAN
 

@@ -9,10 +9,11 @@ from typing import TYPE_CHECKING, Any
 from registration.errors import InputError
 from registration.progress import Progress
 from workflows.engine.child import function_of
-from workflows.engine.jobs import STEPS, checked
+from workflows.engine.jobs import checked
 from workflows.engine.reader import Row
 from workflows.records.remote import capture_here, fetch_folder, is_remote, local_path, model_here
 from workflows.steps.register import REGISTRATION
+from workflows.steps.table import STEPS
 
 if TYPE_CHECKING:
     from workflows.web.fit_page import FitPage

@@ -9,20 +9,12 @@ import json
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
-from workflows.engine.jobs import (
-    EXPRESSION_PRIORITY,
-    GPU,
-    NEUTRAL_PRIORITY,
-    REBUILD,
-    STABILIZE_PRIORITY,
-    FlowJob,
-    Job,
-)
+from workflows.engine.jobs import EXPRESSION_PRIORITY, GPU, NEUTRAL_PRIORITY, REBUILD, STABILIZE_PRIORITY, FlowJob, Job
+from workflows.records.coregistration import FIRST
+from workflows.steps import table
 
 if TYPE_CHECKING:
     from workflows.engine.scope import Scope
-
-FIRST = "model 0"
 
 
 async def batch(scope: "Scope") -> dict[str, int]:
@@ -52,7 +44,7 @@ async def subject(
         arguments = {"capture": f"{subject_dir}/{name}", "out": f"{out}/{name}", **place}
         arguments |= {"neutral": f"{out}/{neutral}"} if number else {"subject_dir": subject_dir}
         priority = NEUTRAL_PRIORITY if number == 0 else EXPRESSION_PRIORITY
-        return Job(id=f"{scope.id}/{kind}", step="register", arguments=arguments, priority=priority)
+        return Job(id=f"{scope.id}/{kind}", step=table.REGISTER, arguments=arguments, priority=priority)
 
     jobs = {name: job(number, name) for number, name in enumerate(captures)}
     done = await scope.do([jobs[neutral]])
@@ -64,7 +56,7 @@ async def subject(
         leave |= {name: f"the neutral failed: {leave[neutral]}" for name in others}
     arguments = {"subject_dir": subject_dir, "out": out, "leave": leave, **_without(place, "variant")}
     identity = _named(f"{scope.id}/collect", arguments)
-    await scope.do([Job(id=identity, step="collect", arguments=arguments, priority=STABILIZE_PRIORITY)])
+    await scope.do([Job(id=identity, step=table.COLLECT, arguments=arguments, priority=STABILIZE_PRIORITY)])
     return {"usable": len(done), "failed": len(captures) - len(done)}
 
 
@@ -81,11 +73,11 @@ async def coregister(scope: "Scope", *, plan: str, variant: str = "llvm") -> dic
         await _register(scope, name, told, told["split"]["training"], run, model, settings)
         steady = f"{run}/stabilized"
         names = told["split"]["training"]
-        still = await _one(scope, f"{name}/stab", "stabilize", run=run, names=names, model=model, out=steady)
+        still = await _one(scope, f"{name}/stab", table.STABILIZE, run=run, names=names, model=model, out=steady)
         built = await _one(
             scope,
             f"{name}/build",
-            "build",
+            table.BUILD,
             run=run,
             names=names,
             steady=still["out"],
@@ -98,7 +90,7 @@ async def coregister(scope: "Scope", *, plan: str, variant: str = "llvm") -> dic
         measured = await _one(
             scope,
             f"{name}/evaluate",
-            "evaluate",
+            table.EVALUATE,
             models=models,
             people=people["people"],
             out=f"{out}/{name}/evaluation",
@@ -107,7 +99,7 @@ async def coregister(scope: "Scope", *, plan: str, variant: str = "llvm") -> dic
             seed=told["seed"],
         )
         rounds.append({"name": name, "stabilize": still, "build": built, "evaluate": measured})
-        verdict = await _one(scope, f"{name}/decide", "end round", plan=plan, people=people, rounds=rounds)
+        verdict = await _one(scope, f"{name}/decide", table.END_ROUND, plan=plan, people=people, rounds=rounds)
         if not verdict["go_on"]:
             break
     return {"rounds": len(rounds), "model": model, "reason": verdict["reason"]}
@@ -121,7 +113,7 @@ async def _hold_out(scope: "Scope", told: Mapping[str, Any], settings: Mapping[s
     return await _one(
         scope,
         "hold_out",
-        "hold out",
+        table.HOLD_OUT,
         dataset=told["dataset"],
         names=told["split"]["held_out"],
         registrations=run,
@@ -163,7 +155,7 @@ async def _register(
 
 async def _one(scope: "Scope", part: str, step: str, **arguments: Any) -> dict[str, Any]:
     """One job's result; the run is parked if it fails."""
-    queue = GPU if step == "end round" else REBUILD
+    queue = GPU if step == table.END_ROUND else REBUILD
     identity = _named(f"{scope.id}/{part}", arguments)
     job = Job(id=identity, step=step, arguments=arguments, queue=queue, priority=STABILIZE_PRIORITY)
     done = await scope.do([job])

@@ -9,6 +9,7 @@ from urllib.parse import quote
 from registration.report.charts import Line, number_curves
 from registration.report.style import document
 from workflows.pages.model import table
+from workflows.records.coregistration import FIRST
 
 _CSS = "td, th { padding-right: 14px; } .panel + .panel { margin-top: 16px; }"
 
@@ -42,7 +43,7 @@ def _rounds(told: Mapping[str, Any]) -> str:
     head = "".join(f"<th>{name}</th>" for name in (*heads, ""))
     at = str(told["at"])
     rows = "".join(_row(number, one, told, at) for number, one in enumerate(told["rounds"], 1))
-    first = told["generalization_mm"].get("model 0", {}).get(at)
+    first = told["generalization_mm"].get(FIRST, {}).get(at)
     note = "" if first is None else f"<p>The first model: {first:.3f} mm with {at} components.</p>"
     return f'<section><h2>Rounds</h2>{note}<div class="panel"><table><tr>{head}</tr>{rows}</table></div></section>'
 

@@ -1,31 +1,22 @@
-"""A coregistration's plan, checked before anything is computed, and its record with the page.
-
-The loop itself, register all, stabilize, build the next model, evaluate it on people held out, decide, is a flow
-(`flows.coregister`); what is done in it is in `steps.py`.
-"""
+"""The record of a coregistration, `coregistration.json`, and its plan, `plan.json`, for coordinators and workers."""
 
 import json
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
-from functools import partial
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
-from coregister.evaluate.linear_fit import identity_part
 from coregister.stopping_rule import Rule
 from registration.errors import InputError
-from registration.fit.recipes import recipe_named
 from registration.model import gnm_npz
 from registration.storage.hashing import plain, versions
 from registration.storage.registration_folder import refuse_foreign, swap_in
-from workflows.pages.coregistration import write_coregistration_page
-from workflows.records.dataset import Split, read_dataset, split
-from workflows.steps import coregistration
+from workflows.records.dataset import Split, read_dataset
+from workflows.records.training_subjects import has_truths
 
 SCHEMA = 1
 KIND = "gnm-coregistration"
 MANIFEST, PAGE = "coregistration.json", "index.html"
-COMPONENTS = (5, 10, 20, 40)  # that models are measured with, unless others are asked for
 FIRST = "model 0"
 
 
@@ -60,83 +51,12 @@ class State:
     verdict: Mapping[str, Any] | None = None
 
 
-def planned(
-    dataset: Path,
-    *,
-    model_path: Path,
-    out: Path,
-    recipe: str = "draft",
-    held_out: float | Path | None = None,
-    seed: int = 0,
-    views: int | None = None,
-    components: Sequence[int] | None = None,
-    samples: int = 200,
-    rule: Rule | None = None,
-) -> Plan:
-    """The plan of rounds over a dataset until the rule says enough, all in the folder `out` (docs/coregistration.md).
-
-    Args:
-        dataset: a folder of subject folders, each of capture folders.
-        model_path: the first model, with its landmark schemes beside it.
-        held_out: as for `dataset.split`.
-        components: numbers that models are measured with, the largest decides; None: COMPONENTS, as far as models go.
-        samples: random heads of each model, for specificity; 0: none.
-
-    Raises:
-        InputError: `read_dataset`, `split` or `check_out` refuses; no such recipe or model; more components than there
-            can be. Nothing is computed or written.
-    """
-    recipe_named(recipe)
-    found = read_dataset(dataset)
-    plan = Plan(
-        dataset=Path(dataset),
-        model=Path(model_path),
-        out=Path(out),
-        recipe=recipe,
-        views=views,
-        seed=seed,
-        components=tuple(components or COMPONENTS),
-        samples=samples,
-        rule=rule or Rule(),
-        split=split(found, held_out, seed),
-    )
-    _check(plan, asked=components is not None)
-    check_out(plan.out)
-    return plan
-
-
-def decided(state: State, measured: Mapping[str, Any]) -> State:
-    """The state with the figures of all models, measured alike, and the verdict."""
-    at, figures = str(measured["at"]), measured["generalization_mm"]
-    rounds = []
-    for number, one in enumerate(state.rounds, 1):
-        failed = sum(not row["usable"] for rows in one["register"].values() for row in rows.values())
-        rounds.append(
-            {
-                "generalization_mm": figures[f"model {number}"][at],
-                "drift_mm": one["build"]["drift_mm"],
-                "registered": one["build"]["registered"],
-                "failed": failed + len(one["build"]["rejected"]),
-            }
-        )
-    verdict = coregistration.decide(first_mm=figures[FIRST][at], rounds=rounds, rule=vars(state.plan.rule))
-    done = [{**one, "decide": figure} for one, figure in zip(state.rounds, rounds, strict=True)]
-    return replace(
-        state,
-        rounds=tuple(done),
-        generalization_mm=figures,
-        specificity_mm=measured["specificity_mm"],
-        at=measured["at"],
-        verdict=verdict,
-    )
-
-
-def save(state: State) -> None:
-    """Write `coregistration.json` and `index.html`, each in one rename."""
+def write_state(state: State, page: Callable[[Mapping[str, Any]], str]) -> None:
+    """Write `coregistration.json` and `index.html`, which `page` makes from its entries, each in one rename."""
     told = plain({"kind": KIND, "schema": SCHEMA, **vars(state), "versions": versions()})
     state.plan.out.mkdir(parents=True, exist_ok=True)
     swap_in(state.plan.out / MANIFEST, json.dumps(told, indent=1, allow_nan=False) + "\n")
-    swap_in(state.plan.out / PAGE, write_coregistration_page(told))
+    swap_in(state.plan.out / PAGE, page(told))
 
 
 def check_out(out: Path) -> None:
@@ -144,24 +64,27 @@ def check_out(out: Path) -> None:
     refuse_foreign(out, kind=KIND, command="coregister", manifest=MANIFEST)
 
 
-def _check(plan: Plan, asked: bool) -> None:
-    """Everything that a later step would refuse and that is known now."""
-    refuse: Callable[..., InputError] = partial(InputError, fix="change it")
-    if plan.rule.rounds < 1:
-        raise refuse("There is no round to go", where="iterations", expected="from 1", got=plan.rule.rounds)
-    if list(plan.components) != sorted(set(plan.components)) or plan.components[0] < 1:
-        expected = "whole numbers from 1, each larger than the one before"
-        raise refuse(
-            "The numbers of components are out of order", where="components", expected=expected, got=plan.components
-        )
-    have = len(identity_part(gnm_npz.read(plan.model)).basis)
-    kept = have if coregistration.builder().identity.previous != 0 else 0
-    most = min(have, len(plan.split.training) - 1 + kept)
-    if asked and plan.components[-1] > most:
+def write_plan(plan: Plan, file: Path) -> None:
+    """All that the flow of a coregistration has to know, for coordinators and workers to read."""
+    found, data = read_dataset(plan.dataset), gnm_npz.read(plan.model)
+    names = (*plan.split.training, *plan.split.held_out)
+    bare = [name for name in plan.split.held_out if not has_truths(found.subjects[name], data)]
+    captures = {name: [one.root.name for one in found.subjects[name].captures] for name in names}
+    told = {**asdict(plan), "captures": captures, "bare": bare}  # of each subject the neutral first
+    file.parent.mkdir(parents=True, exist_ok=True)
+    swap_in(file, json.dumps(plain(told), indent=1, allow_nan=False) + "\n")
+
+
+def read_plan(file: Path) -> dict[str, Any]:
+    """What `write_plan` wrote. Raises InputError if it cannot be read."""
+    try:
+        told: dict[str, Any] = json.loads(file.read_text("utf-8"))
+    except (OSError, ValueError) as error:
         raise InputError(
-            "There are too few subjects for so many components",
-            where="components",
-            expected=f"at most {most}: {len(plan.split.training)} subjects to build from, {have} in the first model",
-            got=plan.components[-1],
-            fix="ask for fewer components, or add subjects",
-        )
+            "The plan of a coregistration cannot be read",
+            where=file,
+            expected="the file that `gnmreg coregister` wrote",
+            got=error,
+            fix="run `gnmreg coregister` again",
+        ) from None
+    return told

@@ -19,8 +19,8 @@ from registration.stabilize import stabilized_folder as stabilized
 from registration.storage.hashing import content_of, hash_capture
 from registration.storage.registration_folder import load_registration
 from registration.types import Registration
+from workflows.records.run import STABILIZED
 from workflows.records.subject import MANIFEST, USABLE
-from workflows.steps.stabilize import OUT as STABILIZED
 
 TAG = "tag_"  # prefix of an NPZ file's tags
 _CATEGORY = "category"

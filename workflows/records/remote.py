@@ -13,7 +13,7 @@ from typing import Any
 import fsspec
 
 from registration.errors import InputError
-from workflows.engine.jobs import redacted
+from workflows.ids import redact
 
 CACHE = Path(os.environ.get("XDG_CACHE_HOME", "~/.cache")).expanduser() / "gnm-registration" / "fetched"
 MAX_BYTES = 64 * 2**30  # of one capture: far beyond any, and what a hostile listing must not make us fetch
@@ -102,5 +102,5 @@ def _is_scheme(path: str) -> bool:
 
 def _unusable(place: str, *, expected: Any, got: Any) -> InputError:
     return InputError(
-        "The input cannot be fetched", where=redacted(place), expected=expected, got=got, fix="check the URL's files"
+        "The input cannot be fetched", where=redact(place), expected=expected, got=got, fix="check the URL's files"
     )

@@ -1,10 +1,8 @@
-"""What `gnmreg stabilize` is given: subject folders as `gnmreg subject` writes them, and a log of decisions."""
+"""The input of `gnmreg stabilize`: subject folders as `gnmreg subject` writes them."""
 
 import json
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass
-from datetime import UTC, datetime
-from getpass import getuser
 from pathlib import Path
 from typing import Any
 
@@ -15,10 +13,11 @@ from registration.errors import InputError
 from registration.model import gnm_npz
 from registration.model.fetch import cache_folder, cached_path
 from registration.model.gnm_npz import GNMData
-from registration.stabilize.decisions import ACTIONS, Decision
 from registration.stabilize.subject_meshes import SkullSkin, SubjectMeshes, subject_meshes
-from registration.storage.registration_folder import load_registration, manifest_of_kind, read_manifest, swap_in
+from registration.storage.registration_folder import load_registration, manifest_of_kind, read_manifest
 from workflows.records.subject import KIND, MANIFEST, USABLE
+
+STABILIZED = "stabilized"  # the folder of the stabilized set within a run
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -163,60 +162,3 @@ def _check_arrays(folder: Path, topology: str, data: GNMData) -> None:
 def _bad(what: str, where: object, expected: object, got: object) -> InputError:
     fix = "register again with `gnmreg subject`, or leave out what failed with --skip-failed"
     return InputError(what, where=where, expected=expected, got=got, fix=fix)
-
-
-def read_decisions(file: Path, dataset: str) -> list[Decision]:
-    """A log's decisions, in order; those of one component may be several, the last one counts.
-
-    Raises InputError for a file that is no log, and for decisions about another dataset.
-    """
-    try:
-        entries = [json.loads(line) for line in Path(file).read_text("utf-8").splitlines() if line.strip()]
-        if unknown := [e["action"] for e in entries if e["action"] not in ACTIONS]:
-            raise ValueError(f"the action {unknown[0]!r}")
-        decisions = [
-            Decision(
-                region=str(e["region"]), component=int(e["component"]), action=e["action"], reason=str(e["reason"])
-            )
-            for e in entries
-        ]
-        datasets = {str(e["dataset"]) for e in entries}
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise InputError(
-            "The decisions cannot be read",
-            where=file,
-            expected="a log as `gnmreg stabilize review` writes it",
-            got=f"{type(error).__name__}: {error}",
-            fix="check the path, or review again",
-        ) from error
-    if datasets - {dataset}:
-        raise InputError(
-            "The decisions are about another dataset",
-            where=file,
-            expected=f"dataset {dataset[:16]}",
-            got=", ".join(sorted(other[:16] for other in datasets - {dataset})),
-            fix="review this dataset: components differ wherever registrations, model or settings do",
-        )
-    return decisions
-
-
-def append_decisions(file: Path, dataset: str, decisions: Sequence[Decision]) -> None:
-    """Add dated decisions to the log, which appears whole or not at all; what is in it stays."""
-    file = Path(file)
-    former = file.read_text("utf-8") if file.is_file() else ""
-    if former:
-        read_decisions(file, dataset)
-    head = {"time": datetime.now(UTC).isoformat(timespec="seconds"), "by": _user(), "dataset": dataset}
-    lines = [
-        json.dumps({**head, "region": d.region, "component": d.component, "action": d.action, "reason": d.reason})
-        for d in decisions
-    ]
-    file.parent.mkdir(parents=True, exist_ok=True)
-    swap_in(file, former + "".join(f"{line}\n" for line in lines))
-
-
-def _user() -> str:
-    try:
-        return getuser()
-    except (OSError, KeyError):  # a container's user without a name
-        return "unknown"

@@ -24,7 +24,7 @@ import fsspec
 
 from registration.errors import InputError
 from registration.storage.registration_folder import swap_in
-from workflows.engine.jobs import check_id, redacted
+from workflows.ids import check_id, redact
 
 SCHEMA = 1
 KIND = "gnm-artifact"
@@ -75,9 +75,9 @@ class Store:
         except (ValueError, ImportError) as error:
             raise InputError(
                 "The store cannot be used",
-                where=redacted(self.url),
+                where=redact(self.url),
                 expected="a folder or an s3:// URL",
-                got=redacted(str(error)),
+                got=redact(str(error)),
                 fix="correct the URL; for s3:// install the extra: pip install 'gnm-registration[s3]'",
             ) from None
         self._root = root.rstrip("/")
@@ -94,7 +94,7 @@ class Store:
             content = self._fs.cat_file(path)
         except FileNotFoundError:
             return None
-        return _parsed(content, where=f"{redacted(self.url)}/{key}/{MANIFEST}", key=key)
+        return _parsed(content, where=f"{redact(self.url)}/{key}/{MANIFEST}", key=key)
 
     def produce(self, key: str, *, wanted: str, make: Callable[[Path], Mapping[str, Any]]) -> Artifact:
         """The artifact of `key` made from the input that hashes to `wanted`: the published one, or a fresh one.
@@ -128,7 +128,7 @@ class Store:
         """
         artifact = self.find(key)
         if artifact is None:
-            raise _unusable(f"{redacted(self.url)}/{key}", expected="a published artifact", got="none")
+            raise _unusable(f"{redact(self.url)}/{key}", expected="a published artifact", got="none")
         for name, told in artifact.files.items():
             target = to / name
             target.parent.mkdir(parents=True, exist_ok=True)
@@ -144,7 +144,7 @@ class Store:
         """A published file, opened for reading bytes."""
         artifact = self.find(key)
         if artifact is None or name not in artifact.files:
-            raise _unusable(f"{redacted(self.url)}/{key}/{name}", expected="a published file", got="none")
+            raise _unusable(f"{redact(self.url)}/{key}/{name}", expected="a published file", got="none")
         return self._fs.open(self._path(key, artifact.attempt, name), "rb")
 
     def keys(self, below: str = "") -> Iterator[str]:
@@ -300,7 +300,7 @@ def _text(artifact: Artifact) -> str:
         "about": dict(artifact.about),
         "version": version("gnm-registration"),
     }
-    return redacted(json.dumps(value, indent=1, allow_nan=False)) + "\n"
+    return redact(json.dumps(value, indent=1, allow_nan=False)) + "\n"
 
 
 def _parsed(content: bytes, *, where: str, key: str) -> Artifact:

@@ -1,4 +1,4 @@
-"""`gnmreg model evaluate`: models and held-out subjects in, a folder with figures and a page out."""
+"""`gnmreg model evaluate`, also as a step: models and held-out subjects in, a folder with figures and a page out."""
 
 import json
 from collections.abc import Mapping, Sequence
@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from coregister.evaluate.evaluation import Evaluation, Settings, check, evaluate
+from coregister.evaluate.linear_fit import identity_part
 from registration.errors import InputError
 from registration.model import gnm_npz
 from registration.model.gnm_npz import GNMData
@@ -16,6 +17,7 @@ from registration.storage.hashing import input_hash, plain, versions
 from registration.storage.registration_folder import fresh_folder, manifest_of_kind, refuse_foreign
 from workflows.pages.evaluation import write_evaluate_page
 from workflows.records.held_out import read_held_out
+from workflows.steps.products import JsonRecord
 
 SCHEMA = 1
 KIND = "gnm-evaluation"
@@ -66,6 +68,37 @@ def evaluate_models(
     )
     _write(manifest, evaluation, models, Path(out))
     return manifest
+
+
+def evaluate_round(
+    *,
+    models: Mapping[str, str],
+    people: str,
+    out: str,
+    components: Sequence[int],
+    samples: int = 200,
+    seed: int = 0,
+    progress: Progress | None = None,
+) -> JsonRecord:
+    """Models by name, the first one first, and held-out people -> the folder of `gnmreg model evaluate`.
+
+    Figures are told with the numbers of `components` that all models have; "at" is the largest of them.
+    Raises InputError as `evaluate_models`.
+    """
+    have = min(len(identity_part(gnm_npz.read(Path(path))).basis) for path in models.values())
+    counts = tuple(k for k in components if k <= have) or (have,)
+    paths = {name: Path(path) for name, path in models.items()}
+    settings = Settings(components=counts, samples=samples, seed=seed)
+    manifest = evaluate_models(paths, held_out=Path(people), out=Path(out), settings=settings, progress=progress)
+    told: JsonRecord = {"out": out, "input_hash": manifest["input_hash"], "components": list(counts), "at": counts[-1]}
+    for figure, curve in (("generalization_mm", "identity"), ("specificity_mm", "specificity")):
+        curves = {name: one[curve] for name, one in manifest["figures"]["models"].items()}
+        told[figure] = {
+            name: dict(zip(map(str, one["components"]), (i["mean"] for i in one["intervals"]), strict=True))
+            for name, one in curves.items()
+            if one is not None
+        }
+    return told
 
 
 def lines(manifest: Mapping[str, Any]) -> list[str]:

@@ -1,4 +1,4 @@
-"""`gnmreg stabilize`: both stages over a run's registrations, subject after subject on disk."""
+"""`gnmreg stabilize`, also as a step: both stages over a run's registrations, one subject at a time on disk."""
 
 from collections.abc import Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass
@@ -25,9 +25,12 @@ from registration.stabilize.pipeline import (
 from registration.stabilize.stabilized_folder import StoredComponents
 from registration.storage.hashing import input_hash, plain, versions
 from workflows.pages.stabilization import write_stabilize_page
-from workflows.records.run import Run, read_decisions, read_run
+from workflows.records.decisions import read_decisions
+from workflows.records.run import STABILIZED, Run, read_run
+from workflows.records.subject import read_usable
+from workflows.steps.products import JsonRecord
 
-OUT, LOG = "stabilized", "decisions.jsonl"  # within the run
+LOG = "decisions.jsonl"  # within the run
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -62,7 +65,7 @@ def stabilize_run(
         InputError: as `read_run`, `read_decisions`, `check_out`; fewer than two expressions. Nothing is written then.
     """
     progress, settings = progress or Silent(), settings or Stabilization()
-    out = Path(run) / OUT if out is None else Path(out)
+    out = Path(run) / STABILIZED if out is None else Path(out)
     data = gnm_npz.read(model_path)
     head = Head.of(data)
     found = read_run(run, data, skip_failed=skip_failed, only=only)
@@ -95,6 +98,25 @@ def stabilize_run(
         page = write_stabilize_page(manifest, components, subjects, head)
         (fresh / disk.PAGE).write_text(page, encoding="utf-8")
     return Outcome(out=out, dataset=dataset, figures=figures)
+
+
+def stabilize_subjects(
+    *, run: str, names: Sequence[str], model: str, out: str, progress: Progress | None = None
+) -> JsonRecord:
+    """A run's registrations -> the stabilized set `out`; none (`"out": null`) where there is too little to stabilize.
+
+    Raises InputError as `stabilize_run`.
+    """
+    usable = {name: one for name in names if (one := read_usable(Path(run) / name)) is not None and one.expressions}
+    count = sum(len(one.expressions) for one in usable.values())
+    if count < LEAST_SAMPLES:
+        return {"out": None, "reason": f"{count} expressions of {len(names)} subjects"}
+    outcome = stabilize_run(
+        Path(run), model_path=Path(model), out=Path(out), skip_failed=True, only=tuple(usable), progress=progress
+    )
+    manifest = disk.read_manifest(outcome.out)
+    told = {name: manifest[name] for name in ("content_id", "input_hash")}
+    return {"out": out, **told, "figures": plain(outcome.figures)}
 
 
 def _write_subjects(

@@ -1,7 +1,7 @@
-"""The captures of a subject, one after the other: a plain loop over the library's public calls."""
+"""The captures of a subject, one after the other: a plain loop over the library's public calls; also as a step."""
 
 import traceback
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -14,14 +14,16 @@ from registration.errors import InputError
 from registration.evaluate.evaluation import evaluate
 from registration.fit.recipes import recipe_named
 from registration.model import gnm_npz
-from registration.model.landmarks import read_scheme
+from registration.model.landmarks import read_scheme, schemes_beside
 from registration.progress import Named, Progress, Silent
 from registration.register import register
 from registration.render.backend import Variant
-from registration.storage.registration_folder import update_figures
+from registration.storage import hashing
+from registration.storage.registration_folder import read_manifest, swap_in, update_figures
 from registration.types import Capture, Registration
 from workflows.pages.subject import thumbnail, write_subject_page
 from workflows.records.subject import MANIFEST, Captures, Row, Subject, check_subject_out, read_captures, save_subject
+from workflows.steps.products import STEP, JsonRecord, find_product, json_text
 
 HEADLINE = ("scan_to_mesh", "drift")  # of a manifest's figures, those of the face
 
@@ -79,6 +81,51 @@ def register_subject(
     return _loop(captures.captures, one, _Record(start, out), leave or {}, progress)
 
 
+def collect_subject(
+    *,
+    subject_dir: str,
+    model: str,
+    out: str,
+    recipe: str = "draft",
+    views: int | None = None,
+    seed: int = 0,
+    leave: Mapping[str, str] | None = None,
+    progress: Progress | None = None,
+) -> JsonRecord:
+    """A subject's captures -> the folder that `gnmreg subject` writes. What ended in an error is tried anew each time,
+    but for the captures of `leave`, which tells why.
+
+    Raises InputError as `register_subject`.
+    """
+    captures = read_captures(Path(subject_dir))
+    data = gnm_npz.read(Path(model))
+    schemes = schemes_beside(Path(model), len(data.template_vertex_positions))
+    inputs = {f"capture {capture.root.name}": hashing.hash_capture(capture) for capture in captures.captures}
+    inputs |= {f"capture {name}": error.line for name, error in captures.broken.items()}
+    inputs |= {f"landmarks {name}": hashing.content_of(one.indices, one.weights) for name, one in schemes.items()}
+    inputs |= {"subject": captures.subject, "model": gnm_npz.content_hash(data)}
+    wanted = hashing.input_hash(inputs, {"recipe": hashing.plain(recipe_named(recipe)), "views": views, "seed": seed})
+    place = Path(out)
+    if (known := find_product(place, wanted)) is not None and _contents(place, known["contents"]) == known["contents"]:
+        return {**known, "out": out}
+    found = register_subject(
+        Path(subject_dir),
+        model_path=Path(model),
+        out=place,
+        recipe=recipe,
+        views=views,
+        seed=seed,
+        leave=leave,
+        progress=progress,
+    )
+    rows = {row.name: {"status": row.status, "reason": row.reason, "usable": row.usable} for row in found.rows}
+    contents = _contents(place, [row.name for row in found.rows if row.folder])
+    told = {"out": out, "rows": rows, "contents": contents, "seconds": sum(row.seconds or 0 for row in found.rows)}
+    if all(row.folder or row.status == "skipped" for row in found.rows):
+        swap_in(place / STEP, json_text({"input_hash": wanted, **told}))
+    return {"input_hash": wanted, **told}
+
+
 def begin_subject(subject_dir: Path, *, model_path: Path, out: Path, recipe: str) -> None:
     """Write the record of a subject of which nothing is registered yet, so that registrations may be put beside it.
 
@@ -109,6 +156,17 @@ def _begun(
         rows=_waiting(captures),
     )
     return captures, start
+
+
+def _contents(place: Path, names: Sequence[str] | Mapping[str, str]) -> dict[str, str]:
+    """Content ids of the registrations of these names that are there."""
+    found = {}
+    for name in names:
+        try:
+            found[name] = str(read_manifest(place / name)["content_id"])
+        except InputError:
+            continue
+    return found
 
 
 class _Record:

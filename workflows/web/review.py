@@ -15,7 +15,7 @@ from registration.report.pictures import scale_colours
 from registration.stabilize import stabilized_folder as disk
 from registration.stabilize.components import Components, Head
 from registration.stabilize.decisions import ACTIONS
-from workflows.records.run import read_decisions
+from workflows.records.decisions import read_decisions
 from workflows.steps.stabilize import LOG, stabilize_run
 from workflows.web import panels
 from workflows.web.glb import SWING, swinging_head

@@ -18,7 +18,7 @@ from registration.stabilize.decisions import (
     decided_actions,
 )
 from registration.stabilize.stabilized_folder import StoredComponents
-from workflows.records.run import append_decisions
+from workflows.records.decisions import append_decisions
 
 
 class Review:

@@ -6,13 +6,14 @@ from pathlib import Path
 import pytest
 
 from registration.errors import InputError
-from workflows.engine.jobs import MAX_BYTES, Step, check_id, check_place, checked, redacted, resolved_roots
+from workflows.engine.jobs import MAX_BYTES, Step, checked
+from workflows.ids import check_id, check_location, redact, resolve_roots
 
 STEPS = {"register": Step(function="m:f", places=("capture", "out"))}
 
 
 def test_a_job_within_the_roots_is_accepted(tmp_path: Path) -> None:
-    roots = resolved_roots((tmp_path, "s3://bucket/runs"))
+    roots = resolve_roots((tmp_path, "s3://bucket/runs"))
     for place in (str(tmp_path / "a"), f"file://{tmp_path}/a", "s3://bucket/runs/a", str(tmp_path)):
         arguments = {"capture": place, "seed": 3}
         step, got = checked({"step": "register", "arguments": arguments}, STEPS, roots)
@@ -66,14 +67,14 @@ def test_a_foreign_place_is_refused(tmp_path: Path, place: object) -> None:
     place = place.format(root=root) if isinstance(place, str) else place
     with pytest.raises(InputError) as refused:
         checked(
-            {"step": "register", "arguments": {"capture": place}}, STEPS, resolved_roots((root, "s3://bucket/runs"))
+            {"step": "register", "arguments": {"capture": place}}, STEPS, resolve_roots((root, "s3://bucket/runs"))
         )
     assert "secret" not in str(refused.value).replace("secrets", "")
 
 
 def test_without_roots_no_place_is_accepted(tmp_path: Path) -> None:
     with pytest.raises(InputError):
-        check_place(str(tmp_path), (), "capture")
+        check_location(str(tmp_path), (), "capture")
 
 
 @pytest.mark.parametrize(
@@ -92,5 +93,5 @@ def test_passwords_do_not_show() -> None:
     text = json.dumps(
         {"a": "postgresql+psycopg://me:pass@h/db", "b": "x postgresql://me:word@h/db?x=1", "c": "s3://b/k"}
     )
-    assert "word" not in redacted(text) and "pass" not in redacted(text)
-    assert "s3://b/k" in redacted(text)
+    assert "word" not in redact(text) and "pass" not in redact(text)
+    assert "s3://b/k" in redact(text)

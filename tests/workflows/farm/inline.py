@@ -7,9 +7,11 @@ from typing import Any
 
 from registration.errors import InputError
 from workflows.engine.child import function_of
-from workflows.engine.jobs import STEPS, FlowJob, Job, Unusable, check_id, checked, resolved_roots
+from workflows.engine.jobs import FlowJob, Job, PermanentStepError, checked
 from workflows.engine.serialization import JobFailed
 from workflows.farm.flows import FLOWS
+from workflows.ids import check_id, resolve_roots
+from workflows.steps.table import STEPS
 
 
 class Inline:
@@ -48,12 +50,12 @@ def really(roots: Sequence[Path]) -> Callable[[Job], Any]:
     """Jobs as workers do them, with all that goes through a queue as JSON: for `Inline`."""
 
     def step(job: Job) -> Any:
-        taken, arguments = checked(json.loads(json.dumps(job.spec())), STEPS, resolved_roots(roots))
+        taken, arguments = checked(json.loads(json.dumps(job.spec())), STEPS, resolve_roots(roots))
         try:
             return json.loads(json.dumps(function_of(taken.function)(**arguments)))
         except InputError as error:
             raise JobFailed({"status": "bad input", "reason": error.line}) from None
-        except Unusable as error:
+        except PermanentStepError as error:
             raise JobFailed({"status": "unusable", "reason": str(error)}) from None
         except Exception as error:
             raise JobFailed({"status": "failed", "reason": f"{type(error).__name__}: {error}"}) from None

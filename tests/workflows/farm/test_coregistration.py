@@ -14,13 +14,13 @@ from workflows.engine.process import migrate
 from workflows.engine.reader import Reader
 from workflows.farm.coregistration import PLAN, put_coregistration
 from workflows.farm.local import LocalFarm, run_until_done
-from workflows.records.coregistration import planned
+from workflows.farm.plan import make_plan
 
 
 def test_a_run_that_goes_on_stays_and_one_that_ended_is_forgotten(capture: Path, tmp_path: Path) -> None:
     dataset = write_people(capture, tmp_path / "dataset", 5)
     url, out = default_url(tmp_path), tmp_path / "june"
-    plan = planned(dataset, model_path=MODEL, out=out, components=(2,))
+    plan = make_plan(dataset, model_path=MODEL, out=out, components=(2,))
     with pytest.raises(InputError, match="There is no queue"):
         put_coregistration(url, plan)
     assert not out.exists()

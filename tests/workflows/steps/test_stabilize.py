@@ -16,7 +16,8 @@ from registration.stabilize.pipeline import stabilize
 from tests.coregister.conftest import anatomy, model, model_file, source, wheel  # noqa: F401  fixtures
 from tests.registration.stabilize import runs
 from workflows.cli.app import main
-from workflows.records.run import append_decisions, read_decisions, read_run
+from workflows.records.decisions import append_decisions, read_decisions
+from workflows.records.run import read_run
 from workflows.steps.stabilize import stabilize_run
 
 NAMES = ("smile", "jaw_open", "brows_up")

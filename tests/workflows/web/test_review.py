@@ -14,7 +14,8 @@ from registration.stabilize.pipeline import stabilize
 from tests.coregister.conftest import anatomy, model, model_file, source, wheel  # noqa: F401  fixtures
 from tests.registration.stabilize import runs
 from tests.workflows.browser import CHROMIUM, FLAGS, needs_browser
-from workflows.records.run import read_decisions, read_run
+from workflows.records.decisions import read_decisions
+from workflows.records.run import read_run
 from workflows.steps.stabilize import stabilize_run
 from workflows.web.glb import swinging_head
 from workflows.web.review import Page, review

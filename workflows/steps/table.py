@@ -1,0 +1,28 @@
+"""The steps that workers may be asked to run. Their names are stored in queues: a name stays, functions may move."""
+
+from collections.abc import Mapping
+
+from workflows.engine.jobs import Step
+
+REGISTER, REGISTER_STORED, COLLECT = "register", "register stored", "collect"
+HOLD_OUT, STABILIZE, BUILD, EVALUATE, END_ROUND = "hold out", "stabilize", "build", "evaluate", "end round"
+
+STEPS: Mapping[str, Step] = {
+    REGISTER_STORED: Step(
+        function="workflows.steps.register:register_stored", places=("capture", "model", "store")
+    ),
+    REGISTER: Step(
+        function="workflows.steps.register:register_capture",
+        places=("capture", "model", "out", "neutral", "subject_dir"),
+    ),
+    COLLECT: Step(function="workflows.steps.subject:collect_subject", places=("subject_dir", "model", "out")),
+    HOLD_OUT: Step(
+        function="workflows.steps.hold_out:hold_out", places=("dataset", "registrations", "model", "out")
+    ),
+    STABILIZE: Step(function="workflows.steps.stabilize:stabilize_subjects", places=("run", "model", "out")),
+    BUILD: Step(
+        function="workflows.steps.build:build_next_model", places=("run", "steady", "dataset", "previous", "out")
+    ),
+    EVALUATE: Step(function="workflows.steps.evaluate:evaluate_round", places=("models", "people", "out")),
+    END_ROUND: Step(function="workflows.steps.round:end_round", places=("plan",)),
+}
