@@ -33,7 +33,12 @@ from registration.report.inputs import ReportInputs, heat_map, report_views
 from registration.report.page import write_report
 from registration.report.stage_snapshots import write_stage
 from registration.storage import hashing
-from registration.storage.registration_folder import check_out, find_same, load_registration, save_registration
+from registration.storage.registration_folder import (
+    check_output_folder,
+    find_existing,
+    load_registration,
+    save_registration,
+)
 from registration.targets.classes import BACKGROUND, class_map
 from registration.targets.pyramid import build_pyramid
 from registration.types import Capture, Parameters, Registration, Status
@@ -100,7 +105,7 @@ def register(
         InputError: something cannot be used; nothing is computed or written.
     """
     progress = progress or Silent()
-    check_out(out)
+    check_output_folder(out)
     inputs = _read_inputs(
         Path(capture_path),
         Path(model_path),
@@ -111,7 +116,7 @@ def register(
         {"seed": seed, "deterministic": deterministic, "variant": variant},
     )
     digest = hashing.input_hash(inputs.digests, inputs.config)
-    if not force and (same := find_same(out, digest)) is not None:
+    if not force and (same := find_existing(out, digest)) is not None:
         progress.note(f"{out} already holds the registration of these inputs")
         return same
     device = backend.activate(variant, deterministic=deterministic)
@@ -151,10 +156,10 @@ def _read_inputs(
     landmarks = _landmarks(capture, schemes)
     _check_start(capture, landmarks)
     digests = {"capture": hashing.hash_capture(capture), "model": gnm_npz.content_hash(data)}
-    digests |= {f"landmarks {name}": hashing.content_of(s.indices, s.weights) for name, s in schemes.items()}
+    digests |= {f"landmarks {name}": hashing.hash_arrays(s.indices, s.weights) for name, s in schemes.items()}
     if neutral is not None:
-        digests["neutral"] = hashing.content_of(neutral.identity, neutral.offsets, neutral.vertices, neutral.texture)
-    config = {"recipe": hashing.plain(recipe), "views": [view.name for view in capture.views], **settings}
+        digests["neutral"] = hashing.hash_arrays(neutral.identity, neutral.offsets, neutral.vertices, neutral.texture)
+    config = {"recipe": hashing.to_jsonable(recipe), "views": [view.name for view in capture.views], **settings}
     return Inputs(
         capture=capture,
         data=data,

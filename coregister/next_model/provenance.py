@@ -46,7 +46,7 @@ def manifest(
     """JSON values; its entries are described in docs/formats.md."""
     found, head, aligned = origin.found, origin.head, origin.aligned
     inputs = {**found.digests, "previous": gnm_npz.content_hash(previous)}
-    settings = hashing.plain(config)
+    settings = hashing.to_jsonable(config)
     used = np.flatnonzero(origin.expression_weights > 0).tolist()
     labels = [origin.expression_labels[k] for k in used]
     counted = Counter(origin.expression_subjects[k] for k in used)
@@ -87,7 +87,7 @@ def manifest(
         "demographics": _demographics([found.tags[k] for k in aligned.kept]),
         "figures": _figures(head, previous, data),
     }
-    plain: dict[str, Any] = hashing.plain(told)
+    plain: dict[str, Any] = hashing.to_jsonable(told)
     return plain
 
 

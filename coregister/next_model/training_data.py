@@ -12,7 +12,7 @@ from registration.errors import InputError
 from registration.geometry.rigid import align
 from registration.model.gnm import GNM
 from registration.model.gnm_npz import GNMData, topology_hash
-from registration.storage.hashing import content_of
+from registration.storage.hashing import hash_arrays
 from registration.types import Parameters, Registration
 
 NEUTRAL = "neutral"  # the label of neutrals
@@ -120,7 +120,7 @@ def survey(
             if mesh is not subject.neutral and labels is not None and mesh.label not in labels:
                 expected = ", ".join(sorted(labels))
                 raise _wrong("A label is unknown", where, expected, mesh.label, "correct the label, or add it")
-            digests[where] = mesh.digest or content_of(mesh.vertices, mesh.confidence)
+            digests[where] = mesh.digest or hash_arrays(mesh.vertices, mesh.confidence)
         names.append(subject.name)
         neutrals.append(subject.neutral.vertices.astype(np.float32))
         sure.append(subject.neutral.confidence.astype(np.float32))

@@ -10,7 +10,7 @@ from registration.report.heat_map import UNMEASURED, heat_pictures, scale_limit_
 from registration.report.inputs import HeatMap, ReportInputs
 from registration.report.pictures import CLASS_COLOURS, SCALE, Picture, ViewPictures, data_uri, view_pictures
 from registration.report.style import document, sectioned
-from registration.storage.hashing import plain
+from registration.storage.hashing import to_jsonable
 from registration.types import Registration
 
 FIGURES = {
@@ -195,7 +195,7 @@ def _optimisation(registration: Registration) -> str:
 
 def _provenance(inputs: ReportInputs) -> str:
     registration = inputs.registration
-    config = escape(json.dumps(plain(registration.config), indent=2))
+    config = escape(json.dumps(to_jsonable(registration.config), indent=2))
     parts = []
     if registration.config:
         parts.append(f"<details class=panel><summary>Resolved configuration</summary><pre>{config}</pre></details>")

@@ -13,8 +13,8 @@ from jaxtyping import Float
 from registration.errors import InputError
 from registration.stabilize.components import Components
 from registration.stabilize.pipeline import StabilizedSubject
-from registration.storage.hashing import content_of, plain
-from registration.storage.registration_folder import fresh_folder, manifest_of_kind, refuse_foreign
+from registration.storage.files import atomic_directory, read_json_of_kind, refuse_foreign
+from registration.storage.hashing import hash_arrays, to_jsonable
 
 SCHEMA = 1
 KIND = "gnm-stabilized"
@@ -45,12 +45,12 @@ def check_out(out: Path) -> None:
 
 def is_stabilized(out: Path) -> bool:
     """Whether the folder holds a manifest that we wrote."""
-    return manifest_of_kind(out / MANIFEST, KIND) is not None
+    return read_json_of_kind(out / MANIFEST, KIND) is not None
 
 
 def read_manifest(out: Path) -> dict[str, Any]:
     """Raises InputError for a folder that is not ours, or of another schema version."""
-    manifest = manifest_of_kind(out / MANIFEST, KIND)
+    manifest = read_json_of_kind(out / MANIFEST, KIND)
     if manifest is None:
         raise _unreadable(out, expected=f'{MANIFEST} with "kind": "{KIND}"', got="none")
     if manifest.get("schema") != SCHEMA:
@@ -60,9 +60,9 @@ def read_manifest(out: Path) -> dict[str, Any]:
 
 @contextmanager
 def fresh_set(out: Path) -> Iterator[Path]:
-    """As `artifacts.fresh_folder`, for a stabilized set. Raises InputError as `check_out`."""
+    """As `artifacts.atomic_directory`, for a stabilized set. Raises InputError as `check_out`."""
     check_out(out)
-    with fresh_folder(out) as fresh:
+    with atomic_directory(out) as fresh:
         (fresh / SUBJECTS).mkdir()
         yield fresh
 
@@ -74,7 +74,7 @@ def write_subject(subject: StabilizedSubject, folder: Path, number: int) -> str:
         arrays[name] = arrays[name].astype(np.float32)
     texts = {name: np.array(getattr(subject, name)) for name in ("subject", "names", "labels")}
     np.savez(folder / SUBJECTS / f"{number:04d}.npz", allow_pickle=False, **arrays, **texts)
-    return content_of(*arrays.values())
+    return hash_arrays(*arrays.values())
 
 
 def read_subject(folder: Path, number: int) -> StabilizedSubject:
@@ -99,7 +99,7 @@ def write_components(stored: StoredComponents, folder: Path) -> str:
     texts = {name: np.array(getattr(stored, name)) for name in ("subjects", "names", "labels")}
     regions = np.array([part.region for part in stored.components])
     np.savez(folder / COMPONENTS, allow_pickle=False, regions=regions, **texts, **arrays)
-    return content_of(*arrays.values())
+    return hash_arrays(*arrays.values())
 
 
 def read_components(folder: Path) -> StoredComponents:
@@ -121,7 +121,7 @@ def read_components(folder: Path) -> StoredComponents:
 
 
 def write_manifest(manifest: Mapping[str, Any], folder: Path) -> None:
-    text = json.dumps(plain({"kind": KIND, "schema": SCHEMA, **manifest}), indent=1, allow_nan=False) + "\n"
+    text = json.dumps(to_jsonable({"kind": KIND, "schema": SCHEMA, **manifest}), indent=1, allow_nan=False) + "\n"
     (folder / MANIFEST).write_text(text, encoding="utf-8")
 
 

@@ -64,25 +64,25 @@ def content_id(arrays: Mapping[str, np.ndarray], texture: np.ndarray) -> str:
     return digest.hexdigest()
 
 
-def content_of(*arrays: np.ndarray) -> str:
+def hash_arrays(*arrays: np.ndarray) -> str:
     """sha256 over the types, shapes and values of some arrays, in order."""
     digest = hashlib.sha256()
     _feed(digest, list(arrays))
     return digest.hexdigest()
 
 
-def plain(value: Any) -> Any:
+def to_jsonable(value: Any) -> Any:
     """Any configuration as JSON values: dataclasses become objects with their type's name, non-finite numbers null."""
     if is_dataclass(value) and not isinstance(value, type):
-        return {"type": type(value).__name__, **{f.name: plain(getattr(value, f.name)) for f in fields(value)}}
+        return {"type": type(value).__name__, **{f.name: to_jsonable(getattr(value, f.name)) for f in fields(value)}}
     if isinstance(value, Mapping):
-        return {str(key): plain(item) for key, item in value.items()}
+        return {str(key): to_jsonable(item) for key, item in value.items()}
     if isinstance(value, (set, frozenset)):
-        return sorted((plain(item) for item in value), key=repr)
+        return sorted((to_jsonable(item) for item in value), key=repr)
     if isinstance(value, (list, tuple)):
-        return [plain(item) for item in value]
+        return [to_jsonable(item) for item in value]
     if hasattr(value, "tolist"):  # NumPy and torch arrays and scalars
-        return plain(value.tolist())
+        return to_jsonable(value.tolist())
     if isinstance(value, float):
         return value if math.isfinite(value) else None
     if value is None or isinstance(value, (bool, int, str)):
@@ -103,7 +103,7 @@ def _version(package: str) -> str:
 
 
 def _feed(digest: Any, value: Any) -> None:
-    digest.update(json.dumps(plain(_arrays_digested(value)), sort_keys=True).encode() + b"\n")
+    digest.update(json.dumps(to_jsonable(_arrays_digested(value)), sort_keys=True).encode() + b"\n")
 
 
 def _arrays_digested(value: Any) -> Any:

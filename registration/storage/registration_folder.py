@@ -3,15 +3,11 @@
 A folder appears, or is replaced, in one rename; its content id is a digest of its arrays, checked on reading.
 """
 
-import ctypes
 import json
 import math
 import os
-import secrets
-import shutil
 import zipfile
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +15,8 @@ import numpy as np
 
 from registration.errors import InputError
 from registration.frames import linear_to_srgb, srgb_to_linear
-from registration.storage.hashing import content_id, input_hash, plain, versions
+from registration.storage.files import atomic_directory, atomic_write_text, has_kind, write_json
+from registration.storage.hashing import content_id, input_hash, versions
 from registration.storage.mesh import write_obj, write_ply
 from registration.types import Registration
 
@@ -51,7 +48,7 @@ AXES = {
 LANDMARKS = "landmarks_"  # prefix of the arrays that hold one scheme's landmarks each
 
 
-def check_out(out: Path) -> None:
+def check_output_folder(out: Path) -> None:
     """Refuse, before any compute, an output folder that is not ours to replace.
 
     Raises:
@@ -74,7 +71,7 @@ def check_out(out: Path) -> None:
 
 def is_registration(path: Path) -> bool:
     """Whether the folder holds a manifest that we wrote, of any schema version."""
-    return manifest_of_kind(Path(path) / "manifest.json", KIND) is not None
+    return has_kind(Path(path) / "manifest.json", KIND)
 
 
 def save_registration(registration: Registration, out: Path, report_html: str | None = None) -> Path:
@@ -83,24 +80,24 @@ def save_registration(registration: Registration, out: Path, report_html: str | 
     Returns the folder. Arrays are stored as float32 (triangles int32), the texture as 16 bit sRGB.
 
     Raises:
-        InputError: as `check_out`.
+        InputError: as `check_output_folder`.
         ValueError: an array is not finite or not of the documented shape; a `failed` one may hold non-finite numbers.
     """
     out = Path(out).resolve()
-    check_out(out)
+    check_output_folder(out)
     arrays = _arrays(registration)
     if problem := _problem(arrays, finite=registration.status != "failed"):
         raise ValueError("{}: expected {}, got {}".format(*problem))
     texture = _encode_texture(registration.texture)
-    with fresh_folder(out) as fresh:
+    with atomic_directory(out) as fresh:
         np.savez(fresh / "registration.npz", allow_pickle=False, **arrays)
         _write_png(fresh / "texture.png", texture)
         write_ply(fresh / "mesh.ply", arrays["vertices"], arrays["triangles"])
         write_obj(fresh / "mesh.obj", arrays["vertices"], arrays["triangles"], arrays["corner_uvs"], "texture.png")
-        _write_json(fresh / "history.json", registration.history)
+        write_json(fresh / "history.json", registration.history)
         if report_html is not None:
             (fresh / "report.html").write_text(report_html, encoding="utf-8")
-        _write_json(fresh / "manifest.json", _manifest(registration, content_id(arrays, texture)))
+        write_json(fresh / "manifest.json", _manifest(registration, content_id(arrays, texture)))
     return out
 
 
@@ -138,7 +135,7 @@ def load_registration(path: Path) -> Registration:
     )
 
 
-def find_same(out: Path, wanted: str) -> Registration | None:
+def find_existing(out: Path, wanted: str) -> Registration | None:
     """What `out` already holds if it was made from the same inputs (`input_hash`) and is intact, else None.
 
     Its status may be any; the caller decides whether a failure is worth another try.
@@ -158,9 +155,9 @@ def update_figures(path: Path, figures: Mapping[str, Any], report_html: str | No
     path = Path(path)
     manifest = read_manifest(path)
     manifest["figures"] = {**manifest["figures"], **figures}
-    swap_in(path / "manifest.json", _json_text(manifest))
+    write_json(path / "manifest.json", manifest)
     if report_html is not None:
-        swap_in(path / "report.html", report_html)
+        atomic_write_text(path / "report.html", report_html)
 
 
 def read_manifest(path: Path) -> dict[str, Any]:
@@ -279,14 +276,6 @@ def _floats(values: list[float | None]) -> list[float]:
     return [math.nan if value is None else value for value in values]
 
 
-def _json_text(value: Any) -> str:
-    return json.dumps(plain(value), indent=1, allow_nan=False) + "\n"
-
-
-def _write_json(file: Path, value: Any) -> None:
-    file.write_text(_json_text(value), encoding="utf-8")
-
-
 def _read_json(file: Path) -> dict[str, Any]:
     try:
         value = json.loads(file.read_text(encoding="utf-8"))
@@ -295,78 +284,6 @@ def _read_json(file: Path) -> dict[str, Any]:
     if not isinstance(value, dict):
         raise _unreadable(file, expected="a JSON object", got=type(value).__name__)
     return value
-
-
-def swap_in(file: Path, text: str) -> None:
-    """Write a file in one rename: whoever reads sees the old or the new one."""
-    fresh = file.with_name(f".{file.name}.{secrets.token_hex(4)}.tmp")
-    try:
-        fresh.write_text(text, encoding="utf-8")
-        os.replace(fresh, file)
-    finally:
-        fresh.unlink(missing_ok=True)
-
-
-def manifest_of_kind(file: Path, kind: str) -> dict[str, Any] | None:
-    """The JSON object in a file, if there is one and it says that it is of this kind."""
-    try:
-        manifest = json.loads(file.read_text("utf-8"))
-    except (OSError, ValueError):
-        return None
-    return manifest if isinstance(manifest, dict) and manifest.get("kind") == kind else None
-
-
-def refuse_foreign(
-    out: Path, *, kind: str, command: str, manifest: str = "manifest.json", files: Sequence[str] | None = None
-) -> None:
-    """Refuse a folder that `gnmreg COMMAND` did not write, or that holds more than these files (None: any).
-
-    Raises InputError, for a file in its place too. A folder that is missing or empty will do.
-    """
-    if not out.exists():
-        return
-    names = sorted(path.name for path in out.iterdir()) if out.is_dir() else ["a file"]
-    foreign = [name for name in names if files is not None and name not in files]
-    if foreign or (names and manifest_of_kind(out / manifest, kind) is None):
-        raise InputError(
-            "The output folder cannot be used",
-            where=out,
-            expected=f"a new or empty folder, or one that `gnmreg {command}` wrote",
-            got=", ".join((foreign or names)[:3]),
-            fix="choose another output folder with --out",
-        )
-
-
-@contextmanager
-def fresh_folder(out: Path) -> Iterator[Path]:
-    """A folder beside `out` that takes its place in one rename, unless something goes wrong: then nothing is left."""
-    out = Path(out).resolve()
-    out.parent.mkdir(parents=True, exist_ok=True)
-    fresh = out.with_name(f".{out.name}.{secrets.token_hex(4)}.tmp")
-    fresh.mkdir()
-    try:
-        yield fresh
-        replace_folder(fresh, out)
-    finally:
-        shutil.rmtree(fresh, ignore_errors=True)
-
-
-def replace_folder(fresh: Path, out: Path) -> None:
-    """Move `fresh` to `out`; an existing folder there is exchanged in one step and ends up at `fresh`."""
-    if not out.exists() or not any(out.iterdir()):
-        os.replace(fresh, out)
-        return
-    try:
-        exchange = ctypes.CDLL(None, use_errno=True).renameat2  # Linux; a plain rename cannot replace a filled folder
-        here, swap = -100, 2  # AT_FDCWD, RENAME_EXCHANGE
-        done = exchange(here, os.fsencode(fresh), here, os.fsencode(out), swap) == 0
-    except (AttributeError, OSError):
-        done = False
-    if not done:
-        former = out.with_name(f".{out.name}.{secrets.token_hex(4)}.old")
-        os.replace(out, former)
-        os.replace(fresh, out)
-        shutil.rmtree(former, ignore_errors=True)
 
 
 def _listed(names: list[str]) -> str:

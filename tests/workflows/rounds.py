@@ -13,7 +13,7 @@ from registration.capture.scan import read_truth
 from registration.model import gnm_npz
 from registration.model.gnm_npz import GNMData
 from registration.storage.hashing import hash_capture, input_hash
-from registration.storage.registration_folder import find_same, save_registration
+from registration.storage.registration_folder import find_existing, save_registration
 from registration.types import Registration
 from tests.registration.capture import small
 from tests.registration.register import synthetic
@@ -74,7 +74,7 @@ class Finds:
         data, capture = gnm_npz.read(model_path), read(capture_path)
         inputs = {"capture": hash_capture(capture), "model": gnm_npz.content_hash(data)}
         config = {"recipe": recipe, "views": views, "seed": seed}
-        if (same := find_same(out, input_hash(inputs, config))) is not None:
+        if (same := find_existing(out, input_hash(inputs, config))) is not None:
             return same
         outcome = self.outcomes.get("/".join(capture_path.parts[-2:]))
         if isinstance(outcome, BaseException):

@@ -9,8 +9,8 @@ from typing import Any
 from coregister.stopping_rule import Rule
 from registration.errors import InputError
 from registration.model import gnm_npz
-from registration.storage.hashing import plain, versions
-from registration.storage.registration_folder import refuse_foreign, swap_in
+from registration.storage.files import atomic_write_text, refuse_foreign
+from registration.storage.hashing import to_jsonable, versions
 from workflows.records.dataset import Split, read_dataset
 from workflows.records.training_subjects import has_truths
 
@@ -53,10 +53,10 @@ class State:
 
 def write_state(state: State, page: Callable[[Mapping[str, Any]], str]) -> None:
     """Write `coregistration.json` and `index.html`, which `page` makes from its entries, each in one rename."""
-    told = plain({"kind": KIND, "schema": SCHEMA, **vars(state), "versions": versions()})
+    told = to_jsonable({"kind": KIND, "schema": SCHEMA, **vars(state), "versions": versions()})
     state.plan.out.mkdir(parents=True, exist_ok=True)
-    swap_in(state.plan.out / MANIFEST, json.dumps(told, indent=1, allow_nan=False) + "\n")
-    swap_in(state.plan.out / PAGE, page(told))
+    atomic_write_text(state.plan.out / MANIFEST, json.dumps(told, indent=1, allow_nan=False) + "\n")
+    atomic_write_text(state.plan.out / PAGE, page(told))
 
 
 def check_out(out: Path) -> None:
@@ -72,7 +72,7 @@ def write_plan(plan: Plan, file: Path) -> None:
     captures = {name: [one.root.name for one in found.subjects[name].captures] for name in names}
     told = {**asdict(plan), "captures": captures, "bare": bare}  # of each subject the neutral first
     file.parent.mkdir(parents=True, exist_ok=True)
-    swap_in(file, json.dumps(plain(told), indent=1, allow_nan=False) + "\n")
+    atomic_write_text(file, json.dumps(to_jsonable(told), indent=1, allow_nan=False) + "\n")
 
 
 def read_plan(file: Path) -> dict[str, Any]:

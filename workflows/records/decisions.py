@@ -8,7 +8,7 @@ from pathlib import Path
 
 from registration.errors import InputError
 from registration.stabilize.decisions import ACTIONS, Decision
-from registration.storage.registration_folder import swap_in
+from registration.storage.files import atomic_write_text
 
 
 def read_decisions(file: Path, dataset: str) -> list[Decision]:
@@ -58,7 +58,7 @@ def append_decisions(file: Path, dataset: str, decisions: Sequence[Decision]) ->
         for d in decisions
     ]
     file.parent.mkdir(parents=True, exist_ok=True)
-    swap_in(file, former + "".join(f"{line}\n" for line in lines))
+    atomic_write_text(file, former + "".join(f"{line}\n" for line in lines))
 
 
 def _user() -> str:

@@ -16,7 +16,7 @@ from registration.errors import InputError
 from registration.evaluate.evaluation import CLOUD_TOLERANCE
 from registration.evaluate.face import face_ball, seen
 from registration.stabilize import stabilized_folder as stabilized
-from registration.storage.hashing import content_of, hash_capture
+from registration.storage.hashing import hash_arrays, hash_capture
 from registration.storage.registration_folder import load_registration
 from registration.types import Registration
 from workflows.records.run import STABILIZED
@@ -47,7 +47,7 @@ def read_held_out(source: Path, captures: Path | None = None) -> HeldOutSet:
     source = Path(source)
     if not source.is_dir():
         found = _of_file(source)
-        return replace(found, inputs={"held_out": content_of(*_arrays(found.subjects))})
+        return replace(found, inputs={"held_out": hash_arrays(*_arrays(found.subjects))})
     files = sorted(source.glob(f"*/{MANIFEST}"), key=lambda file: natural_key(file.parent.name))
     if not files:
         raise _bad("There are no held-out subjects", source, f"folders with {MANIFEST}, or an NPZ file", "none")
@@ -66,7 +66,7 @@ def read_held_out(source: Path, captures: Path | None = None) -> HeldOutSet:
     if other := [s.subject for s, t in zip(subjects, topologies, strict=True) if not np.array_equal(t, topologies[0])]:
         got = f"another of {other[0]}"
         raise _bad("The held-out subjects have different topologies", source, "one topology", got)
-    inputs["held_out"] = content_of(*_arrays(subjects))
+    inputs["held_out"] = hash_arrays(*_arrays(subjects))
     return HeldOutSet(subjects=tuple(subjects), triangles=topologies[0], inputs=inputs)
 
 

@@ -14,7 +14,8 @@ from registration.model import gnm_npz
 from registration.model.fetch import cache_folder, cached_path
 from registration.model.gnm_npz import GNMData
 from registration.stabilize.subject_meshes import SkullSkin, SubjectMeshes, subject_meshes
-from registration.storage.registration_folder import load_registration, manifest_of_kind, read_manifest
+from registration.storage.files import read_json_of_kind
+from registration.storage.registration_folder import load_registration, read_manifest
 from workflows.records.subject import KIND, MANIFEST, USABLE
 
 STABILIZED = "stabilized"  # the folder of the stabilized set within a run
@@ -111,7 +112,7 @@ def _subject_folders(folder: Path) -> list[Path]:
 
 
 def _is_subject(folder: Path) -> bool:
-    return manifest_of_kind(folder / MANIFEST, KIND) is not None
+    return read_json_of_kind(folder / MANIFEST, KIND) is not None
 
 
 def _subject(folder: Path, skip_failed: bool) -> RunSubject:

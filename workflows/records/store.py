@@ -23,7 +23,7 @@ from typing import Any
 import fsspec
 
 from registration.errors import InputError
-from registration.storage.registration_folder import swap_in
+from registration.storage.files import atomic_write_text
 from workflows.ids import check_id, redact
 
 SCHEMA = 1
@@ -232,7 +232,7 @@ class Store:
         if self.local is None:
             self._fs.pipe_file(path, text.encode())
             return
-        swap_in(Path(path), text)
+        atomic_write_text(Path(path), text)
 
     def _complete(self, artifact: Artifact) -> bool:
         """Whether all files are there in their length; `verify` is for more."""

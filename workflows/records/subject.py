@@ -9,8 +9,9 @@ from typing import Any, Literal
 
 from registration.capture.native import natural_key, read
 from registration.errors import InputError
-from registration.storage.hashing import plain
-from registration.storage.registration_folder import check_out, manifest_of_kind, swap_in
+from registration.storage.files import atomic_write_text, read_json_of_kind
+from registration.storage.hashing import to_jsonable
+from registration.storage.registration_folder import check_output_folder
 from registration.types import Capture
 
 SCHEMA = 1
@@ -118,9 +119,9 @@ def check_subject_out(out: Path, captures: Captures) -> None:
         if owner != captures.subject:
             raise _refused(out, got=f"the folder of subject {owner!r}", fix="give every subject a folder of its own")
     else:
-        check_out(place)
+        check_output_folder(place)
     for name in captures.names:
-        check_out(place / name)
+        check_output_folder(place / name)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -152,9 +153,9 @@ def save_subject(subject: Subject, out: Path, page: str) -> None:
     head = {"kind": KIND, "schema": SCHEMA}
     rows = [{f.name: getattr(row, f.name) for f in fields(row)} for row in subject.rows]
     body = {f.name: getattr(subject, f.name) for f in fields(subject) if f.name != "rows"}
-    text = json.dumps(plain({**head, **body, "captures": rows}), indent=1, allow_nan=False) + "\n"
-    swap_in(out / MANIFEST, text)
-    swap_in(out / PAGE, page)
+    text = json.dumps(to_jsonable({**head, **body, "captures": rows}), indent=1, allow_nan=False) + "\n"
+    atomic_write_text(out / MANIFEST, text)
+    atomic_write_text(out / PAGE, page)
 
 
 def _capture_folders(folder: Path) -> list[Path]:
@@ -209,7 +210,7 @@ def _neutral(
 
 def _owner(out: Path) -> str | None:
     """The subject whose folder `out` is; None if it is not ours."""
-    manifest = manifest_of_kind(out / MANIFEST, KIND)
+    manifest = read_json_of_kind(out / MANIFEST, KIND)
     return None if manifest is None else str(manifest.get("subject"))
 
 

@@ -11,7 +11,7 @@ from registration.errors import InputError
 from registration.model import gnm_npz
 from registration.progress import Progress, Silent
 from registration.storage import hashing
-from registration.storage.registration_folder import fresh_folder
+from registration.storage.files import atomic_directory
 from workflows.pages.model import write_model_page
 from workflows.records.dataset import read_dataset
 from workflows.records.training_subjects import Registered
@@ -45,7 +45,7 @@ def build_next_model(
     subjects = Registered(run=Path(run), names=names, model=data, steady=place, tags=tags)
     settings = builder(found.categories)
     inputs = {**subjects.inputs, "previous": gnm_npz.content_hash(data)}
-    wanted = hashing.input_hash(inputs, {"settings": hashing.plain(settings), "tags": tags})
+    wanted = hashing.input_hash(inputs, {"settings": hashing.to_jsonable(settings), "tags": tags})
     known = find_product(Path(out), wanted)
     if known is not None and _is_model(Path(out) / MODEL, known["content_id"]):
         return {**known, "model": str(Path(out) / MODEL)}
@@ -60,7 +60,7 @@ def build_next_model(
         "components": built.manifest["identity"]["components"],
         "drift_mm": built.manifest["figures"]["drift_mm"],
     }
-    with fresh_folder(Path(out)) as fresh:
+    with atomic_directory(Path(out)) as fresh:
         provenance.write(built.data, built.manifest, built.coefficients, fresh / MODEL, Path(previous))
         (fresh / PAGE).write_text(write_model_page(built.data, built.manifest), encoding="utf-8")
         (fresh / STEP).write_text(json_text(told), encoding="utf-8")

@@ -13,8 +13,8 @@ from registration.errors import InputError
 from registration.model import gnm_npz
 from registration.model.gnm_npz import GNMData
 from registration.progress import Progress
-from registration.storage.hashing import input_hash, plain, versions
-from registration.storage.registration_folder import fresh_folder, manifest_of_kind, refuse_foreign
+from registration.storage.files import atomic_directory, read_json_of_kind, refuse_foreign
+from registration.storage.hashing import input_hash, to_jsonable, versions
 from workflows.pages.evaluation import write_evaluate_page
 from workflows.records.held_out import read_held_out
 from workflows.steps.products import JsonRecord
@@ -50,12 +50,12 @@ def evaluate_models(
     found = read_held_out(held_out, captures)
     check(models, found.subjects, found.triangles, settings)
     inputs = {**{f"model {name}": gnm_npz.content_hash(data) for name, data in models.items()}, **found.inputs}
-    wanted = input_hash(inputs, plain(settings))
-    known = None if force else manifest_of_kind(Path(out) / MANIFEST, KIND)
+    wanted = input_hash(inputs, to_jsonable(settings))
+    known = None if force else read_json_of_kind(Path(out) / MANIFEST, KIND)
     if known is not None and known.get("input_hash") == wanted and known.get("schema") == SCHEMA:
         return known
     evaluation = evaluate(models, found.subjects, found.triangles, settings, progress)
-    manifest: dict[str, Any] = plain(
+    manifest: dict[str, Any] = to_jsonable(
         {
             "kind": KIND,
             "schema": SCHEMA,
@@ -140,7 +140,7 @@ def _named(paths: Sequence[Path]) -> dict[str, Path]:
 
 def _write(manifest: Mapping[str, Any], evaluation: Evaluation, models: Mapping[str, GNMData], out: Path) -> None:
     """The folder appears, or is replaced, in one rename."""
-    with fresh_folder(out) as fresh:
+    with atomic_directory(out) as fresh:
         (fresh / MANIFEST).write_text(json.dumps(manifest, indent=1, allow_nan=False) + "\n", encoding="utf-8")
         distances = {name: one.vertex_mm.astype(np.float32) for name, one in evaluation.models.items()}
         np.savez(

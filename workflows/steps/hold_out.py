@@ -7,7 +7,8 @@ from registration.model import gnm_npz
 from registration.progress import Progress
 from registration.stabilize.subject_meshes import SkullSkin
 from registration.storage import hashing
-from registration.storage.registration_folder import read_manifest, swap_in
+from registration.storage.files import atomic_write_text
+from registration.storage.registration_folder import read_manifest
 from workflows.records.dataset import Dataset, read_dataset
 from workflows.records.subject import read_usable
 from workflows.records.training_subjects import (
@@ -50,7 +51,7 @@ def hold_out(
     write_held_out(people, data.triangles, place / PEOPLE)
     sources = {one.subject: "true meshes" if one.subject in true else "registrations" for one in people}
     told = {"input_hash": wanted, "people": str(place / PEOPLE), "sources": sources, "lost": lost}
-    swap_in(place / STEP, json_text(told))
+    atomic_write_text(place / STEP, json_text(told))
     return told
 
 

@@ -24,4 +24,4 @@ def find_product(folder: Path, input_hash: str) -> JsonRecord | None:
 
 def json_text(value: Any) -> str:
     """A record as the text of a JSON file."""
-    return json.dumps(hashing.plain(value), indent=1, allow_nan=False) + "\n"
+    return json.dumps(hashing.to_jsonable(value), indent=1, allow_nan=False) + "\n"

@@ -42,11 +42,11 @@ def register_stored(
     file = model_here(model)
     data = gnm_npz.read(file)
     schemes = schemes_beside(file, len(data.template_vertex_positions))
-    inputs = {f"landmarks {name}": hashing.content_of(one.indices, one.weights) for name, one in schemes.items()}
+    inputs = {f"landmarks {name}": hashing.hash_arrays(one.indices, one.weights) for name, one in schemes.items()}
     inputs["model"] = gnm_npz.content_hash(data)
     with capture_here(capture) as folder:
         inputs["capture"] = hashing.hash_capture(read(folder))
-        settings = {"recipe": hashing.plain(resolved), "views": views, "seed": seed, "variant": variant}
+        settings = {"recipe": hashing.to_jsonable(resolved), "views": views, "seed": seed, "variant": variant}
 
         def make(attempt: Path) -> dict[str, Any]:
             result = register(
@@ -60,7 +60,7 @@ def register_stored(
                 progress=progress,
             )
             scan = result.figures.get("scan_to_mesh", {}).get("face")
-            return hashing.plain({"status": result.status, "reason": result.reason, "scan_to_mesh_face": scan})
+            return hashing.to_jsonable({"status": result.status, "reason": result.reason, "scan_to_mesh_face": scan})
 
         made = Store(store).produce(key, wanted=hashing.input_hash(inputs, settings), make=make)
     if made.about.get("status") == "failed":

@@ -23,7 +23,7 @@ from registration.stabilize.pipeline import (
     regional_stage,
 )
 from registration.stabilize.stabilized_folder import StoredComponents
-from registration.storage.hashing import input_hash, plain, versions
+from registration.storage.hashing import input_hash, to_jsonable, versions
 from workflows.pages.stabilization import write_stabilize_page
 from workflows.records.decisions import read_decisions
 from workflows.records.run import STABILIZED, Run, read_run
@@ -71,9 +71,9 @@ def stabilize_run(
     found = read_run(run, data, skip_failed=skip_failed, only=only)
     disk.check_out(out)
     _check_count(found, run)
-    dataset = input_hash(found.inputs, plain(settings))
+    dataset = input_hash(found.inputs, to_jsonable(settings))
     decided = [] if decisions is None else read_decisions(decisions, dataset)
-    wanted = input_hash(found.inputs, {"settings": plain(settings), "decisions": plain(decided)})
+    wanted = input_hash(found.inputs, {"settings": to_jsonable(settings), "decisions": to_jsonable(decided)})
     if not force and disk.is_stabilized(out):
         manifest = disk.read_manifest(out)
         if manifest["input_hash"] == wanted or (whatever_decided and manifest["dataset"] == dataset):
@@ -116,7 +116,7 @@ def stabilize_subjects(
     )
     manifest = disk.read_manifest(outcome.out)
     told = {name: manifest[name] for name in ("content_id", "input_hash")}
-    return {"out": out, **told, "figures": plain(outcome.figures)}
+    return {"out": out, **told, "figures": to_jsonable(outcome.figures)}
 
 
 def _write_subjects(

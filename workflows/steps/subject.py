@@ -19,7 +19,8 @@ from registration.progress import Named, Progress, Silent
 from registration.register import register
 from registration.render.backend import Variant
 from registration.storage import hashing
-from registration.storage.registration_folder import read_manifest, swap_in, update_figures
+from registration.storage.files import atomic_write_text
+from registration.storage.registration_folder import read_manifest, update_figures
 from registration.types import Capture, Registration
 from workflows.pages.subject import thumbnail, write_subject_page
 from workflows.records.subject import MANIFEST, Captures, Row, Subject, check_subject_out, read_captures, save_subject
@@ -102,9 +103,11 @@ def collect_subject(
     schemes = schemes_beside(Path(model), len(data.template_vertex_positions))
     inputs = {f"capture {capture.root.name}": hashing.hash_capture(capture) for capture in captures.captures}
     inputs |= {f"capture {name}": error.line for name, error in captures.broken.items()}
-    inputs |= {f"landmarks {name}": hashing.content_of(one.indices, one.weights) for name, one in schemes.items()}
+    inputs |= {f"landmarks {name}": hashing.hash_arrays(one.indices, one.weights) for name, one in schemes.items()}
     inputs |= {"subject": captures.subject, "model": gnm_npz.content_hash(data)}
-    wanted = hashing.input_hash(inputs, {"recipe": hashing.plain(recipe_named(recipe)), "views": views, "seed": seed})
+    wanted = hashing.input_hash(
+        inputs, {"recipe": hashing.to_jsonable(recipe_named(recipe)), "views": views, "seed": seed}
+    )
     place = Path(out)
     if (known := find_product(place, wanted)) is not None and _contents(place, known["contents"]) == known["contents"]:
         return {**known, "out": out}
@@ -122,7 +125,7 @@ def collect_subject(
     contents = _contents(place, [row.name for row in found.rows if row.folder])
     told = {"out": out, "rows": rows, "contents": contents, "seconds": sum(row.seconds or 0 for row in found.rows)}
     if all(row.folder or row.status == "skipped" for row in found.rows):
-        swap_in(place / STEP, json_text({"input_hash": wanted, **told}))
+        atomic_write_text(place / STEP, json_text({"input_hash": wanted, **told}))
     return {"input_hash": wanted, **told}
 
 

@@ -10,8 +10,8 @@ from coregister.synthetic import expressions, subject
 from coregister.synthetic.capture import Studio, check
 from registration.errors import InputError
 from registration.progress import Progress, Silent
-from registration.storage.hashing import plain, versions
-from registration.storage.registration_folder import swap_in
+from registration.storage.files import atomic_write_text
+from registration.storage.hashing import to_jsonable, versions
 from workflows.processes import side_by_side
 from workflows.records.dataset import HELD_OUT, KIND, MANIFEST, SCHEMA
 from workflows.records.subject import NEUTRAL
@@ -99,7 +99,7 @@ def photograph(**settings: Any) -> str:
 
 def _told(population: Population) -> dict[str, Any]:
     categories = {name: expressions.named(name).category for name in population.expressions}
-    told: dict[str, Any] = plain(
+    told: dict[str, Any] = to_jsonable(
         {
             "kind": KIND,
             "schema": SCHEMA,
@@ -117,7 +117,7 @@ def _save(out: Path, told: Mapping[str, Any], complete: bool) -> dict[str, Any]:
     """Written only if it says anything new: a dataset that is there stays as it is."""
     file, whole = out / MANIFEST, {**told, "complete": complete, "versions": versions()}
     if _read(file) != whole:
-        swap_in(file, json.dumps(whole, indent=1, allow_nan=False) + "\n")
+        atomic_write_text(file, json.dumps(whole, indent=1, allow_nan=False) + "\n")
     return whole
 
 

@@ -13,7 +13,7 @@ from coregister.first_model import population
 from coregister.synthetic import expressions
 from registration.errors import InputError
 from registration.model import gnm_npz, regions
-from registration.storage.hashing import plain
+from registration.storage.hashing import to_jsonable
 from tests.conftest import SHARED, needs_shared
 from tests.coregister.spectrum import DEVIATIONS_MM, heads, spectrum_model, with_identity
 
@@ -136,8 +136,8 @@ def test_gains_are_paired_and_of_the_same_number_of_components(model):
 
 def test_equal_seeds_make_equal_figures_that_fit_into_a_manifest(model, found):
     again = evaluate({"own": model}, people(model), model.triangles, SETTINGS)
-    text = json.dumps(plain(found.figures), allow_nan=False)
-    assert text == json.dumps(plain(again.figures), allow_nan=False)
+    text = json.dumps(to_jsonable(found.figures), allow_nan=False)
+    assert text == json.dumps(to_jsonable(again.figures), allow_nan=False)
     other = evaluate({"own": model}, people(model), model.triangles, replace(SETTINGS, seed=1))
     assert other.models["own"].specificity.values_mm.tolist() != found.models["own"].specificity.values_mm.tolist()
 

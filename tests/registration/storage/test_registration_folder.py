@@ -12,11 +12,11 @@ import pytest
 import trimesh
 
 from registration.errors import InputError
-from registration.storage import registration_folder
+from registration.storage import files, registration_folder
 from registration.storage.hashing import hash_capture, hash_file, input_hash
 from registration.storage.registration_folder import (
-    check_out,
-    find_same,
+    check_output_folder,
+    find_existing,
     load_registration,
     save_registration,
     update_figures,
@@ -108,23 +108,21 @@ def test_a_folder_of_ours_is_replaced_whole(tmp_path):
 
 
 def test_replacing_without_an_atomic_exchange(tmp_path, monkeypatch):
-    monkeypatch.setattr(
-        registration_folder.ctypes, "CDLL", lambda *a, **k: object()
-    )  # as on a system without renameat2
+    monkeypatch.setattr(files.ctypes, "CDLL", lambda *a, **k: object())  # as on a system without renameat2
     save_registration(a_registration(0), tmp_path / "r")
     save_registration(a_registration(1), tmp_path / "r")
     np.testing.assert_array_equal(load_registration(tmp_path / "r").identity, a_registration(1).identity)
     assert [p.name for p in tmp_path.iterdir()] == ["r"]
 
 
-@pytest.mark.parametrize("failing", ["write_obj", "replace_folder"])
+@pytest.mark.parametrize("failing", ["write_obj", "exchange"])
 def test_a_crash_while_writing_leaves_the_former_result(tmp_path, monkeypatch, failing):
     save_registration(a_registration(0), tmp_path / "r")
 
     def crash(*_):
         raise OSError("disk full")
 
-    monkeypatch.setattr(registration_folder, failing, crash)
+    monkeypatch.setattr(files if failing == "exchange" else registration_folder, failing, crash)
     with pytest.raises(OSError, match="disk full"):
         save_registration(a_registration(1), tmp_path / "r")
     np.testing.assert_array_equal(load_registration(tmp_path / "r").identity, a_registration(0).identity)
@@ -164,7 +162,7 @@ def test_foreign_output_is_refused_and_left_alone(tmp_path, make):
     out = make(tmp_path)
     before = {p: p.read_bytes() for p in tmp_path.rglob("*") if p.is_file()}
     with pytest.raises(InputError, match="output folder"):
-        check_out(out)
+        check_output_folder(out)
     with pytest.raises(InputError, match="output folder"):
         save_registration(a_registration(1), out)
     assert {p: p.read_bytes() for p in tmp_path.rglob("*") if p.is_file()} == before
@@ -173,7 +171,7 @@ def test_foreign_output_is_refused_and_left_alone(tmp_path, make):
 def test_new_and_empty_folders_are_fine(tmp_path):
     (tmp_path / "empty").mkdir()
     for out in (tmp_path / "empty", tmp_path / "a" / "b"):
-        check_out(out)
+        check_output_folder(out)
         save_registration(a_registration(), out)
         assert load_registration(out).status == "converged"
 
@@ -213,13 +211,13 @@ BROKEN = {
 def test_a_broken_folder_names_what_is_wrong(tmp_path, case):
     save_registration(a_registration(), tmp_path / "r")
     wanted = input_hash(a_registration().inputs, a_registration().config)
-    assert find_same(tmp_path / "r", wanted) is not None
+    assert find_existing(tmp_path / "r", wanted) is not None
     breaks, message = BROKEN[case]
     breaks(tmp_path / "r")
     with pytest.raises(InputError) as caught:
         load_registration(tmp_path / "r")
     assert re.search(message, str(caught.value)), str(caught.value)
-    assert find_same(tmp_path / "r", wanted) is None
+    assert find_existing(tmp_path / "r", wanted) is None
 
 
 def test_non_finite_results_are_written_only_for_debugging(tmp_path):
@@ -232,13 +230,13 @@ def test_non_finite_results_are_written_only_for_debugging(tmp_path):
         load_registration(tmp_path / "r")
 
 
-def test_find_same_depends_on_inputs_and_configuration(tmp_path):
+def test_find_existing_depends_on_inputs_and_configuration(tmp_path):
     r = a_registration()
     save_registration(r, tmp_path / "r")
-    assert find_same(tmp_path / "r", input_hash(r.inputs, r.config)).reason == r.reason
-    assert find_same(tmp_path / "r", input_hash({**r.inputs, "model": "ee"}, r.config)) is None
-    assert find_same(tmp_path / "r", input_hash(r.inputs, {**r.config, "steps": 4})) is None
-    assert find_same(tmp_path / "nothing", "") is None
+    assert find_existing(tmp_path / "r", input_hash(r.inputs, r.config)).reason == r.reason
+    assert find_existing(tmp_path / "r", input_hash({**r.inputs, "model": "ee"}, r.config)) is None
+    assert find_existing(tmp_path / "r", input_hash(r.inputs, {**r.config, "steps": 4})) is None
+    assert find_existing(tmp_path / "nothing", "") is None
 
 
 def test_update_figures_keeps_the_rest(tmp_path):

@@ -1,0 +1,135 @@
+"""Atomic writes of files and folders, and checks of output folders: a reader sees the old state or the new one.
+
+A process that is killed leaves at most a hidden sibling whose name ends in `.tmp`; the target is never half written.
+"""
+
+import ctypes
+import json
+import os
+import secrets
+import shutil
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from registration.errors import InputError
+from registration.storage.hashing import to_jsonable
+
+_AT_FDCWD, _RENAME_EXCHANGE = -100, 2  # linux/fcntl.h, linux/fs.h
+
+
+@contextmanager
+def atomic_file(file: Path) -> Iterator[Path]:
+    """Yield the path of a temporary sibling of `file` that replaces it when the block ends without an error.
+
+    The temporary name keeps the suffix, from which some writers derive the format. The folder must exist.
+    """
+    file = Path(file)
+    temporary = file.with_name(f".{file.stem}.{secrets.token_hex(4)}.tmp{file.suffix}")
+    try:
+        yield temporary
+        os.replace(temporary, file)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def atomic_write_bytes(file: Path, content: bytes) -> None:
+    """Write a file in one rename."""
+    with atomic_file(file) as temporary:
+        temporary.write_bytes(content)
+
+
+def atomic_write_text(file: Path, text: str) -> None:
+    """Write a UTF-8 text file in one rename."""
+    atomic_write_bytes(file, text.encode("utf-8"))
+
+
+def json_text(value: Any) -> str:
+    """Return the text of a JSON file: `to_jsonable` values (non-finite numbers are null), indented, with a newline."""
+    return json.dumps(to_jsonable(value), indent=1, allow_nan=False) + "\n"
+
+
+def write_json(file: Path, value: Any) -> None:
+    """Write `json_text` of a value in one rename."""
+    atomic_write_text(file, json_text(value))
+
+
+@contextmanager
+def atomic_directory(out: Path) -> Iterator[Path]:
+    """Yield an empty sibling folder that takes the place of `out` when the block ends without an error.
+
+    After an error nothing is left of it and `out` is as before. Missing parents of `out` are created.
+    """
+    out = Path(out).resolve()
+    out.parent.mkdir(parents=True, exist_ok=True)
+    temporary = out.with_name(f".{out.name}.{secrets.token_hex(4)}.tmp")
+    temporary.mkdir()
+    try:
+        yield temporary
+        exchange(temporary, out)
+    finally:
+        shutil.rmtree(temporary, ignore_errors=True)
+
+
+def exchange(source: Path, out: Path) -> None:
+    """Move the folder `source` to `out`.
+
+    A non-empty folder at `out` is exchanged with it in one step and ends up at `source`; where the system cannot
+    exchange folders, it is renamed and deleted instead, and `out` is missing for a moment.
+    """
+    if not out.exists() or not any(out.iterdir()):
+        os.replace(source, out)
+        return
+    try:
+        rename = ctypes.CDLL(None, use_errno=True).renameat2  # os.replace cannot replace a non-empty folder
+        done = rename(_AT_FDCWD, os.fsencode(source), _AT_FDCWD, os.fsencode(out), _RENAME_EXCHANGE) == 0
+    except (AttributeError, OSError):
+        done = False
+    if not done:
+        previous = out.with_name(f".{out.name}.{secrets.token_hex(4)}.old")
+        os.replace(out, previous)
+        os.replace(source, out)
+        shutil.rmtree(previous, ignore_errors=True)
+
+
+def refuse_foreign(
+    out: Path, *, kind: str, command: str, manifest: str = "manifest.json", files: Sequence[str] | None = None
+) -> None:
+    """Refuse an output folder that `gnmreg COMMAND` did not write. A missing or empty folder is accepted.
+
+    Args:
+        out: the output folder.
+        kind: the kind of the record that our folder holds.
+        command: the command that writes such folders, for the message.
+        manifest: the record's file name.
+        files: the only names that may be in the folder; None: any.
+
+    Raises:
+        InputError: `out` is a file, holds no record of that kind, or holds a name that is not in `files`.
+    """
+    if not out.exists():
+        return
+    names = sorted(path.name for path in out.iterdir()) if out.is_dir() else ["a file"]
+    foreign = [name for name in names if files is not None and name not in files]
+    if foreign or (names and not has_kind(out / manifest, kind)):
+        raise InputError.output_folder(
+            out,
+            expected=f"a new or empty folder, or one that `gnmreg {command}` wrote",
+            got=", ".join((foreign or names)[:3]),
+            fix="choose another output folder with --out",
+        )
+
+
+def read_json_of_kind(file: Path, kind: str) -> dict[str, Any] | None:
+    """Return the JSON object in a file if its `kind` is this one, of any schema version, else None."""
+    try:
+        value = json.loads(Path(file).read_text("utf-8"))
+    except (OSError, ValueError, RecursionError):
+        return None
+    return value if isinstance(value, dict) and value.get("kind") == kind else None
+
+
+def has_kind(file: Path, kind: str) -> bool:
+    """Return whether a file is a JSON object with this `kind`, of any schema version."""
+    return read_json_of_kind(file, kind) is not None
