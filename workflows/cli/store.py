@@ -1,59 +1,60 @@
-"""Commands that look after published results."""
+"""`gnmreg store ...`: maintenance of published results."""
 
-import os
-from pathlib import Path
 from typing import Annotated
 
-from tyro.conf import Positional, arg
+from tyro.conf import arg
+
+from workflows.cli.options import FarmOptions, RunName, StoreUrl
+
+_FARM = FarmOptions()
 
 
-def verify(store: Positional[Annotated[str, arg(metavar="STORE")]], /, tidy: bool = False) -> int:
-    """Read every file of a store and compare it with the manifests. Exit code 1 if something is missing or altered.
+def verify(store: StoreUrl, /, tidy: bool = False) -> int:
+    """Compare every file of a store with the manifests.
+
+    The exit code is 1 if a file is missing or altered.
 
     Args:
         store: The folder or URL.
-        tidy: Delete files of attempts that nobody published and that are older than a day.
+        tidy: Delete unpublished attempts' files that are older than a day.
     """
     from workflows.records.store import Store
 
     opened = Store(store)
-    found = opened.verify()
-    for what, names in (("missing", found.missing), ("altered", found.altered), ("orphaned", found.orphaned)):
+    report = opened.verify()
+    for kind, names in (("missing", report.missing), ("altered", report.altered), ("orphaned", report.orphaned)):
         for name in names:
-            print(f"{what}: {name}")
-    for name, why in found.unreadable.items():
-        print(f"unreadable: {name}: {why}")
+            print(f"{kind}: {name}")
+    for name, reason in report.unreadable.items():
+        print(f"unreadable: {name}: {reason}")
     if tidy:
         print(f"{opened.tidy()} orphaned files deleted")
     print(
-        f"{found.artifacts} artifacts; {len(found.missing)} files missing, {len(found.altered)} altered, "
-        f"{len(found.orphaned)} orphaned; {len(found.unreadable)} manifests unreadable"
+        f"{report.artifacts} artifacts; {len(report.missing)} files missing, {len(report.altered)} altered, "
+        f"{len(report.orphaned)} orphaned; {len(report.unreadable)} manifests unreadable"
     )
-    return 0 if found.sound else 1
+    return 0 if report.sound else 1
 
 
 def retire(
-    store: Positional[Annotated[str, arg(metavar="STORE")]],
-    run: Positional[Annotated[str, arg(metavar="RUN")]],
+    store: StoreUrl,
+    run: RunName,
     /,
     keep: Annotated[int, arg(metavar="N")],
-    folder: Annotated[Path, arg(metavar="DIR")] = Path("."),
-    db: Annotated[str | None, arg(metavar="URL")] = None,
+    farm: FarmOptions = _FARM,
 ) -> int:
-    """Delete the results of a run's iterations but the last ones, and their rows in the queue.
+    """Delete the results of a run's earlier rounds, and their jobs in the queue.
 
     Args:
         store: The folder or URL.
         run: The run.
-        keep: How many iterations to keep.
-        folder: The farm's folder.
-        db: The queue's database, as for worker.
+        keep: Number of rounds to keep, the last ones.
+        farm: Which farm.
     """
     from workflows.engine.client import Queue
-    from workflows.engine.database import ENVIRONMENT, checked_url, default_url
     from workflows.records.store import Store
 
-    opened = Queue(checked_url(db or os.environ.get(ENVIRONMENT) or default_url(folder)))
+    opened = Queue(farm.url)
     try:
         for part in Store(store).retire(run, keep):
             print(f"{part}: {opened.forget(part)} rows deleted")

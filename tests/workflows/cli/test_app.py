@@ -1,42 +1,32 @@
+import importlib
+import inspect
+import re
 import subprocess
 import sys
 from pathlib import Path
 from types import SimpleNamespace
+from typing import get_args
 
 import pytest
 
 import registration.register
+import workflows.cli
 import workflows.steps.subject
+from registration.fit.recipes import RECIPES
 from tests.conftest import FIXTURES
 from tests.registration.capture.small import make
-from workflows.cli.app import main
+from workflows.cli.app import COMMANDS, main
+from workflows.cli.farm import QueueName
+from workflows.engine.jobs import GPU, REBUILD
 from workflows.records.subject import Row, Subject
 
+CLI = Path(workflows.cli.__file__).parent
 TINY_MODEL = FIXTURES / "tiny_gnm.npz"
 HEAVY = {"torch", "mitsuba", "drjit", "numpy", "scipy", "cv2", "pycolmap", "kornia", "trimesh", "matplotlib", "viser"}
+HEAVY |= {"dbos", "sqlalchemy", "jinja2"}
 
 
-@pytest.mark.parametrize(
-    "command",
-    [
-        *(
-            "",
-            "register",
-            "subject",
-            "evaluate",
-            "stabilize",
-            "stabilize review",
-            "coregister",
-            "dataset",
-            "dataset synth",
-            "capture",
-            "capture check",
-            "capture synth",
-            "capture spoil",
-        ),
-        *("model", "model info", "model evaluate", "model fetch", "model bootstrap"),
-    ],
-)
+@pytest.mark.parametrize("command", ["", "capture", "dataset", "model", "store", *COMMANDS])
 def test_every_command_explains_itself(command: str, capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as stop:
         main([*command.split(), "--help"])
@@ -44,17 +34,79 @@ def test_every_command_explains_itself(command: str, capsys: pytest.CaptureFixtu
     assert f"usage: gnmreg {command}".strip() in capsys.readouterr().out
 
 
-def test_help_imports_nothing_heavy() -> None:
+@pytest.mark.parametrize("command", COMMANDS)
+def test_help_explains_every_option_where_it_is_shown(
+    command: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("COLUMNS", "1000")
+    with pytest.raises(SystemExit):
+        main([*command.split(), "--help"])
+    text = re.sub(r"[│ ]*\n[│ ] {10,}(?=\w)", " ", capsys.readouterr().out)  # help below a long option
+    rows = re.findall(r"^[│ ]{2,}((?:--?[a-z]|[A-Z]+ ).*)$", text, re.MULTILINE)
+    assert len(rows) > (command != "model fetch")
+    assert all(re.search(r"[a-z] [a-z]", row) for row in rows), rows  # words, not only a name and a default
+    assert not re.search(r"(?i)\bas for\b|default: \)", text)
+
+
+def test_the_overview_lists_every_command_once_in_its_group(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        main(["-h"])
+    text = capsys.readouterr().out
+    listed = re.findall(r"^  (\w+(?: \w+)?)  +\S", text, re.MULTILINE)
+    assert listed == [*COMMANDS]
+    assert re.findall(r"^([A-Z][a-z]+)$", text, re.MULTILINE) == ["Capture", "Register", "Model", "Farm"]
+
+
+def test_every_function_of_the_command_modules_is_a_command() -> None:
+    modules = [importlib.import_module(f"workflows.cli.{path.stem}") for path in CLI.glob("[!_]*.py")]
+    public = {
+        function
+        for module in modules
+        if module.__name__ not in ("workflows.cli.app", "workflows.cli.options")
+        for name, function in inspect.getmembers(module, inspect.isfunction)
+        if function.__module__ == module.__name__ and not name.startswith("_")
+    }
+    assert public == {*COMMANDS.values()}
+
+
+def test_summaries_fit_into_the_overview() -> None:
+    summaries = {name: (inspect.getdoc(command) or "").splitlines()[0] for name, command in COMMANDS.items()}
+    assert {name: text for name, text in summaries.items() if not 20 < len(text) <= 80} == {}
+
+
+@pytest.mark.parametrize("words", ["registr", "capture synht", "capture"])
+def test_unknown_commands_show_what_there_is(words: str, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as stop:
+        main(words.split())
+    error = capsys.readouterr().err
+    assert stop.value.code == 2
+    assert "capture synth" in error and ("similar: " in error) == (words != "capture")
+
+
+def test_recipes_and_queues_in_the_help_are_those_that_exist(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("COLUMNS", "300")
+    for command in ("register", "subject", "batch", "coregister"):
+        with pytest.raises(SystemExit):
+            main([command, "--help"])
+        row = re.search(r"--recipe.*", capsys.readouterr().out)
+        assert row and all(f"{name}: " in row[0] for name in RECIPES)
+    assert set(get_args(QueueName)) == {GPU, REBUILD}
+
+
+@pytest.mark.parametrize("command", ["", "register", "coregister", "worker"])
+def test_help_imports_nothing_heavy(command: str) -> None:
     code = """
 import sys
 from workflows.cli.app import main
 try:
-    main(["register", "--help"])
+    main([*sys.argv[1:], "--help"])
 finally:
     print("MODULES", *sys.modules, file=sys.stderr)
 """
-    run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert "--deterministic" in run.stdout
+    run = subprocess.run([sys.executable, "-c", code, *command.split()], capture_output=True, text=True, check=True)
+    assert "usage: gnmreg" in run.stdout
     assert HEAVY.isdisjoint(run.stderr.split("MODULES")[1].split())
 
 
@@ -153,13 +205,14 @@ def test_missing_capture_of_a_registration(tmp_path: Path, capsys: pytest.Captur
     assert list(tmp_path.iterdir()) == []
 
 
-def test_unknown_recipe_stops_with_code_2(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(SystemExit) as stop:
-        main(["register", "C", "--model", "M", "--out", str(tmp_path / "out"), "--recipe", "drafty"])
-    assert stop.value.code == 2
+@pytest.mark.parametrize("command", ["register {capture}", "subject {subject}"])
+def test_unknown_recipes_stop_with_code_2(command: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    capture, out = make(tmp_path / "subject" / "neutral"), tmp_path / "out"
+    words = command.format(capture=capture, subject=capture.parent).split()
+    assert main([*words, "--model", str(TINY_MODEL), "--out", str(out), "--recipe", "drafty"]) == 2
     error = capsys.readouterr().err
-    assert "drafty" in error and "draft" in error and "studio" in error
-    assert list(tmp_path.iterdir()) == []
+    assert "drafty" in error and "draft" in error and "studio" in error and "Traceback" not in error
+    assert not out.exists()
 
 
 def test_capture_check_tells_and_draws(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -170,10 +223,10 @@ def test_capture_check_tells_and_draws(tmp_path: Path, capsys: pytest.CaptureFix
     assert sheet.read_bytes().startswith(b"\x89PNG")
 
 
-def test_capture_spoil_breaks_what_it_is_told_to(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_capture_degrade_applies_the_faults(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     source, target = make(tmp_path / "source"), tmp_path / "target"
     flags = ["--preset", "none", "--seed", "4", "--break", "cam3=shifted", "cam1=black", "cam3=exposure"]
-    assert main(["capture", "spoil", str(source), str(target), *flags]) == 0
+    assert main(["capture", "degrade", str(source), str(target), *flags]) == 0
     assert capsys.readouterr().out == f"{target}\n"
     assert main(["capture", "check", str(target)]) == 0
     assert "preset none, seed 4; cam1 black; cam3 exposure shifted" in capsys.readouterr().out
@@ -181,14 +234,14 @@ def test_capture_spoil_breaks_what_it_is_told_to(tmp_path: Path, capsys: pytest.
 
 @pytest.mark.parametrize("pair", ["cam03", "cam03=", "=black"])
 def test_malformed_breaks_are_told(pair: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["capture", "spoil", str(tmp_path / "source"), str(tmp_path / "target"), "--break", pair]) == 2
+    assert main(["capture", "degrade", str(tmp_path / "source"), str(tmp_path / "target"), "--break", pair]) == 2
     error = capsys.readouterr().err
-    assert "VIEW=HOW" in error and pair in error and "fix:" in error and "Traceback" not in error
+    assert "VIEW=FAULT" in error and pair in error and "fix:" in error and "Traceback" not in error
 
 
 def test_an_option_given_twice_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     flags = ["--break", "cam3=shifted", "--break=cam1=black"]
-    assert main(["capture", "spoil", str(tmp_path / "source"), str(tmp_path / "target"), *flags]) == 2
+    assert main(["capture", "degrade", str(tmp_path / "source"), str(tmp_path / "target"), *flags]) == 2
     error = capsys.readouterr().err
     assert "more than once" in error and "--break" in error and "fix:" in error
 
@@ -196,7 +249,7 @@ def test_an_option_given_twice_is_refused(tmp_path: Path, capsys: pytest.Capture
 def test_unknown_presets_stop_with_code_2(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     source = make(tmp_path / "source")
     with pytest.raises(SystemExit) as stop:
-        main(["capture", "spoil", str(source), str(tmp_path / "target"), "--preset", "studioo"])
+        main(["capture", "degrade", str(source), str(tmp_path / "target"), "--preset", "studioo"])
     assert stop.value.code == 2
     error = capsys.readouterr().err
     assert "studioo" in error and "harsh" in error

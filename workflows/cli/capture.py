@@ -1,0 +1,135 @@
+"""`gnmreg capture ...` and `dataset synth`: captures checked, rendered and degraded."""
+
+from collections.abc import Sequence
+from typing import Annotated, Literal
+
+from tyro.conf import arg
+
+from registration.errors import InputError
+from workflows.cli.options import (
+    NOT_SET,
+    CaptureFolder,
+    OptionalImage,
+    OutputFolder,
+    Seed,
+    StudioOptions,
+    weights,
+)
+
+_STUDIO = StudioOptions()
+
+
+def check(capture: CaptureFolder, /, out: OptionalImage = None) -> int:
+    """Check a capture folder before it is registered.
+
+    Args:
+        capture: The capture folder.
+        out: Contact sheet to draw: every image with the scan and the landmarks projected into it.
+    """
+    from registration.capture.doctor import check
+
+    print(check(capture, sheet=out))
+    return 0
+
+
+def synth(
+    out: OutputFolder,
+    /,
+    seed: Seed = 0,
+    expression: Annotated[str, arg(metavar="NAME")] = "neutral",
+    spanned: bool = False,
+    target: Annotated[tuple[str, ...], arg(metavar="NAME=WEIGHT", help_behavior_hint=NOT_SET)] = (),
+    studio: StudioOptions = _STUDIO,
+) -> int:
+    """Render a capture of a synthetic subject, with ground truth.
+
+    Args:
+        out: The capture folder to write; it must not exist.
+        seed: The subject: each seed is one person with one skin, and one arrangement of cameras.
+        expression: A named expression, such as neutral, jaw_open, smile, gaze_left, tongue_out.
+        spanned: Sample a person that the first model spans; otherwise asymmetry, age and build exceed it.
+        target: Weights of MakeHuman targets, such as nose/nose-hump-incr=0.5.
+        studio: The synthetic studio.
+    """
+    targets = weights(target)
+    from coregister.synthetic.subject import capture
+
+    print(capture(out, seed=seed, expression=expression, spanned=spanned, targets=targets, studio=studio.studio(seed)))
+    return 0
+
+
+def degrade(
+    source: CaptureFolder,
+    target: OutputFolder,
+    /,
+    preset: Literal["none", "studio", "harsh"] = "studio",
+    seed: Seed = 0,
+    faults: Annotated[tuple[str, ...], arg(name="break", metavar="VIEW=FAULT", help_behavior_hint=NOT_SET)] = (),
+) -> int:
+    """Copy a clean capture with realistic errors, to measure robustness.
+
+    Calibration, normals, landmarks, masks, labels and images get errors; scan and ground truth stay.
+
+    Args:
+        source: The capture folder; it is not changed.
+        target: The capture folder to write; it must not exist.
+        preset: studio: the errors that remain in a good studio; harsh: about twice those; none: no errors.
+        seed: Seed of the errors.
+        faults: Views with a fault: shifted (by 30 px), black, or exposure (2.5 times the light). They are kept.
+    """
+    parsed = _faults(faults)
+    from registration.capture.degrade import PRESETS, spoil
+
+    print(spoil(source, target, preset=PRESETS[preset], seed=seed, breaks=parsed))
+    return 0
+
+
+def synth_dataset(
+    out: OutputFolder,
+    /,
+    subjects: Annotated[int, arg(metavar="N")],
+    expressions: Annotated[str, arg(metavar="A,B,C", help_behavior_hint=NOT_SET)] = "",
+    seed: Seed = 0,
+    held_out: Annotated[int, arg(metavar="N")] = 0,
+    jobs: Annotated[int, arg(metavar="N")] = 1,
+    studio: StudioOptions = _STUDIO,
+) -> int:
+    """Render a dataset of synthetic subjects, with ground truth.
+
+    Run again, the command resumes.
+
+    Args:
+        out: The dataset's folder: one folder for each subject, with one capture for each expression.
+        subjects: Number of subjects, of any adult age and build, beyond what the first model spans.
+        expressions: Named expressions besides the neutral, separated by commas.
+        seed: The population: no two seeds share a subject.
+        held_out: Number of subjects, the last ones, that are marked to be held out of models.
+        jobs: Captures rendered in parallel.
+        studio: The synthetic studio.
+    """
+    from registration.progress import shown
+    from workflows.steps.synthesize import Population, synth_dataset
+
+    names = tuple(name.strip() for name in expressions.split(",") if name.strip())
+    population = Population(subjects=subjects, expressions=names, seed=seed, held_out=held_out, studio=studio.studio())
+    with shown() as progress:
+        synth_dataset(out, population, jobs=jobs, progress=progress)
+    print(out)
+    return 0
+
+
+def _faults(pairs: Sequence[str]) -> dict[str, set[str]]:
+    """Parse `VIEW=FAULT` arguments; a view may have several faults."""
+    parsed: dict[str, set[str]] = {}
+    for pair in pairs:
+        view, _, fault = pair.rpartition("=")
+        if not (view and fault):
+            raise InputError(
+                "Cannot read a view's fault",
+                where="--break",
+                expected="VIEW=FAULT, e.g. cam03=shifted",
+                got=pair,
+                fix="write the view's name, an equals sign and one of shifted, black, exposure",
+            )
+        parsed.setdefault(view, set()).add(fault)
+    return parsed

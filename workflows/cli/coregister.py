@@ -1,0 +1,97 @@
+"""`gnmreg coregister`: rounds of registration and model building over a dataset."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+from tyro.conf import Positional, arg
+
+from workflows.cli.options import FitOptions, Folder, ModelFile, RunOptions
+
+
+@dataclass(frozen=True, kw_only=True)
+class RoundOptions:
+    """Rounds and their evaluation.
+
+    Attributes:
+        iterations: Maximum number of rounds. Fewer are computed if another one is not expected to improve the
+            model.
+        all_iterations: Compute all rounds, unless too many captures fail.
+        held_out: Subjects to evaluate models on: a fraction of them such as 0.2, or a file with one subject
+            folder's name on each line.
+        components: Numbers of identity components to evaluate models with; the largest is compared between rounds.
+    """
+
+    iterations: Annotated[int, arg(metavar="K")] = 3
+    all_iterations: bool = False
+    held_out: Annotated[
+        str | None,
+        arg(metavar="FRACTION|FILE", help_behavior_hint="(default: neutrals tagged held_out, otherwise 0.2)"),
+    ] = None
+    components: Annotated[tuple[int, ...], arg(metavar="K", help_behavior_hint="(default: 5 10 20 40)")] = ()
+
+
+_FIT, _ROUNDS, _RUN = FitOptions(), RoundOptions(), RunOptions()
+
+
+def coregister(
+    dataset: Positional[Annotated[Path, arg(metavar="DATASET")]],
+    /,
+    model: ModelFile,
+    out: Folder,
+    rounds: RoundOptions = _ROUNDS,
+    fit: FitOptions = _FIT,
+    farm: RunOptions = _RUN,
+) -> int:
+    """Build a head model from a dataset in rounds: register, build, evaluate.
+
+    Every round registers the dataset with the previous round's model, builds the next model and evaluates it on
+    held-out subjects.
+
+    Args:
+        dataset: A folder of subject folders, each with capture folders.
+        model: The first head model, a GNM NPZ file with its landmark schemes beside it.
+        out: Output folder. An earlier run of this command there is resumed.
+        rounds: Rounds and their evaluation.
+        fit: How captures are registered.
+        farm: Where the jobs are executed.
+    """
+    from coregister.stopping_rule import Rule
+    from registration.progress import shown
+    from workflows.engine.process import migrate
+    from workflows.farm.coregistration import coregister, put_coregistration
+    from workflows.farm.local import gpus_here
+    from workflows.farm.plan import make_plan
+    from workflows.records.coregistration import PAGE
+
+    plan = make_plan(
+        dataset,
+        model_path=model,
+        out=out,
+        recipe=fit.recipe,
+        held_out=_fraction_or_file(rounds.held_out),
+        seed=fit.seed,
+        views=fit.views,
+        components=rounds.components or None,
+        rule=Rule(rounds=rounds.iterations, early=not rounds.all_iterations),
+    )
+    folder = farm.farm_folder(out)
+    url = farm.url_for(folder)
+    if not farm.local:
+        print(f"{put_coregistration(url, plan, variant=fit.variant)} is in the queue; see gnmreg status")
+        return 0
+    migrate(url)
+    gpus = gpus_here(None) if fit.variant == "cuda" else ()
+    with shown() as progress:
+        record = coregister(plan, url=url, folder=folder, workers=farm.workers, gpus=gpus, progress=progress)
+    for name, figures in record["generalization_mm"].items():
+        print(f"{name}, {record['at']} components: generalization {figures[str(record['at'])]:.3f} mm")
+    print(f"{record.get('stopped') or record['verdict']['reason']}\n{out / PAGE}")
+    return 1 if "stopped" in record else 0
+
+
+def _fraction_or_file(text: str | None) -> float | Path | None:
+    try:
+        return None if text is None else float(text)
+    except ValueError:
+        return Path(str(text))

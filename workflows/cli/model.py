@@ -1,0 +1,79 @@
+"""`gnmreg model ...`: head models described, evaluated, built from public data and downloaded."""
+
+from pathlib import Path
+from typing import Annotated
+
+from tyro.conf import Positional, arg
+
+from workflows.cli.options import Folder, OptionalFolder, OptionalImage, OptionalModel, Seed
+
+
+def info(file: Positional[Annotated[Path, arg(metavar="NPZ")]], /, out: OptionalImage = None) -> int:
+    """Describe a model file: dimensions, parts and regions.
+
+    Args:
+        file: The head model, a GNM NPZ file.
+        out: Image of the model to draw.
+    """
+    from registration.model.info import describe
+
+    describe(file, picture=out)
+    return 0
+
+
+def evaluate(
+    models: Positional[Annotated[tuple[Path, ...], arg(metavar="MODEL", help_behavior_hint="(required)")]],
+    /,
+    held_out: Annotated[Path, arg(metavar="RUN|NPZ")],
+    out: Folder,
+    captures: OptionalFolder = None,
+    components: Annotated[tuple[int, ...], arg(metavar="K")] = (5, 10, 20, 40),
+    samples: Annotated[int, arg(metavar="N")] = 200,
+    seed: Seed = 0,
+    force: bool = False,
+) -> int:
+    """Evaluate head models on held-out subjects and compare them with the first.
+
+    Args:
+        models: The head models, GNM NPZ files of one topology.
+        held_out: A folder of subject folders that `gnmreg subject` wrote, or an NPZ file of meshes.
+        out: The folder to write; one that this command wrote before is replaced.
+        captures: The folder of the subjects' captures: adds scans, categories and tags.
+        components: Numbers of components to evaluate, besides all of a model's.
+        samples: Random heads of each model, for specificity; 0: no specificity.
+        seed: Seed of the random heads.
+        force: Evaluate again although the folder holds the result of the same input.
+    """
+    from coregister.evaluate.evaluation import Settings
+    from registration.progress import shown
+    from workflows.steps.evaluate import PAGE, evaluate_models, lines
+
+    settings = Settings(components=components, samples=samples, seed=seed)
+    with shown() as progress:
+        manifest = evaluate_models(
+            models, held_out=held_out, out=out, captures=captures, settings=settings, force=force, progress=progress
+        )
+    print("\n".join((*lines(manifest), str(out / PAGE))))
+    return 0
+
+
+def fetch() -> int:
+    """Download Google's GNM head weights into the cache and print their path."""
+    from registration.model.fetch import fetch
+
+    print(fetch())
+    return 0
+
+
+def bootstrap(out: OptionalModel = None) -> int:
+    """Build the first model from MakeHuman's CC0 head and print its path.
+
+    It is built once and kept in the cache.
+
+    Args:
+        out: Copy the model file here, with its landmark schemes beside it.
+    """
+    from coregister.first_model.build import bootstrap
+
+    print(bootstrap(out))
+    return 0

@@ -1,0 +1,236 @@
+"""Option groups and argument types that several commands share.
+
+tyro adds the fields of these dataclasses to a command's options and shows their docstrings as help. Nothing heavy is
+imported here, so that help stays fast.
+"""
+
+import os
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+from tyro.conf import Positional, arg
+
+from registration.errors import InputError
+
+if TYPE_CHECKING:
+    from coregister.synthetic.capture import Studio
+
+NOT_SET = "(optional)"
+Command = Callable[..., int]
+
+CaptureFolder = Positional[Annotated[Path, arg(metavar="CAPTURE")]]
+OutputFolder = Positional[Annotated[Path, arg(metavar="DIR")]]
+RunName = Positional[Annotated[str, arg(metavar="RUN")]]
+JobId = Positional[Annotated[str, arg(metavar="JOB")]]
+StoreUrl = Positional[Annotated[str, arg(metavar="STORE")]]
+Folder = Annotated[Path, arg(metavar="DIR")]
+ModelFile = Annotated[Path, arg(metavar="NPZ")]
+Seed = Annotated[int, arg(metavar="S")]
+Port = Annotated[int, arg(metavar="PORT")]
+OptionalFile = Annotated[Path | None, arg(metavar="FILE", help_behavior_hint=NOT_SET)]
+OptionalFolder = Annotated[Path | None, arg(metavar="DIR", help_behavior_hint=NOT_SET)]
+OptionalRegistration = Annotated[Path | None, arg(metavar="REG", help_behavior_hint=NOT_SET)]
+OptionalCapture = Annotated[Path | None, arg(metavar="CAPTURE", help_behavior_hint=NOT_SET)]
+OptionalImage = Annotated[Path | None, arg(metavar="PNG", help_behavior_hint=NOT_SET)]
+OptionalModel = Annotated[Path | None, arg(metavar="NPZ", help_behavior_hint=NOT_SET)]
+
+
+@dataclass(frozen=True, kw_only=True)
+class FitOptions:
+    """How captures are registered, wherever that is computed.
+
+    Attributes:
+        recipe: Schedule of the fit. preview: seconds, small images. draft: minutes; shows whether a capture can be
+            used. studio: full quality. in_model: the model's parameters alone, without free offsets.
+        views: Use only this many views of each capture, spread around the head.
+        seed: Seed of the random number generators.
+        variant: Render on the CPU (llvm) or on NVIDIA GPUs (cuda).
+    """
+
+    recipe: Annotated[str, arg(metavar="NAME")] = "draft"
+    views: Annotated[int | None, arg(metavar="N", help_behavior_hint="(default: all)")] = None
+    seed: Seed = 0
+    variant: Literal["llvm", "cuda"] = "llvm"
+
+
+@dataclass(frozen=True, kw_only=True)
+class RegisterOptions(FitOptions):
+    """How captures are registered in this process.
+
+    Attributes:
+        deterministic: Compute bitwise reproducible arrays; slower.
+        landmarks: The model's vertices for landmark schemes, instead of the files beside the model.
+    """
+
+    deterministic: bool = False
+    landmarks: Annotated[tuple[str, ...], arg(metavar="SCHEME=FILE", help_behavior_hint=NOT_SET)] = ()
+
+    def landmark_files(self) -> dict[str, Path]:
+        """Scheme -> file.
+
+        Raises:
+            InputError: an entry is not of the form SCHEME=FILE.
+        """
+        return {scheme: Path(file) for scheme, file in (self._pair(text) for text in self.landmarks)}
+
+    @staticmethod
+    def _pair(text: str) -> tuple[str, str]:
+        scheme, _, file = text.partition("=")
+        if not (scheme and file):
+            raise InputError(
+                "Cannot read a landmark file argument",
+                where="--landmarks",
+                expected="SCHEME=FILE, e.g. 68=head_sparse_68.txt",
+                got=text,
+                fix="write the scheme's name, an equals sign and the path of the model's landmark file",
+            )
+        return scheme, file
+
+
+@dataclass(frozen=True, kw_only=True)
+class StudioOptions:
+    """The synthetic studio that renders captures.
+
+    Attributes:
+        views: Number of cameras.
+        size: Width and height of the images in pixels.
+        distortion: Give the cameras lens distortion.
+        noise: Add sensor noise, and differences of exposure and colour between the cameras.
+        hair: Add hair, with a label of its own.
+        shirt: Add a shirt, with a label of its own.
+    """
+
+    views: Annotated[int, arg(metavar="N")] = 22
+    size: Annotated[tuple[int, int], arg(metavar="W H")] = (480, 720)
+    distortion: bool = False
+    noise: bool = False
+    hair: bool = False
+    shirt: bool = False
+
+    def studio(self, seed: int = 0) -> "Studio":
+        """Return the library's settings."""
+        from coregister.synthetic.capture import Studio
+        from registration.render.studio.shoot import Sensor
+
+        noisy = Sensor(shot_noise=0.01, read_noise=0.002, exposure_spread=0.05, colour_spread=0.03)
+        return Studio(
+            cameras=self.views,
+            size_px=self.size,
+            distortion=self.distortion,
+            seed=seed,
+            sensor=noisy if self.noise else Sensor(),
+            hair=self.hair,
+            shirt=self.shirt,
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
+class FarmOptions:
+    """Which farm: the folder of its logs, and its queue.
+
+    Attributes:
+        folder: Folder of the farm: job logs and, unless --db names a database, the queue.
+        db: Database of the queue: sqlite:///FILE or postgresql://... Pass a URL with a password as GNMREG_DB: other
+            users of the machine can read command lines.
+    """
+
+    folder: Annotated[Path | None, arg(metavar="DIR", help_behavior_hint="(default: the current folder)")] = None
+    db: Annotated[
+        str | None, arg(metavar="URL", help_behavior_hint="(default: $GNMREG_DB, or a SQLite file in the folder)")
+    ] = None
+
+    @property
+    def directory(self) -> Path:
+        """The farm's folder."""
+        return self.folder or Path(".")
+
+    @property
+    def url(self) -> str:
+        """URL of the queue's database.
+
+        Raises:
+            InputError: a URL that cannot be used.
+        """
+        return queue_url(self.directory, self.db)
+
+
+@dataclass(frozen=True, kw_only=True)
+class RunOptions(FarmOptions):
+    """Where a run's jobs are executed: by a farm, or with --local on this machine.
+
+    Attributes:
+        local: Start a coordinator and workers on this machine, wait for the run to end, and stop them. Otherwise
+            the jobs wait in the queue for a farm's workers.
+        workers: With --local: captures registered in parallel. With --variant cuda there is one worker for each GPU
+            instead.
+        folder: Folder of the farm: job logs and, unless --db names a database, the queue.
+    """
+
+    local: bool = False
+    workers: Annotated[int, arg(metavar="N")] = 1
+    folder: Annotated[
+        Path | None,
+        arg(metavar="DIR", help_behavior_hint="(default: the current folder; with --local, OUT.farm beside --out)"),
+    ] = None
+
+    def farm_folder(self, out: str | Path) -> Path:
+        """Return the farm's folder for a run whose results go to `out`.
+
+        Raises:
+            InputError: a local farm without a folder whose results go to a URL.
+        """
+        if self.folder is not None or not self.local:
+            return self.directory
+        from workflows.records.remote import is_remote, local_path
+
+        if is_remote(str(out)):
+            raise InputError(
+                "A farm on this machine needs a folder",
+                where="--folder",
+                expected="a folder for its queue and logs, as the results go to a URL",
+                got="none",
+                fix="add --folder DIR",
+            )
+        path = local_path(str(out)).resolve()
+        return path.with_name(f"{path.name}.farm")
+
+    def url_for(self, folder: Path) -> str:
+        """Return the URL of the queue's database, for a farm in `folder`."""
+        return queue_url(folder, self.db)
+
+
+def queue_url(folder: Path, db: str | None) -> str:
+    """Return the database URL: `db`, the environment's, or a SQLite file in the folder.
+
+    Raises:
+        InputError: a URL that cannot be used.
+    """
+    from workflows.engine.database import ENVIRONMENT, checked_url, default_url
+
+    return checked_url(db or os.environ.get(ENVIRONMENT) or default_url(folder))
+
+
+def weights(pairs: Sequence[str]) -> Mapping[str, float]:
+    """Parse `NAME=WEIGHT` arguments.
+
+    Raises:
+        InputError: an argument of another form.
+    """
+    parsed = {}
+    for pair in pairs:
+        name, _, weight = pair.rpartition("=")
+        try:
+            parsed[name] = float(weight)
+        except ValueError:
+            name = ""
+        if not name:
+            raise InputError(
+                "Cannot read a target's weight",
+                where="--target",
+                expected="NAME=WEIGHT, e.g. nose/nose-hump-incr=0.5",
+                got=pair,
+                fix="write the target's name, an equals sign and a number",
+            )
+    return parsed

@@ -1,0 +1,131 @@
+"""`gnmreg register`, `subject` and `evaluate`: registrations and their evaluation."""
+
+from pathlib import Path
+from typing import Annotated
+
+from tyro.conf import Positional, arg
+
+from workflows.cli.options import (
+    CaptureFolder,
+    Folder,
+    ModelFile,
+    OptionalCapture,
+    OptionalRegistration,
+    RegisterOptions,
+)
+
+_DEFAULTS = RegisterOptions()
+
+
+def register(
+    capture: CaptureFolder,
+    /,
+    model: ModelFile,
+    out: Folder,
+    neutral: OptionalRegistration = None,
+    force: bool = False,
+    fit: RegisterOptions = _DEFAULTS,
+) -> int:
+    """Fit the head model to one capture and write the registered mesh.
+
+    Args:
+        capture: The capture folder.
+        model: The head model, a GNM NPZ file.
+        out: The registration folder to write; one that gnmreg wrote before is replaced.
+        neutral: Start from this registration of the same subject's neutral and keep its identity.
+        force: Register again although the folder holds the result of the same input.
+        fit: How the capture is registered.
+    """
+    landmark_files = fit.landmark_files()
+    from registration.progress import shown
+    from registration.register import register
+
+    with shown() as progress:
+        result = register(
+            capture,
+            model_path=model,
+            out=out,
+            recipe=fit.recipe,
+            views=fit.views,
+            seed=fit.seed,
+            neutral=neutral,
+            deterministic=fit.deterministic,
+            force=force,
+            variant=fit.variant,
+            landmark_files=landmark_files,
+            progress=progress,
+        )
+    print(f"{result.status}: {result.reason}\n{out}")
+    return 1 if result.status == "failed" else 0
+
+
+def subject(
+    subject: Positional[Annotated[Path, arg(metavar="SUBJECT")]],
+    /,
+    model: ModelFile,
+    out: Folder,
+    neutral: Annotated[
+        str | None, arg(metavar="NAME", help_behavior_hint='(default: the one labelled "neutral")')
+    ] = None,
+    force: bool = False,
+    fit: RegisterOptions = _DEFAULTS,
+) -> int:
+    """Register all captures of a subject: the neutral, then the expressions.
+
+    Every expression starts from the neutral's registration. Run again, the command resumes.
+
+    Args:
+        subject: The folder whose sub-folders are the captures.
+        model: The head model, a GNM NPZ file.
+        out: The folder to write: a registration for each capture, subject.json and index.html.
+        neutral: The neutral's sub-folder.
+        force: Register again although the folder holds the results of the same input.
+        fit: How the captures are registered.
+    """
+    landmark_files = fit.landmark_files()
+    from registration.progress import shown
+    from workflows.steps.subject import register_subject
+
+    with shown() as progress:
+        result = register_subject(
+            subject,
+            model_path=model,
+            out=out,
+            recipe=fit.recipe,
+            views=fit.views,
+            seed=fit.seed,
+            neutral=neutral,
+            deterministic=fit.deterministic,
+            force=force,
+            variant=fit.variant,
+            landmark_files=landmark_files,
+            progress=progress,
+        )
+    for row in result.rows:
+        print(f"{row.name}: {row.status}: {row.reason}")
+    print(out / "index.html")
+    usable = sum(row.usable for row in result.rows)
+    return 0 if usable == len(result.rows) else 1 if usable else 2
+
+
+def evaluate(
+    registration: Positional[Annotated[Path, arg(metavar="REG")]],
+    /,
+    capture: Annotated[Path, arg(metavar="CAPTURE")],
+    neutral: OptionalRegistration = None,
+    neutral_capture: OptionalCapture = None,
+) -> int:
+    """Compare a registration with its capture's scan and ground truth.
+
+    The metrics are printed and stored with the registration.
+
+    Args:
+        registration: The registration folder.
+        capture: The capture that it registers.
+        neutral: The same subject's neutral registration: adds the surface's drift against it.
+        neutral_capture: The capture of that neutral registration.
+    """
+    from registration.evaluate.evaluation import evaluate_folder
+
+    evaluate_folder(registration, capture, neutral, neutral_capture)
+    return 0
