@@ -18,9 +18,9 @@ from coregister.evaluate.evaluation import HeldOut, Settings, evaluate
 from coregister.first_model import assembly as anatomy_of
 from coregister.first_model import build, makehuman, population
 from coregister.first_model.assembly import Anatomy
-from coregister.next_model.identity import principal_components
 from coregister.synthetic import expressions
 from registration.geometry.closest_point import barycentric_points
+from registration.geometry.pca import dense_components
 from registration.model import gnm_npz, regions
 from registration.model.gnm_npz import GNMData
 
@@ -71,7 +71,7 @@ def trained(anatomy: Anatomy, data: GNMData, moves: Moves, count: int) -> GNMDat
     rng = np.random.default_rng(_TRAINING_SEED)
     heads = [anatomy.person(population.any_person(anatomy.source, rng), moves)[0] for _ in range(count)]
     rows = np.stack(heads).reshape(count, -1)
-    basis = principal_components(rows, 0.9999, centred=True)[0].reshape(-1, *heads[0].shape)
+    basis = dense_components(rows, 0.9999, centred=True)[0].reshape(-1, *heads[0].shape)
     return replace(
         data,
         template_vertex_positions=np.mean(heads, 0),

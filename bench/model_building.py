@@ -19,7 +19,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from coregister.first_model import build
-from coregister.next_model.expression import REGIONS, regional_masks
+from coregister.region_masks import REGIONS, regional_masks
 from registration.geometry.pca import principal_components
 from registration.model import gnm_npz
 

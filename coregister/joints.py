@@ -4,7 +4,7 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy.optimize import nnls
 
-from coregister.next_model.expression import smoothstep
+from coregister.region_masks import smoothstep
 from registration.model import regions
 from registration.model.gnm_npz import GNMData
 

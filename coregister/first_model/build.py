@@ -11,12 +11,11 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from coregister import joints
+from coregister import joints, region_masks
 from coregister.first_model import assembly, eyes, landmark_schemes, makehuman, population, tongue
 from coregister.first_model.assembly import COMPONENTS, JOINTS, Anatomy
 from coregister.first_model.makehuman import MakeHuman
-from coregister.next_model import expression
-from coregister.next_model.identity import principal_components
+from registration.geometry.pca import dense_components
 from registration.geometry.quads import corner_triangles, triangles_of
 from registration.model import gnm_npz, landmarks
 from registration.model.fetch import cache_folder
@@ -70,7 +69,7 @@ def bootstrap(out: Path | None = None) -> Path:
 def _code() -> bytes:
     """The sources that the model depends on: this package, and the geometry and bases that it uses."""
     here, geometry = Path(__file__).parent, Path(gnm_npz.__file__).parents[1] / "geometry"
-    used = [here.parent / "joints.py", here.parent / "next_model" / "expression.py", *sorted(geometry.glob("*.py"))]
+    used = [here.parent / "joints.py", here.parent / "region_masks.py", *sorted(geometry.glob("*.py"))]
     return b"".join(file.read_bytes() for file in [*sorted(here.glob("*.py")), *used])
 
 
@@ -153,7 +152,7 @@ def _identity_basis(
     V = len(made.template)
     rows = np.stack([np.concatenate([v - made.template, j - made.joints]).ravel() for v, j in heads])
     # Symmetric people make a symmetric basis: their own mirror images add nothing.
-    components, _ = principal_components(rows, IDENTITY_SHARE, centred=True)
+    components, _ = dense_components(rows, IDENTITY_SHARE, centred=True)
     components = components.reshape(len(components), -1, 3)
     ball = eyes.variation()
     eyeballs = np.zeros((len(ball), V, 3))
@@ -188,7 +187,7 @@ def _expression_basis(made: Anatomy, masks: Float[np.ndarray, "3 V"]) -> dict[st
     lower_face = _regional(np.stack([units[n] for n in lower]) * masks[2][:, None], rng)
     return {
         "left_eye_region": left_eye,
-        "right_eye_region": expression.mirrored(left_eye, made.mirror),
+        "right_eye_region": region_masks.mirrored(left_eye, made.mirror),
         "lower_face_region": lower_face,
         **_tongue_basis(made, rng),
         "pupils": _pupils(made),
@@ -201,7 +200,7 @@ def _regional(units: Float[np.ndarray, "U V 3"], rng: np.random.Generator) -> Fl
     mixtures = active * rng.uniform(size=active.shape)
     # The samples' span is the units': one QR instead of a Gram matrix over all vertices.
     q, r = np.linalg.qr(units.reshape(len(units), -1).T)
-    components, _ = principal_components(mixtures @ r.T, EXPRESSION_SHARE, centred=False)
+    components, _ = dense_components(mixtures @ r.T, EXPRESSION_SHARE, centred=False)
     return np.asarray((components @ q.T).reshape(len(components), *units.shape[1:]))
 
 
@@ -212,7 +211,7 @@ def _tongue_basis(made: Anatomy, rng: np.random.Generator) -> dict[str, Float[np
     samples = tongue.motions(made.template[rows], out, TONGUE_SAMPLES, rng).reshape(TONGUE_SAMPLES, -1)
     # As people's tongues go both ways, so must the basis: each sample comes with its mirror image.
     samples = np.concatenate([samples, _mirrored_tongue(made, samples)])
-    components, _ = principal_components(samples, TONGUE_SHARE, centred=True)
+    components, _ = dense_components(samples, TONGUE_SHARE, centred=True)
     found = {}
     for name, values in (("tongue_mean", samples.mean(0, keepdims=True)), ("tongue", components)):
         found[name] = np.zeros((len(values), *made.template.shape))
@@ -222,7 +221,7 @@ def _tongue_basis(made: Anatomy, rng: np.random.Generator) -> dict[str, Float[np
 
 def _mirrored_tongue(made: Anatomy, samples: Float[np.ndarray, "N D"]) -> Float[np.ndarray, "N D"]:
     mirror = made.parts["tongue"].mirror
-    return expression.mirrored(samples.reshape(len(samples), -1, 3), mirror).reshape(len(samples), -1)
+    return region_masks.mirrored(samples.reshape(len(samples), -1, 3), mirror).reshape(len(samples), -1)
 
 
 def _pupils(made: Anatomy) -> Float[np.ndarray, "1 V 3"]:
@@ -237,7 +236,7 @@ def _masks(made: Anatomy) -> Float[np.ndarray, "3 V"]:
     part = made.parts["skin"]
     masks = np.zeros((3, len(made.template)))
     masks[2] = 1
-    masks[:, made.slices["skin"]] = expression.soft_masks(part.vertices, made.skin.edges, part.mirror, part.groups)
+    masks[:, made.slices["skin"]] = region_masks.soft_masks(part.vertices, made.skin.edges, part.mirror, part.groups)
     return masks
 
 

@@ -9,9 +9,9 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from coregister.next_model import eyelids
-from coregister.next_model.expression import FLIP, mirrored
 from coregister.next_model.shrinkage import Mixed
 from coregister.next_model.shrinkage_weight import SHARES, left_out_rms
+from coregister.region_masks import FLIP, mirrored
 from registration.geometry import pca
 from registration.geometry.rigid import fit_twists, motion_fields
 from registration.geometry.topology import vertex_areas
@@ -210,21 +210,3 @@ def _filled(
     for side, socket in enumerate(both):
         basis[:, socket.ball] = shifts[:, None, side]
     return template, basis
-
-
-def principal_components(
-    samples: Float[np.ndarray, "N D"], share: float, *, centred: bool
-) -> tuple[Float[np.ndarray, "K D"], Float[np.ndarray, "K"]]:
-    """Components that keep this share of the samples' variance, each scaled by its standard deviation, and those.
-
-    Centred: about the mean, divided by N - 1; uncentred: about zero, divided by N. Exact, by the N x N Gram matrix,
-    which is the smaller one here. The largest entry of every component is positive, so the result is unique.
-    """
-    moved = samples - samples.mean(0) if centred else samples
-    count = len(samples) - 1 if centred else len(samples)
-    variance, vectors = np.linalg.eigh(moved @ moved.T / count)
-    variance, vectors = np.maximum(variance[::-1], 0), vectors[:, ::-1]
-    kept = int(np.searchsorted(np.cumsum(variance) / variance.sum(), share)) + 1
-    scaled = vectors[:, :kept].T @ moved / np.sqrt(count)
-    largest = scaled[np.arange(kept), np.abs(scaled).argmax(1)]
-    return scaled * np.sign(largest)[:, None], np.sqrt(variance[:kept])

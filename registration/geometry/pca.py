@@ -1,4 +1,4 @@
-"""Principal components of samples that are read as a stream."""
+"""Principal components: of a small matrix in memory, or of samples that are read as a stream."""
 
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
@@ -9,6 +9,30 @@ from jaxtyping import Float
 from scipy.linalg import eigh
 
 _BLOCK = 64  # samples a block
+
+
+def dense_components(
+    samples: Float[np.ndarray, "N D"], share: float, *, centred: bool
+) -> tuple[Float[np.ndarray, "K D"], Float[np.ndarray, "K"]]:
+    """Return the fewest components that hold this share of the variance of samples in memory, in float64 throughout.
+
+    The others read streams in float32 blocks. The first model is built with this one.
+
+    Args:
+        samples: fewer than D, since the N x N matrix of their products is decomposed.
+        share: of the variance, 0 to 1.
+        centred: about the mean, divided by N - 1; else about zero, divided by N.
+
+    Returns:
+        Components, each scaled by its standard deviation and with a positive largest entry, and standard deviations.
+    """
+    deviations = samples - samples.mean(0) if centred else samples
+    count = len(samples) - 1 if centred else len(samples)
+    variance, vectors = _descending(*np.linalg.eigh(deviations @ deviations.T / count))
+    kept = int(np.searchsorted(np.cumsum(variance) / variance.sum(), share)) + 1
+    components = vectors[:, :kept].T @ deviations / np.sqrt(count)
+    largest = components[np.arange(kept), np.abs(components).argmax(1)]
+    return components * np.sign(largest)[:, None], np.sqrt(variance[:kept])
 
 
 def uncentred_components(

@@ -6,7 +6,8 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from coregister.next_model import expression
-from coregister.next_model.expression import Expressions, regional_bases, regional_masks
+from coregister.next_model.expression import Expressions, regional_bases
+from coregister.region_masks import REGIONS, regional_masks
 from registration.geometry.topology import vertex_areas
 from registration.model import regions
 from tests.coregister.next_model import known
@@ -75,7 +76,7 @@ def test_a_region_equals_a_dense_uncentred_svd(displacements, weights, bases, mo
 
 def test_nothing_but_skin_and_what_the_jaw_takes_along_moves(bases, model):
     masks = regional_masks(model)
-    for name, mask in zip(expression.REGIONS, masks, strict=True):
+    for name, mask in zip(REGIONS, masks, strict=True):
         moving = (mask > 0) | (regions.jaw_parts(model) & (name == "lower_face_region"))
         assert not bases[name].basis[:, ~moving].any()
     still = (
@@ -92,7 +93,7 @@ def test_both_eyes_can_be_kept_apart(displacements, weights, bases, model):
 
 def test_the_previous_model_can_have_a_share(displacements, weights, bases, model):
     mixed = regional_bases(displacements, weights, model, Expressions(share=0.999, previous=0.3))
-    for name in expression.REGIONS:
+    for name in REGIONS:
         assert mixed[name].previous == 0.3 and bases[name].previous == 0
         total = mixed[name].energy.sum() / mixed[name].share
         assert total == pytest.approx(bases[name].energy.sum() / bases[name].share, rel=1e-4)

@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 from scipy.linalg import subspace_angles
 
-from coregister.next_model import expression, eyelids
+from coregister.next_model import eyelids
 from coregister.next_model.alignment import align_neutrals
 from coregister.next_model.identity import HeadIdentity, Identity, head_identity
+from coregister.region_masks import FLIP, mirrored
 from registration.geometry.rigid import fit_twists, motion_fields
 from registration.geometry.topology import vertex_areas
 from registration.model import regions
@@ -204,8 +205,8 @@ def test_mirrored_heads_make_a_symmetric_model(model):
     for settings in (MIRRORED, Identity(share=1.0, by_area=True)):
         found = head_identity(heads, model, settings)
         assert (found.heads, found.mirrored) == (12, True)
-        template = found.template[model.mirror_indices] * expression.FLIP
-        twins = expression.mirrored(found.basis, model.mirror_indices)
+        template = found.template[model.mirror_indices] * FLIP
+        twins = mirrored(found.basis, model.mirror_indices)
         flat, other = (basis.reshape(len(basis), -1) for basis in (found.basis, twins))
         left = other - other @ np.linalg.pinv(flat) @ flat
         print(f"template {np.abs(template - found.template).max():.1e} m, span {np.abs(left).max():.1e} m")
@@ -214,7 +215,7 @@ def test_mirrored_heads_make_a_symmetric_model(model):
         assert (same ^ opposite).all() and opposite.sum() >= 1
     # By its nature no component of the heads alone is that.
     alone = head_identity(heads, model, RAW)
-    twins = expression.mirrored(alone.basis, model.mirror_indices)
+    twins = mirrored(alone.basis, model.mirror_indices)
     assert min(np.abs(twins - sign * alone.basis).max((1, 2)).min() for sign in (1, -1)) > 1e-5
 
 
@@ -225,7 +226,7 @@ def test_mirrored_variance_keeps_its_meaning(model):
     heads = heads.astype(np.float32)
     found = head_identity(heads, model, MIRRORED)
     skin = regions.skin(model)
-    twins = expression.mirrored(heads, model.mirror_indices)
+    twins = mirrored(heads, model.mirror_indices)
     even, odd = (((heads + sign * twins) / 2)[:, skin].reshape(9, -1).astype(np.float64) for sign in (1, -1))
     even = np.linalg.svd(even - even.mean(0), compute_uv=False) ** 2 / 8
     odd = np.linalg.svd(odd, compute_uv=False) ** 2 / 9
@@ -233,7 +234,7 @@ def test_mirrored_variance_keeps_its_meaning(model):
     np.testing.assert_allclose(found.variance[: len(expected)], expected, rtol=1e-4)
     assert found.variance[len(expected) :].sum() < 1e-6 * expected.sum()
     # And its direction is a component: half a bump here, less half a bump there.
-    pair = ((bump - expression.mirrored(bump[None], model.mirror_indices)[0]) / 2)[skin].ravel()
+    pair = ((bump - mirrored(bump[None], model.mirror_indices)[0]) / 2)[skin].ravel()
     own = _skin(found.basis, model)
     cosine = np.abs(own @ pair) / np.linalg.norm(own, axis=1) / np.linalg.norm(pair)
     assert cosine.max() > 1 - 1e-5

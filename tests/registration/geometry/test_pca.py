@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from registration.geometry.pca import principal_components, uncentred_components
+from registration.geometry.pca import dense_components, principal_components, uncentred_components
 
 
 @pytest.mark.parametrize("count, size", [(30, 200), (300, 20)], ids=["products of samples", "products of entries"])
@@ -89,3 +89,13 @@ def test_weights_must_be_one_a_sample():
     for count in (6, 8):
         with pytest.raises(ValueError):
             principal_components(samples, centred=True, weights=np.ones(count))
+
+
+@pytest.mark.parametrize("centred", [False, True], ids=["about zero", "about the mean"])
+def test_dense_components_are_those_of_the_stream(centred: bool):
+    samples = _faces(np.random.default_rng(6), count=60).astype(np.float64)
+    components, deviation = dense_components(samples, 0.9, centred=centred)
+    streamed = principal_components(list(samples), centred=centred, share=0.9)
+    assert len(components) == len(streamed.components)
+    np.testing.assert_allclose(deviation, np.sqrt(streamed.variance), rtol=1e-4)
+    np.testing.assert_allclose(components, streamed.components, atol=1e-4 * deviation[0])
