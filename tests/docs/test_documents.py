@@ -7,6 +7,7 @@ import subprocess
 import tomllib
 from collections.abc import Callable, Iterator
 from functools import cache
+from itertools import pairwise
 from pathlib import Path
 
 import pytest
@@ -212,19 +213,36 @@ def test_glossary_is_alphabetic_and_says_each_term_once():
     assert terms == sorted(set(terms))
 
 
-def test_ten_minutes_lists_every_room():
-    """The list names each package with the folders directly inside it, no other."""
+def test_ten_minutes_lists_every_room_in_import_order():
+    """The list names each package with the folders directly inside it, no other, in the order of the contracts."""
     text = (ROOT / "docs" / "ten_minutes.md").read_text("utf-8")
     (block,) = [block for _, block in FENCE.findall(text) if "registration    " in block]
-    listed, package = set(), ""
+    listed, package = list[str](), ""
     for line in block.splitlines():
         name = line.split()[0]
         package = package if line.startswith(" ") else name
-        listed.add(f"{package}/{name}" if line.startswith(" ") else name)
+        listed.append(f"{package}/{name}" if line.startswith(" ") else name)
     rooms = {path.rsplit("/", 1)[0] for path in tracked() if path.endswith("/__init__.py") and path.count("/") <= 2}
     rooms = {room for room in rooms if room.split("/")[0] in ("registration", "coregister", "workflows")}
     assert {name for name in listed if not name.endswith(".py")} == rooms
     assert {name for name in listed if name.endswith(".py")} <= tracked()
+    position = {name.removesuffix(".py"): number for number, name in enumerate(listed)}
+    for name, layers in import_layers().items():
+        listed_layers = [[position[room] for room in layer if room in position] for layer in layers]
+        listed_layers = [layer for layer in listed_layers if layer]
+        assert all(max(upper) < min(lower) for upper, lower in pairwise(listed_layers)), name
+
+
+def import_layers() -> dict[str, list[list[str]]]:
+    """The layers of each import contract, from the top, as paths from the root without a suffix."""
+    contracts = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["tool"]["importlinter"]["contracts"]
+    layers = {}
+    for contract in contracts:
+        if contract["type"] == "layers":
+            prefixes = [f"{container}/" for container in contract.get("containers", [])] or [""]
+            rooms = [[room.strip() for room in layer.split("|")] for layer in contract["layers"]]
+            layers[contract["name"]] = [[prefix + room for prefix in prefixes for room in layer] for layer in rooms]
+    return layers
 
 
 def sources() -> dict[str, str]:
