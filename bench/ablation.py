@@ -21,6 +21,7 @@ from registration.capture.native import read
 from registration.evaluate.audit import BEYOND
 from registration.evaluate.evaluation import evaluate
 from registration.fit.recipes import Recipe, Stage, draft
+from registration.options import RegisterOptions
 from registration.progress import shown
 from registration.register import register
 from registration.storage.registration_folder import load_registration
@@ -90,17 +91,11 @@ def main() -> None:
             recipe, folder = VARIANTS[name](draft()), options.out / name.replace(" ", "_")
             recipe = replace(recipe, name=f"draft without {name}" if name != "everything" else "draft")
             progress.note(f"without {name}" if name != "everything" else name)
-            made = register(
-                options.neutral, model_path=options.model, out=folder / "neutral", recipe=recipe, progress=progress
-            )
+            chosen = RegisterOptions(recipe=recipe)
+            made = register(options.neutral, options.model, folder / "neutral", chosen, progress=progress)
             neutral_table.add_row(name, *_row(made, None))
             made = register(
-                options.expression,
-                model_path=options.model,
-                out=folder / "expression",
-                recipe=recipe,
-                neutral=whole,
-                progress=progress,
+                options.expression, options.model, folder / "expression", chosen, neutral=whole, progress=progress
             )
             found = evaluate(
                 made,

@@ -52,7 +52,7 @@ def registered(captures: Sequence[Path], model: Path, out: Path) -> list[tuple[C
         for number, path in enumerate(captures):
             capture = read(path)
             progress.at(number, len(captures), capture.subject)
-            one = register(path, model_path=model, out=out / "registrations" / capture.subject, progress=progress)
+            one = register(path, model, out / "registrations" / capture.subject, progress=progress)
             found.append((capture, one))
     return found
 

@@ -2,46 +2,34 @@
 
 import time
 from collections.abc import Collection, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float
 
-from registration.capture.doctor import validate
-from registration.capture.native import read
-from registration.capture.triangulation import triangulate
-from registration.errors import InputError
 from registration.evaluate.audit import audit
 from registration.evaluate.evaluation import Evaluation, evaluate
 from registration.fit.initialization import LEAST_LANDMARKS, LEAST_OVERLAP, from_landmarks, from_masks, spread_views
 from registration.fit.problem import Fit, Outcome
-from registration.fit.recipes import Recipe, Stage, expression_of, recipe_named
-from registration.fit.variables import Start, pivot, start_of
+from registration.fit.recipes import Stage
+from registration.fit.variables import Start, start_of
 from registration.fit.view_weights import ViewErrors
-from registration.geometry.topology import edges
-from registration.model import gnm_npz
+from registration.inputs import RegistrationInputs, read_inputs
 from registration.model.atlas import texture_atlas
 from registration.model.gnm import GNM
-from registration.model.landmarks import LandmarkScheme, read_scheme, schemes_beside
-from registration.model.regions import exterior, vertex_classes
+from registration.model.regions import exterior
+from registration.options import RegisterOptions
 from registration.progress import Progress, Silent
 from registration.render import backend
 from registration.report.inputs import ReportInputs, heat_map, report_views
 from registration.report.page import write_report
 from registration.report.stage_snapshots import write_stage
 from registration.storage import hashing
-from registration.storage.registration_folder import (
-    check_output_folder,
-    find_existing,
-    load_registration,
-    save_registration,
-)
-from registration.targets.classes import BACKGROUND, class_map
+from registration.storage.registration_folder import check_output_folder, find_existing, save_registration
+from registration.targets.classes import class_map
 from registration.targets.pyramid import build_pyramid
-from registration.types import Capture, Parameters, Registration, Status
+from registration.types import Parameters, Registration, Status
 
 SETTLED_MM = 0.05  # 95th percentile of vertex motion over the last tenth of the last stage
 LANDMARK_PX = 3.0  # median residual at 512 px of head height
@@ -50,52 +38,28 @@ _REPORT_VIEWS = 8
 _STAGE_VIEWS = 3
 
 
-@dataclass(frozen=True, kw_only=True)
-class Inputs:
-    """All that a registration is made from, read and checked."""
-
-    capture: Capture
-    data: gnm_npz.GNMData
-    schemes: Mapping[str, LandmarkScheme]
-    landmarks: Mapping[str, Float[np.ndarray, "L 3"]]  # triangulated, of the schemes that capture and model share
-    recipe: Recipe
-    neutral: Registration | None
-    digests: Mapping[str, str]  # of the input files
-    config: Mapping[str, Any]  # resolved; decides the result together with the digests
-
-
 def register(
-    capture_path: Path,
-    *,
-    model_path: Path,
+    capture: Path,
+    model: Path,
     out: Path,
-    recipe: str | Recipe = "draft",
-    views: int | None = None,
-    seed: int = 0,
+    options: RegisterOptions = RegisterOptions(),  # noqa: B008  frozen
+    *,
     neutral: Path | None = None,
-    deterministic: bool = False,
     force: bool = False,
-    variant: backend.Variant = "llvm",
-    landmark_files: Mapping[str, Path] | None = None,
     pictures: Path | None = None,
     progress: Progress | None = None,
 ) -> Registration:
     """Register one capture and write the registration folder `out`.
 
     Args:
-        capture_path: a native capture folder.
-        model_path: an official GNM NPZ file; landmark schemes lie beside it.
-        out: replaced if we wrote it before; returned at once if it was made from the same inputs.
-        recipe: "preview", "draft", "studio", "in_model", or one of your own.
-        views: use only so many views, spread around the head.
-        seed: of view subsets and silhouette samples.
-        neutral: folder of the subject's neutral registration: its identity, offsets and texture are the start, and
-            its identity stays.
-        deterministic: every array equal from run to run, for about twice the time.
+        capture: a native capture folder.
+        model: an official GNM NPZ file; landmark schemes lie next to it.
+        out: replaced if it is a registration; returned at once if it was made from the same inputs.
+        options: recipe, views, seed and the like.
+        neutral: folder of the subject's neutral registration: its identity, offsets and texture are the initial
+            guess, and its identity stays.
         force: compute even if `out` already holds this result.
-        variant: "llvm" (CPU) or "cuda".
-        landmark_files: scheme name -> file, instead of those beside the model.
-        pictures: a folder for a picture and the mesh of the fit at its start and after each stage, for debugging.
+        pictures: a folder for an image and the mesh of the fit at its start and after each stage, for debugging.
         progress: where to report to.
 
     Returns:
@@ -105,135 +69,23 @@ def register(
         InputError: something cannot be used; nothing is computed or written.
     """
     progress = progress or Silent()
+    out = Path(out)
     check_output_folder(out)
-    inputs = _read_inputs(
-        Path(capture_path),
-        Path(model_path),
-        recipe,
-        views,
-        None if neutral is None else Path(neutral),
-        {name: Path(file) for name, file in (landmark_files or {}).items()},
-        {"seed": seed, "deterministic": deterministic, "variant": variant},
-    )
-    digest = hashing.input_hash(inputs.digests, inputs.config)
-    if not force and (same := find_existing(out, digest)) is not None:
+    inputs = read_inputs(Path(capture), Path(model), options, None if neutral is None else Path(neutral))
+    if not force and (same := find_existing(out, inputs.input_hash)) is not None:
         progress.note(f"{out} already holds the registration of these inputs")
         return same
-    device = backend.activate(variant, deterministic=deterministic)
-    torch.manual_seed(seed)
-    fit, start, outcome = _fit(inputs, seed, device, pictures, progress)
+    device = backend.activate(options.variant, deterministic=options.deterministic)
+    torch.manual_seed(options.seed)
+    fit, start, outcome = _fit(inputs, options.seed, device, pictures, progress)
     registration = _collect(inputs, fit, start, outcome)
     registration, page = _judge(inputs, fit, registration, progress)
     save_registration(registration, out, page)
     return registration
 
 
-def _read_inputs(
-    capture_path: Path,
-    model_path: Path,
-    wanted: str | Recipe,
-    views: int | None,
-    neutral_path: Path | None,
-    landmark_files: Mapping[str, Path],
-    settings: Mapping[str, Any],
-) -> Inputs:
-    """Read and check everything; only landmarks are triangulated."""
-    recipe = recipe_named(wanted) if isinstance(wanted, str) else wanted
-    capture = read(capture_path)
-    validate(capture)
-    if views is not None:
-        capture = _some_views(capture, views)
-    data = gnm_npz.read(model_path)
-    _check_parts(data)
-    neutral = None
-    if neutral_path is not None:
-        neutral = load_registration(neutral_path)
-        _check_topology(neutral, data, neutral_path, model_path)
-        recipe = expression_of(recipe)
-    count = len(data.template_vertex_positions)
-    schemes = schemes_beside(model_path, count)
-    schemes |= {name: read_scheme(file, count, name) for name, file in landmark_files.items()}
-    landmarks = _landmarks(capture, schemes)
-    _check_start(capture, landmarks)
-    digests = {"capture": hashing.hash_capture(capture), "model": gnm_npz.content_hash(data)}
-    digests |= {f"landmarks {name}": hashing.hash_arrays(s.indices, s.weights) for name, s in schemes.items()}
-    if neutral is not None:
-        digests["neutral"] = hashing.hash_arrays(neutral.identity, neutral.offsets, neutral.vertices, neutral.texture)
-    config = {"recipe": hashing.to_jsonable(recipe), "views": [view.name for view in capture.views], **settings}
-    return Inputs(
-        capture=capture,
-        data=data,
-        schemes=schemes,
-        landmarks=landmarks,
-        recipe=recipe,
-        neutral=neutral,
-        digests=digests,
-        config=config,
-    )
-
-
-def _some_views(capture: Capture, count: int) -> Capture:
-    if count < 2:
-        raise InputError("Too few views", where="views", expected="at least 2", got=count, fix="use at least two views")
-    chosen = spread_views([view.camera for view in capture.views], count)
-    return replace(capture, views=tuple(capture.views[i] for i in chosen))
-
-
-def _landmarks(capture: Capture, schemes: Mapping[str, LandmarkScheme]) -> dict[str, Float[np.ndarray, "L 3"]]:
-    """Triangulated landmarks (world, metres; NaN = unseen) of every scheme that capture and model share."""
-    solved = {}
-    for name in sorted({name for view in capture.views for name in view.landmarks} & set(schemes)):
-        solved[name] = triangulate(capture, name)[0]
-        expected = len(schemes[name].indices)
-        if len(solved[name]) != expected:
-            raise InputError(
-                "Landmarks of another length than the model's scheme",
-                where=f"scheme {name} of {capture.root}",
-                expected=f"{expected} landmarks",
-                got=len(solved[name]),
-                fix=f"name the scheme otherwise, or give the model's with --landmarks {name}=FILE",
-            )
-    return solved
-
-
-def _check_parts(data: gnm_npz.GNMData) -> None:
-    """Raise now what the fit would trip over: missing vertex groups or components, a mesh that is no manifold."""
-    vertex_classes(data)
-    pivot(data)
-    texture_atlas(data)
-    edges(data.triangles)
-
-
-def _check_start(capture: Capture, landmarks: Mapping[str, Float[np.ndarray, "L 3"]]) -> None:
-    counts = {name: int(np.isfinite(points).all(1).sum()) for name, points in landmarks.items()}
-    labelled = BACKGROUND in capture.classes and any(view.segmentation for view in capture.views)
-    if max(counts.values(), default=0) < LEAST_LANDMARKS and not labelled and not any(v.mask for v in capture.views):
-        found = [f"{count} triangulated of scheme {name}" for name, count in counts.items()]
-        raise InputError(
-            "Nothing tells where the head is",
-            where=capture.root,
-            expected=f"{LEAST_LANDMARKS} landmarks of a scheme that the model knows, or masks",
-            got=", ".join([*(found or ["no landmarks that the model knows"]), "no masks"]),
-            fix="add masks (or label maps with a background), landmarks, or the model's landmarks with --landmarks",
-        )
-
-
-def _check_topology(neutral: Registration, data: gnm_npz.GNMData, neutral_path: Path, model_path: Path) -> None:
-    same = gnm_npz.topology_hash(neutral.triangles) == gnm_npz.topology_hash(data.triangles)
-    sizes = (len(neutral.identity), len(neutral.expression), len(neutral.vertices))
-    expected = (len(data.vertex_identity_basis), len(data.expression_basis), len(data.template_vertex_positions))
-    if not same or sizes != expected:
-        raise InputError(
-            "The neutral was registered with another model",
-            where=neutral_path,
-            expected=f"identity, expression, vertices {expected} and the triangles of {model_path}",
-            got=f"{sizes}, {'the same' if same else 'other'} triangles",
-            fix="register the neutral with this model first",
-        )
-
-
 def _fit(
-    inputs: Inputs, seed: int, device: torch.device, pictures: Path | None, progress: Progress
+    inputs: RegistrationInputs, seed: int, device: torch.device, pictures: Path | None, progress: Progress
 ) -> tuple[Fit, Start, Outcome]:
     """Read the targets, find the start, run the stages."""
     begun = time.perf_counter()
@@ -280,7 +132,7 @@ def _fit(
     return fit, start, outcome
 
 
-def _start(inputs: Inputs, fit: Fit, progress: Progress) -> Start:
+def _start(inputs: RegistrationInputs, fit: Fit, progress: Progress) -> Start:
     """From landmarks if the model knows a scheme of the capture's, from the neutral's pose, or from the masks."""
     neutral = None
     if inputs.neutral is not None:
@@ -312,7 +164,7 @@ def _parameters(registration: Registration) -> Parameters:
     return Parameters(**{name: torch.as_tensor(np.asarray(getattr(registration, name))) for name in names})
 
 
-def _collect(inputs: Inputs, fit: Fit, start: Start, outcome: Outcome) -> Registration:
+def _collect(inputs: RegistrationInputs, fit: Fit, start: Start, outcome: Outcome) -> Registration:
     """The result as arrays, with its status."""
     parameters, offsets = fit.unknowns.parameters()
     positions = fit.vertices()
@@ -379,7 +231,9 @@ def _status(
     return status, "; ".join([*reasons, views] if views else reasons)
 
 
-def _judge(inputs: Inputs, fit: Fit, registration: Registration, progress: Progress) -> tuple[Registration, str]:
+def _judge(
+    inputs: RegistrationInputs, fit: Fit, registration: Registration, progress: Progress
+) -> tuple[Registration, str]:
     """Figures against the scan, if there is one, and the report."""
     evaluation: Evaluation | None = None
     finite = np.isfinite(registration.vertices).all()

@@ -13,7 +13,8 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 from torch import Tensor
 
-from registration.fit.optimizer import AdamUniformBlock, Rate, minimise
+from registration.fit.optimizer import AdamUniformBlock, minimise
+from registration.fit.recipes import Rate
 from registration.fit.variables import skin_topology, skin_vertices
 from registration.frames import MM_PER_M
 from registration.geometry.closest_point import closest_points

@@ -12,7 +12,8 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from registration.fit.optimizer import AdamUniformBlock, Rate, minimise
+from registration.fit.optimizer import AdamUniformBlock, minimise
+from registration.fit.recipes import Rate
 from registration.frames import MM_PER_M
 from registration.geometry.closest_point import barycentric_points, closest_points
 from registration.geometry.large_steps import LargeSteps

@@ -1,28 +1,15 @@
 """The one optimisation loop. It is handed blocks of unknowns and an objective, and knows none by name."""
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Int
 from torch import Tensor
 
+from registration.fit.recipes import Rate
+
 History = dict[str, list[float]]
-
-
-@dataclass(frozen=True, kw_only=True)
-class Rate:
-    """A learning rate: `start`, held for a share of the steps, then falling geometrically to `end`."""
-
-    start: float
-    end: float
-    hold: float = 0.0
-
-    def at(self, progress: float) -> float:
-        """The rate when a share `progress` of the steps is done."""
-        fall = max(0.0, progress - self.hold) / max(1e-9, 1.0 - self.hold)
-        return self.start * (self.end / self.start) ** fall
 
 
 @runtime_checkable

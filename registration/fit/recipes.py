@@ -3,11 +3,28 @@
 A recipe is a function that returns its stages; the resolved values are saved with every result.
 """
 
+import importlib
+import sys
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
 
 from registration.errors import InputError
-from registration.fit.optimizer import Rate
+
+
+@dataclass(frozen=True, kw_only=True)
+class Rate:
+    """A learning rate: `start`, held for a share of the steps, then falling geometrically to `end`."""
+
+    start: float
+    end: float
+    hold: float = 0.0
+
+    def at(self, progress: float) -> float:
+        """The rate when a share `progress` of the steps is done."""
+        fall = max(0.0, progress - self.hold) / max(1e-9, 1.0 - self.hold)
+        return self.start * (self.end / self.start) ** fall
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -189,14 +206,62 @@ RECIPES: dict[str, Callable[[], Recipe]] = {
 }
 
 
-def recipe_named(name: str) -> Recipe:
-    """Raises InputError for a name that no recipe has."""
+def named_recipe(name: str) -> str:
+    """Return the name of a recipe of `RECIPES`. Jobs may name no other: an import path runs code of the sender's.
+
+    Raises:
+        InputError: no such name.
+    """
     if name not in RECIPES:
         raise InputError(
-            "There is no such recipe",
-            where="recipe",
-            expected=" or ".join(RECIPES),
-            got=name,
-            fix="choose one of them",
+            "There is no such recipe", where="recipe", expected=" or ".join(RECIPES), got=name, fix="choose one of them"
         )
-    return RECIPES[name]()
+    return name
+
+
+def load_recipe(recipe: str | Recipe) -> Recipe:
+    """Return the recipe of a name or import path.
+
+    Args:
+        recipe: a key of `RECIPES`; `module:function`, the import path of a function without parameters that returns
+            a Recipe, looked up in the working directory too; or a Recipe, which is returned as it is.
+
+    Raises:
+        InputError: an unknown name, a module or function that cannot be imported or fails, or a result that is not a
+            Recipe.
+    """
+    if isinstance(recipe, Recipe):
+        return recipe
+    if recipe in RECIPES:
+        return RECIPES[recipe]()
+    module, _, function = recipe.partition(":")
+    if not (module and function):
+        raise _recipe_error(recipe, got=f"the name {recipe}")
+    try:
+        loaded = _import(module, function)()
+    except Exception as error:  # the module is the user's: anything may go wrong
+        raise _recipe_error(recipe, got=f"{type(error).__name__}: {error}") from error
+    if not isinstance(loaded, Recipe):
+        raise _recipe_error(recipe, got=f"a function that returns {type(loaded).__name__}")
+    return loaded
+
+
+def _import(module: str, function: str) -> Callable[[], Any]:
+    """The function of a module, which may lie in the working directory."""
+    folder = str(Path.cwd())
+    sys.path.insert(0, folder)
+    try:
+        result: Callable[[], Any] = getattr(importlib.import_module(module), function)
+    finally:
+        sys.path.remove(folder)
+    return result
+
+
+def _recipe_error(recipe: str, *, got: str) -> InputError:
+    return InputError(
+        "There is no such recipe",
+        where="recipe",
+        expected=f"{', '.join(RECIPES)}, or module:function of a function that returns a Recipe",
+        got=got,
+        fix="choose one by name, or correct the import path",
+    )

@@ -5,14 +5,14 @@ import json
 import math
 import platform
 from collections.abc import Mapping
-from dataclasses import fields, is_dataclass
+from dataclasses import fields, is_dataclass, replace
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from registration.types import Capture
+from registration.types import Capture, Registration
 
 PACKAGES = (
     "gnm-registration",
@@ -32,20 +32,54 @@ def hash_file(path: Path) -> str:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
+# Fields that decide nothing, each with the reason. All others are hashed, also those that are added later.
+NOT_HASHED: Mapping[type, Mapping[str, str]] = {
+    Capture: {"root": "the files' contents decide, not where they lie"},
+    Registration: {
+        "status": "an assessment of the arrays",
+        "reason": "an assessment of the arrays",
+        "seconds": "how long it took",
+        "history": "how it was fitted",
+        "figures": "measurements of the arrays",
+        "config": "the arrays are its result",
+        "inputs": "the arrays are their result",
+    },
+}
+
+
 def hash_capture(capture: Capture) -> str:
-    """sha256 of all a capture holds: cameras, landmarks, names and its files' bytes; not of where it lies."""
+    """sha256 of all that a capture holds, cameras, landmarks, names and the bytes of its files; not of its path.
+
+    The order of the views does not matter.
+    """
+    return hash_fields(replace(capture, views=tuple(sorted(capture.views, key=lambda view: view.name))))
+
+
+def hash_fields(value: Any) -> str:
+    """sha256 of the fields of a dataclass, nested ones too, but for those of `NOT_HASHED`.
+
+    Of a path the file's bytes count, of an array its type, shape and values.
+    """
     digest = hashlib.sha256()
-    _feed(digest, [capture.subject, capture.expression, capture.classes, capture.tags])
-    for view in sorted(capture.views, key=lambda v: v.name):
-        camera = view.camera
-        _feed(digest, [view.name, camera.width_px, camera.height_px, camera.distortion])
-        _feed(digest, [camera.intrinsics, camera.T_cam_world])
-        _feed(digest, {name: np.asarray(points) for name, points in view.landmarks.items()})
-        for file in (view.image, view.mask, view.normals, view.segmentation):
-            _feed(digest, hash_file(file) if file else None)
-    for file in (capture.scan, capture.ground_truth):
-        _feed(digest, hash_file(file) if file else None)
+    _feed(digest, _field_digests(value))
     return digest.hexdigest()
+
+
+def hashed_fields(value: Any, not_hashed: Mapping[str, str] | None = None) -> dict[str, Any]:
+    """The fields of a dataclass that decide a result, by name: all but those of `NOT_HASHED` and `not_hashed`."""
+    excluded = {name for kind, names in NOT_HASHED.items() if isinstance(value, kind) for name in names}
+    excluded |= set(not_hashed or {})
+    return {f.name: getattr(value, f.name) for f in fields(value) if f.name not in excluded}
+
+
+def _field_digests(value: Any) -> Any:
+    if is_dataclass(value) and not isinstance(value, type):
+        return {name: _field_digests(item) for name, item in hashed_fields(value).items()}
+    if isinstance(value, Mapping):
+        return {str(key): _field_digests(item) for key, item in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_field_digests(item) for item in value]
+    return hash_file(value) if isinstance(value, Path) else value
 
 
 def input_hash(inputs: Mapping[str, str], config: Mapping[str, Any]) -> str:

@@ -12,6 +12,7 @@ from registration.capture.native import read
 from registration.capture.scan import read_truth
 from registration.model import gnm_npz
 from registration.model.gnm_npz import GNMData
+from registration.options import RegisterOptions
 from registration.storage.hashing import hash_capture, input_hash
 from registration.storage.registration_folder import find_existing, save_registration
 from registration.types import Registration
@@ -68,21 +69,19 @@ class Finds:
         self.outcomes: dict[str, BaseException | Callable[[np.ndarray], np.ndarray]] = {}  # SUBJECT/CAPTURE
         self.made: list[Path] = []
 
-    def __call__(
-        self, capture_path: Path, *, model_path: Path, out: Path, recipe: str, views: int | None, seed: int, **_: object
-    ) -> Registration:
-        data, capture = gnm_npz.read(model_path), read(capture_path)
-        inputs = {"capture": hash_capture(capture), "model": gnm_npz.content_hash(data)}
-        config = {"recipe": recipe, "views": views, "seed": seed}
+    def __call__(self, capture: Path, model: Path, out: Path, options: RegisterOptions, **_: object) -> Registration:
+        data, moment = gnm_npz.read(model), read(capture)
+        inputs = {"capture": hash_capture(moment), "model": gnm_npz.content_hash(data)}
+        config = {"recipe": options.recipe, "views": options.views, "seed": options.seed}
         if (same := find_existing(out, input_hash(inputs, config))) is not None:
             return same
-        outcome = self.outcomes.get("/".join(capture_path.parts[-2:]))
+        outcome = self.outcomes.get("/".join(capture.parts[-2:]))
         if isinstance(outcome, BaseException):
             raise outcome
-        assert capture.ground_truth is not None
-        vertices = read_truth(capture.ground_truth)
+        assert moment.ground_truth is not None
+        vertices = read_truth(moment.ground_truth)
         vertices = vertices if outcome is None else outcome(vertices)
-        turn, shift = world(int(capture.subject[1:]), capture.expression)
+        turn, shift = world(int(moment.subject[1:]), moment.expression)
         result = a_registration(
             identity=np.zeros(len(data.vertex_identity_basis), np.float32),
             expression=np.zeros(len(data.expression_basis), np.float32),

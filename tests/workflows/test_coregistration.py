@@ -196,14 +196,14 @@ def test_neutrals_alone_will_do_and_bare_captures_are_measured_by_registrations(
     real = finds.__class__.__call__
     np.savez(tmp_path / "truth.npz", vertices=head(gnm_npz.read(MODEL), 4))
 
-    def with_truth(self, capture_path, **options):
-        if "p4" in capture_path.parts:
-            shutil.copy(tmp_path / "truth.npz", capture_path / "ground_truth.npz")
+    def with_truth(self, capture, *arguments, **options):
+        if "p4" in capture.parts:
+            shutil.copy(tmp_path / "truth.npz", capture / "ground_truth.npz")
         try:
-            return real(self, capture_path, **options)
+            return real(self, capture, *arguments, **options)
         finally:
-            if "p4" in capture_path.parts:
-                (capture_path / "ground_truth.npz").unlink()
+            if "p4" in capture.parts:
+                (capture / "ground_truth.npz").unlink()
 
     finds.__class__ = type("Bare", (Finds,), {"__call__": with_truth})
     state = go(dataset, tmp_path / "out", rule=Rule(rounds=1))

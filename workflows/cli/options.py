@@ -56,40 +56,6 @@ class FitOptions:
 
 
 @dataclass(frozen=True, kw_only=True)
-class RegisterOptions(FitOptions):
-    """How captures are registered in this process.
-
-    Attributes:
-        deterministic: Compute bitwise reproducible arrays; slower.
-        landmarks: The model's vertices for landmark schemes, instead of the files beside the model.
-    """
-
-    deterministic: bool = False
-    landmarks: Annotated[tuple[str, ...], arg(metavar="SCHEME=FILE", help_behavior_hint=NOT_SET)] = ()
-
-    def landmark_files(self) -> dict[str, Path]:
-        """Scheme -> file.
-
-        Raises:
-            InputError: an entry is not of the form SCHEME=FILE.
-        """
-        return {scheme: Path(file) for scheme, file in (self._pair(text) for text in self.landmarks)}
-
-    @staticmethod
-    def _pair(text: str) -> tuple[str, str]:
-        scheme, _, file = text.partition("=")
-        if not (scheme and file):
-            raise InputError(
-                "Cannot read a landmark file argument",
-                where="--landmarks",
-                expected="SCHEME=FILE, e.g. 68=head_sparse_68.txt",
-                got=text,
-                fix="write the scheme's name, an equals sign and the path of the model's landmark file",
-            )
-        return scheme, file
-
-
-@dataclass(frozen=True, kw_only=True)
 class StudioOptions:
     """The synthetic studio that renders captures.
 

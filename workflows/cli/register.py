@@ -5,14 +5,8 @@ from typing import Annotated
 
 from tyro.conf import Positional, arg
 
-from workflows.cli.options import (
-    CaptureFolder,
-    Folder,
-    ModelFile,
-    OptionalCapture,
-    OptionalRegistration,
-    RegisterOptions,
-)
+from registration.options import RegisterOptions
+from workflows.cli.options import CaptureFolder, Folder, ModelFile, OptionalCapture, OptionalRegistration
 
 _DEFAULTS = RegisterOptions()
 
@@ -24,7 +18,7 @@ def register(
     out: Folder,
     neutral: OptionalRegistration = None,
     force: bool = False,
-    fit: RegisterOptions = _DEFAULTS,
+    options: RegisterOptions = _DEFAULTS,
 ) -> int:
     """Fit the head model to one capture and write the registered mesh.
 
@@ -34,27 +28,13 @@ def register(
         out: The registration folder to write; one that gnmreg wrote before is replaced.
         neutral: Start from this registration of the same subject's neutral and keep its identity.
         force: Register again although the folder holds the result of the same input.
-        fit: How the capture is registered.
+        options: How the capture is registered.
     """
-    landmark_files = fit.landmark_files()
     from registration.progress import shown
     from registration.register import register
 
     with shown() as progress:
-        result = register(
-            capture,
-            model_path=model,
-            out=out,
-            recipe=fit.recipe,
-            views=fit.views,
-            seed=fit.seed,
-            neutral=neutral,
-            deterministic=fit.deterministic,
-            force=force,
-            variant=fit.variant,
-            landmark_files=landmark_files,
-            progress=progress,
-        )
+        result = register(capture, model, out, options, neutral=neutral, force=force, progress=progress)
     print(f"{result.status}: {result.reason}\n{out}")
     return 1 if result.status == "failed" else 0
 
@@ -68,7 +48,7 @@ def subject(
         str | None, arg(metavar="NAME", help_behavior_hint='(default: the one labelled "neutral")')
     ] = None,
     force: bool = False,
-    fit: RegisterOptions = _DEFAULTS,
+    options: RegisterOptions = _DEFAULTS,
 ) -> int:
     """Register all captures of a subject: the neutral, then the expressions.
 
@@ -80,27 +60,13 @@ def subject(
         out: The folder to write: a registration for each capture, subject.json and index.html.
         neutral: The neutral's sub-folder.
         force: Register again although the folder holds the results of the same input.
-        fit: How the captures are registered.
+        options: How the captures are registered.
     """
-    landmark_files = fit.landmark_files()
     from registration.progress import shown
     from workflows.steps.subject import register_subject
 
     with shown() as progress:
-        result = register_subject(
-            subject,
-            model_path=model,
-            out=out,
-            recipe=fit.recipe,
-            views=fit.views,
-            seed=fit.seed,
-            neutral=neutral,
-            deterministic=fit.deterministic,
-            force=force,
-            variant=fit.variant,
-            landmark_files=landmark_files,
-            progress=progress,
-        )
+        result = register_subject(subject, model, out, options, neutral=neutral, force=force, progress=progress)
     for row in result.rows:
         print(f"{row.name}: {row.status}: {row.reason}")
     print(out / "index.html")

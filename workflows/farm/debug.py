@@ -7,6 +7,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from registration.errors import InputError
+from registration.fit.recipes import named_recipe
+from registration.options import RegisterOptions
 from registration.progress import Progress
 from workflows.engine.child import function_of
 from workflows.engine.jobs import checked
@@ -70,14 +72,16 @@ def _register(arguments: Mapping[str, Any], out: Path, progress: Progress, port:
         page = None if port is None else _page(out / PICTURES, capture, model, port, progress)
         if page is not None:
             until_done.callback(page.close)
+        options = {key: arguments[key] for key in ("recipe", "views", "seed", "variant") if key in arguments}
+        named_recipe(options.get("recipe", "draft"))
         result = register(
             capture,
-            model_path=model,
-            out=out / REGISTRATION,
+            model,
+            out / REGISTRATION,
+            RegisterOptions(**options),
             neutral=None if neutral is None else Path(neutral),
             pictures=out / PICTURES,
             progress=progress,
-            **{key: arguments[key] for key in ("recipe", "views", "seed", "variant") if key in arguments},
         )
         until_done.pop_all()  # the page stays
     return Debugged(told=f"{result.status}: {result.reason}", page=page)

@@ -7,7 +7,7 @@ from pathlib import Path
 from coregister.evaluate.linear_fit import identity_part
 from coregister.stopping_rule import Rule
 from registration.errors import InputError
-from registration.fit.recipes import recipe_named
+from registration.fit.recipes import named_recipe
 from registration.model import gnm_npz
 from workflows.records.coregistration import Plan, check_out
 from workflows.records.dataset import read_dataset, split
@@ -42,7 +42,7 @@ def make_plan(
         InputError: `read_dataset`, `split` or `check_out` refuses; no such recipe or model; more components than there
             can be. Nothing is computed or written.
     """
-    recipe_named(recipe)
+    named_recipe(recipe)
     found = read_dataset(dataset)
     plan = Plan(
         dataset=Path(dataset),

@@ -4,9 +4,10 @@ from pathlib import Path
 from typing import Any
 
 from registration.capture.native import read
-from registration.fit.recipes import recipe_named
+from registration.fit.recipes import named_recipe
+from registration.inputs import input_hash, read_schemes
 from registration.model import gnm_npz
-from registration.model.landmarks import schemes_beside
+from registration.options import RegisterOptions
 from registration.progress import Progress
 from registration.register import register
 from registration.render.backend import Variant
@@ -38,31 +39,19 @@ def register_stored(
         InputError: as `register`, or an input cannot be fetched.
         PermanentStepError: the registration's status is failed; it is published nevertheless, for inspection.
     """
-    resolved = recipe_named(recipe)
+    options = RegisterOptions(recipe=named_recipe(recipe), views=views, seed=seed, variant=variant)
     file = model_here(model)
     data = gnm_npz.read(file)
-    schemes = schemes_beside(file, len(data.template_vertex_positions))
-    inputs = {f"landmarks {name}": hashing.hash_arrays(one.indices, one.weights) for name, one in schemes.items()}
-    inputs["model"] = gnm_npz.content_hash(data)
+    schemes = read_schemes(file, data, options.landmark_files)
     with capture_here(capture) as folder:
-        inputs["capture"] = hashing.hash_capture(read(folder))
-        settings = {"recipe": hashing.to_jsonable(resolved), "views": views, "seed": seed, "variant": variant}
+        wanted = input_hash(read(folder), data, schemes, None, options)
 
         def make(attempt: Path) -> dict[str, Any]:
-            result = register(
-                folder,
-                model_path=file,
-                out=attempt / REGISTRATION,
-                recipe=recipe,
-                views=views,
-                seed=seed,
-                variant=variant,
-                progress=progress,
-            )
+            result = register(folder, file, attempt / REGISTRATION, options, progress=progress)
             scan = result.figures.get("scan_to_mesh", {}).get("face")
             return hashing.to_jsonable({"status": result.status, "reason": result.reason, "scan_to_mesh_face": scan})
 
-        made = Store(store).produce(key, wanted=hashing.input_hash(inputs, settings), make=make)
+        made = Store(store).produce(key, wanted=wanted, make=make)
     if made.about.get("status") == "failed":
         raise PermanentStepError(f"registration failed: {made.about.get('reason')}")
     return {**made.brief(), "attempt": made.attempt}
@@ -89,19 +78,11 @@ def register_capture(
         InputError: as `register`.
         PermanentStepError: the registration's status is failed; its folder is kept.
     """
+    options = RegisterOptions(recipe=named_recipe(recipe), views=views, seed=seed, variant=variant)
     if subject_dir is not None:
-        begin_subject(Path(subject_dir), model_path=Path(model), out=Path(out).parent, recipe=recipe)
-    result = register(
-        Path(capture),
-        model_path=Path(model),
-        out=Path(out),
-        recipe=recipe,
-        views=views,
-        seed=seed,
-        neutral=None if neutral is None else Path(neutral),
-        variant=variant,
-        progress=progress,
-    )
+        begin_subject(Path(subject_dir), Path(model), Path(out).parent, options)
+    start = None if neutral is None else Path(neutral)
+    result = register(Path(capture), Path(model), Path(out), options, neutral=start, progress=progress)
     if result.status == "failed":
         raise PermanentStepError(f"registration failed: {result.reason}")
     return {"out": out, "status": result.status, "content_id": read_manifest(Path(out))["content_id"]}

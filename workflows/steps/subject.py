@@ -12,12 +12,12 @@ import numpy as np
 from registration.capture.scan import read_truth
 from registration.errors import InputError
 from registration.evaluate.evaluation import evaluate
-from registration.fit.recipes import recipe_named
+from registration.fit.recipes import load_recipe, named_recipe
+from registration.inputs import input_hash, read_schemes
 from registration.model import gnm_npz
-from registration.model.landmarks import read_scheme, schemes_beside
+from registration.options import RegisterOptions
 from registration.progress import Named, Progress, Silent
 from registration.register import register
-from registration.render.backend import Variant
 from registration.storage import hashing
 from registration.storage.files import atomic_write_text
 from registration.storage.registration_folder import read_manifest, update_figures
@@ -31,17 +31,12 @@ HEADLINE = ("scan_to_mesh", "drift")  # of a manifest's figures, those of the fa
 
 def register_subject(
     subject_dir: Path,
-    *,
-    model_path: Path,
+    model: Path,
     out: Path,
-    recipe: str = "draft",
-    views: int | None = None,
-    seed: int = 0,
+    options: RegisterOptions = RegisterOptions(),  # noqa: B008  frozen
+    *,
     neutral: str | None = None,
-    deterministic: bool = False,
     force: bool = False,
-    variant: Variant = "llvm",
-    landmark_files: Mapping[str, Path] | None = None,
     leave: Mapping[str, str] | None = None,
     progress: Progress | None = None,
 ) -> Subject:
@@ -53,9 +48,13 @@ def register_subject(
 
     Args:
         subject_dir: its sub-folders that hold a capture.toml are the captures.
+        model: a GNM NPZ file, as for `register`.
+        out: the folder of the subject's registrations.
+        options: of each registration.
         neutral: the name of the neutral's sub-folder; None: the one whose expression is "neutral".
+        force: register again what is there already.
         leave: captures that are not to be tried, and why: their rows are errors.
-        model_path, recipe, views, seed, deterministic, force, variant, landmark_files, progress: as for `register`.
+        progress: where to report to.
 
     Returns:
         What became of each capture.
@@ -65,20 +64,9 @@ def register_subject(
             a landmark file cannot be read; nothing is computed or written.
     """
     progress = progress or Silent()
-    subject_dir, out, model_path = Path(subject_dir), Path(out), Path(model_path)
-    landmark_files = {name: Path(file) for name, file in (landmark_files or {}).items()}
-    captures, start = _begun(subject_dir, model_path, out, recipe, neutral, landmark_files)
-    one = partial(
-        register,
-        model_path=model_path,
-        recipe=recipe,
-        views=views,
-        seed=seed,
-        deterministic=deterministic,
-        force=force,
-        variant=variant,
-        landmark_files=landmark_files,
-    )
+    subject_dir, model, out = Path(subject_dir), Path(model), Path(out)
+    captures, start = _begun(subject_dir, model, out, options, neutral)
+    one = partial(register, model=model, options=options, force=force)
     return _loop(captures.captures, one, _Record(start, out), leave or {}, progress)
 
 
@@ -98,67 +86,23 @@ def collect_subject(
 
     Raises InputError as `register_subject`.
     """
+    options = RegisterOptions(recipe=named_recipe(recipe), views=views, seed=seed)
     captures = read_captures(Path(subject_dir))
     data = gnm_npz.read(Path(model))
-    schemes = schemes_beside(Path(model), len(data.template_vertex_positions))
-    inputs = {f"capture {capture.root.name}": hashing.hash_capture(capture) for capture in captures.captures}
-    inputs |= {f"capture {name}": error.line for name, error in captures.broken.items()}
-    inputs |= {f"landmarks {name}": hashing.hash_arrays(one.indices, one.weights) for name, one in schemes.items()}
-    inputs |= {"subject": captures.subject, "model": gnm_npz.content_hash(data)}
-    wanted = hashing.input_hash(
-        inputs, {"recipe": hashing.to_jsonable(recipe_named(recipe)), "views": views, "seed": seed}
-    )
+    schemes = read_schemes(Path(model), data, options.landmark_files)
+    inputs = {one.root.name: input_hash(one, data, schemes, None, options) for one in captures.captures}
+    inputs |= {name: error.line for name, error in captures.broken.items()}
+    wanted = hashing.input_hash(inputs, {"subject": captures.subject})
     place = Path(out)
     if (known := find_product(place, wanted)) is not None and _contents(place, known["contents"]) == known["contents"]:
         return {**known, "out": out}
-    found = register_subject(
-        Path(subject_dir),
-        model_path=Path(model),
-        out=place,
-        recipe=recipe,
-        views=views,
-        seed=seed,
-        leave=leave,
-        progress=progress,
-    )
+    found = register_subject(Path(subject_dir), Path(model), place, options, leave=leave, progress=progress)
     rows = {row.name: {"status": row.status, "reason": row.reason, "usable": row.usable} for row in found.rows}
     contents = _contents(place, [row.name for row in found.rows if row.folder])
     told = {"out": out, "rows": rows, "contents": contents, "seconds": sum(row.seconds or 0 for row in found.rows)}
     if all(row.folder or row.status == "skipped" for row in found.rows):
         atomic_write_text(place / STEP, json_text({"input_hash": wanted, **told}))
     return {"input_hash": wanted, **told}
-
-
-def begin_subject(subject_dir: Path, *, model_path: Path, out: Path, recipe: str) -> None:
-    """Write the record of a subject of which nothing is registered yet, so that registrations may be put beside it.
-
-    One that is there stays. Raises InputError as `register_subject`.
-    """
-    _, start = _begun(subject_dir, model_path, out, recipe, None, {})
-    if not (out / MANIFEST).exists():
-        _Record(start, out)
-
-
-def _begun(
-    subject_dir: Path,
-    model_path: Path,
-    out: Path,
-    recipe: str,
-    neutral: str | None,
-    landmark_files: Mapping[str, Path],
-) -> tuple[Captures, Subject]:
-    """A subject's captures, and what is known before the first is registered. Everything is checked."""
-    recipe_named(recipe)
-    captures = read_captures(subject_dir, neutral)
-    check_subject_out(out, captures)
-    start = Subject(
-        subject=captures.subject,
-        model=_checked_model(model_path, landmark_files),
-        recipe=recipe,
-        neutral=captures.captures[0].root.name,
-        rows=_waiting(captures),
-    )
-    return captures, start
 
 
 def _contents(place: Path, names: Sequence[str] | Mapping[str, str]) -> dict[str, str]:
@@ -170,6 +114,35 @@ def _contents(place: Path, names: Sequence[str] | Mapping[str, str]) -> dict[str
         except InputError:
             continue
     return found
+
+
+def begin_subject(subject_dir: Path, model: Path, out: Path, options: RegisterOptions) -> None:
+    """Write the record of a subject of which nothing is registered yet, so that registrations may be put beside it.
+
+    One that is there stays. Raises InputError as `register_subject`.
+    """
+    _, start = _begun(subject_dir, model, out, options, None)
+    if not (out / MANIFEST).exists():
+        _Record(start, out)
+
+
+def _begun(
+    subject_dir: Path, model: Path, out: Path, options: RegisterOptions, neutral: str | None
+) -> tuple[Captures, Subject]:
+    """A subject's captures, and what is known before the first is registered. Everything is checked."""
+    load_recipe(options.recipe)
+    captures = read_captures(subject_dir, neutral)
+    check_subject_out(out, captures)
+    data = gnm_npz.read(model)
+    read_schemes(model, data, options.landmark_files)
+    start = Subject(
+        subject=captures.subject,
+        model=gnm_npz.content_hash(data),
+        recipe=options.recipe_name,
+        neutral=captures.captures[0].root.name,
+        rows=_waiting(captures),
+    )
+    return captures, start
 
 
 class _Record:
@@ -303,11 +276,3 @@ def _waiting(captures: Captures) -> tuple[Row, ...]:
         Row(name=name, expression="", status="error", reason=error.line) for name, error in captures.broken.items()
     ]
     return (*rows, *broken)
-
-
-def _checked_model(model_path: Path, landmark_files: Mapping[str, Path]) -> str:
-    """The model's content hash. Raises InputError for what `register` would refuse with every capture."""
-    data = gnm_npz.read(model_path)
-    for name, file in landmark_files.items():
-        read_scheme(file, len(data.template_vertex_positions), name)
-    return gnm_npz.content_hash(data)

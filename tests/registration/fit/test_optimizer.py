@@ -3,7 +3,8 @@
 import pytest
 import torch
 
-from registration.fit.optimizer import AdamBlock, AdamUniformBlock, Rate, minimise
+from registration.fit.optimizer import AdamBlock, AdamUniformBlock, minimise
+from registration.fit.recipes import Rate
 
 
 def test_a_rate_is_held_and_then_falls_by_equal_ratios():

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 import torch
 
-from registration.fit.optimizer import AdamUniformBlock, Rate, minimise
+from registration.fit.optimizer import AdamUniformBlock, minimise
+from registration.fit.recipes import Rate
 from registration.geometry.large_steps import (
     LargeSteps,
     combinatorial_laplacian,

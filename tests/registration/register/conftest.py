@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from registration.options import RegisterOptions
 from registration.register import register
 from registration.storage.registration_folder import load_registration
 from registration.types import Registration
@@ -74,9 +75,9 @@ class Beside:
         self._process.communicate()
 
 
-def run(truth: Truth, out: Path, **options) -> Run:
+def run(truth: Truth, out: Path, options: RegisterOptions = RegisterOptions(), **settings) -> Run:  # noqa: B008
     progress = Notes()
-    result = register(truth.root, model_path=MODEL, out=out, progress=progress, **options)
+    result = register(truth.root, MODEL, out, options, progress=progress, **settings)
     return Run(truth=truth, out=out, result=result, progress=progress)
 
 

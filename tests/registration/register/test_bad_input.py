@@ -18,6 +18,7 @@ from registration.errors import InputError
 from registration.model import gnm_npz
 from registration.model.atlas import texture_atlas
 from registration.model.gnm import GNM
+from registration.options import RegisterOptions
 from registration.register import register
 from registration.render import backend
 from registration.storage.registration_folder import save_registration
@@ -36,7 +37,9 @@ class Request:
     options: dict[str, Any] = field(default_factory=dict)
 
     def register(self) -> Registration:
-        return register(self.capture, model_path=self.model, out=self.out, **self.options)
+        settings = {name: self.options[name] for name in ("neutral", "force") if name in self.options}
+        options = {name: value for name, value in self.options.items() if name not in settings}
+        return register(self.capture, self.model, self.out, RegisterOptions(**options), **settings)
 
     def change_model(self, **arrays: np.ndarray | None) -> None:
         """Replace arrays of the model file, or take them out where None is given."""

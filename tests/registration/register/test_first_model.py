@@ -28,7 +28,7 @@ def model() -> Path:
 def test_neutral(model: Path, tmp_path: Path) -> None:
     """The demo's bound: scan to mesh on the face, mean, mm."""
     root = capture(tmp_path / "capture", seed=8)
-    register(root, model_path=model, out=tmp_path / "out", recipe="draft")
+    register(root, model, tmp_path / "out")
     figures = read_manifest(tmp_path / "out")["figures"]
     print(figures["scan_to_mesh"]["face"], figures["vertex_error"]["face"])
     assert figures["scan_to_mesh"]["face"]["mean_mm"] <= 0.20
@@ -37,7 +37,7 @@ def test_neutral(model: Path, tmp_path: Path) -> None:
 def test_teeth_and_tongue_of_an_open_mouth(model: Path, tmp_path: Path) -> None:
     """Teeth and tongue have no offsets: what the pictures and the `oral` landmarks say must reach the model."""
     root = capture(tmp_path / "capture", seed=5, expression="jaw_open")
-    result = register(root, model_path=model, out=tmp_path / "out", recipe="draft")
+    result = register(root, model, tmp_path / "out")
     error = errors_mm(result, root)
     data = gnm_npz.read(model)
     means = {name: float(error[regions.group(data, name) > 0.5].mean()) for name in ("teeth", "tongue")}

@@ -16,7 +16,7 @@ MODEL = SHARED / "data" / "gnm" / "gnm_head_reconstructed.npz"
 
 def figures(capture: Path, out: Path) -> dict[str, Any]:
     """Register, print and return the face's figures in mm."""
-    result = register(capture, model_path=MODEL, out=out)
+    result = register(capture, MODEL, out)
     face = result.figures["scan_to_mesh"]["face"]
     error = result.figures.get("vertex_error", {}).get("face", {})
     print(f"{capture}: {result.status}, {sum(result.seconds.values()):.0f} s, scan to mesh {face}, vertices {error}")

@@ -13,6 +13,7 @@ import trimesh
 from registration.model.gnm import GNM
 from registration.model.gnm_npz import read
 from registration.model.regions import group, neck_other
+from registration.options import RegisterOptions
 from registration.register import register
 from registration.render import backend
 from registration.storage.registration_folder import FILES, load_registration
@@ -132,7 +133,7 @@ def contents(folder: Path) -> dict[str, tuple[int, bytes]]:
 
 def test_same_inputs_return_at_once(registered: Run, no_compute: None):
     before = contents(registered.out)
-    result = register(registered.truth.root, model_path=MODEL, out=registered.out)
+    result = register(registered.truth.root, MODEL, registered.out)
     np.testing.assert_array_equal(result.vertices, registered.result.vertices)
     assert contents(registered.out) == before
 
@@ -143,7 +144,8 @@ def test_same_inputs_return_at_once(registered: Run, no_compute: None):
 def test_force_and_other_settings_compute(change: dict, registered: Run, no_compute: None):
     before = contents(registered.out)
     with pytest.raises(Computing):
-        register(registered.truth.root, model_path=MODEL, out=registered.out, **change)
+        force = "force" in change
+        register(registered.truth.root, MODEL, registered.out, RegisterOptions(**{} if force else change), force=force)
     assert contents(registered.out) == before
 
 

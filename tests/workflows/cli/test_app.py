@@ -13,6 +13,7 @@ import registration.register
 import workflows.cli
 import workflows.steps.subject
 from registration.fit.recipes import RECIPES
+from registration.options import RegisterOptions
 from tests.conftest import FIXTURES
 from tests.registration.capture.small import make
 from workflows.cli.app import COMMANDS, main
@@ -263,8 +264,8 @@ def test_register_passes_every_argument_on(
     """The library's own work is tested in tests/register; here only what the command hands over and makes of it."""
     heard = {}
 
-    def listen(capture: Path, **options) -> SimpleNamespace:
-        heard.update(options, capture=capture)
+    def listen(capture: Path, model: Path, out: Path, options: RegisterOptions, **settings) -> SimpleNamespace:
+        heard.update(settings, capture=capture, model=model, out=out, options=options)
         return SimpleNamespace(status=status, reason="because")
 
     monkeypatch.setattr(registration.register, "register", listen)
@@ -273,16 +274,18 @@ def test_register_passes_every_argument_on(
     heard.pop("progress").note("told")
     assert heard == {
         "capture": Path("C"),
-        "model_path": Path("M.npz"),
+        "model": Path("M.npz"),
         "out": Path("O"),
-        "recipe": "studio",
-        "views": 7,
-        "seed": 3,
         "neutral": Path("N"),
-        "deterministic": True,
         "force": True,
-        "variant": "cuda",
-        "landmark_files": {"68": Path("a"), "5": Path("b")},
+        "options": RegisterOptions(
+            recipe="studio",
+            views=7,
+            seed=3,
+            deterministic=True,
+            variant="cuda",
+            landmark_files={"68": Path("a"), "5": Path("b")},
+        ),
     }
     told = capsys.readouterr()
     assert told.out == f"{status}: because\nO\n"
@@ -305,8 +308,8 @@ def test_subject_passes_every_argument_on(
     """The loop itself is tested in test_subject.py."""
     heard = {}
 
-    def listen(subject: Path, **options) -> Subject:
-        heard.update(options, subject=subject)
+    def listen(subject: Path, model: Path, out: Path, options: RegisterOptions, **settings) -> Subject:
+        heard.update(settings, subject=subject, model=model, out=out, options=options)
         rows = tuple(Row(name=f"c{i}", expression="", status=s, reason="because") for i, s in enumerate(statuses))
         return Subject(subject="anna", model="ab", recipe="draft", neutral="c0", rows=rows)
 
@@ -316,16 +319,18 @@ def test_subject_passes_every_argument_on(
     heard.pop("progress").note("told")
     assert heard == {
         "subject": Path("S"),
-        "model_path": Path("M.npz"),
+        "model": Path("M.npz"),
         "out": Path("O"),
-        "recipe": "studio",
-        "views": 7,
-        "seed": 3,
         "neutral": "N",
-        "deterministic": True,
         "force": True,
-        "variant": "cuda",
-        "landmark_files": {"68": Path("a"), "5": Path("b")},
+        "options": RegisterOptions(
+            recipe="studio",
+            views=7,
+            seed=3,
+            deterministic=True,
+            variant="cuda",
+            landmark_files={"68": Path("a"), "5": Path("b")},
+        ),
     }
     told = capsys.readouterr()
     assert told.out == f"c0: {statuses[0]}: because\nc1: {statuses[1]}: because\nO/index.html\n"

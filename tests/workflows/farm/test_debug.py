@@ -8,6 +8,7 @@ import pytest
 
 import registration.register
 from registration.errors import InputError
+from registration.options import RegisterOptions
 from registration.progress import Silent
 from tests.registration.capture import small
 from tests.registration.register import synthetic
@@ -34,8 +35,8 @@ def row(step: str = "register", kind: str = "job", **arguments: Any) -> Row:
 def calls(monkeypatch: pytest.MonkeyPatch) -> list[dict[str, Any]]:
     made: list[dict[str, Any]] = []
 
-    def register(capture: Path, **settings: Any) -> Any:
-        made.append({"capture": capture, **settings})
+    def register(capture: Path, model: Path, out: Path, options: RegisterOptions, **settings: Any) -> Any:
+        made.append({"capture": capture, "model": model, "out": out, "options": options, **settings})
         return a_registration(status="failed", reason="so it is")
 
     monkeypatch.setattr(registration.register, "register", register)
@@ -54,12 +55,10 @@ def test_a_registration_is_made_again_with_pictures_and_out_of_the_way(
     told = debug(row(step, **arguments, **places[step]), tmp_path / "out", Silent())
     assert told.told == "failed: so it is" and told.page is None
     (call,) = calls
-    assert call["capture"] == Path("/c/e") and call["model_path"] == Path("/m.npz")
+    assert call["capture"] == Path("/c/e") and call["model"] == Path("/m.npz")
     assert call["out"] == tmp_path / "out" / "registration" and call["pictures"] == tmp_path / "out" / "stages"
     assert call["neutral"] == (Path("/results/n") if step == "register" else None)
-    assert {name: call[name] for name in ("recipe", "views", "seed", "variant")} == {
-        **{"recipe": "studio", "views": 5, "seed": 3, "variant": "llvm"}
-    }
+    assert call["options"] == RegisterOptions(recipe="studio", views=5, seed=3)
 
 
 def test_a_capture_from_a_url_is_kept_for_looking(

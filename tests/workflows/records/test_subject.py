@@ -6,6 +6,7 @@ from pathlib import Path
 import pytest
 
 from registration.errors import InputError
+from registration.options import RegisterOptions
 from tests.workflows.conftest import MODEL, FakeRegister, change
 from workflows.steps.subject import register_subject
 
@@ -75,9 +76,14 @@ def unreadable(name: str, **options):
         (lambda subject: {"out": subject / "smile"}, {}, "output folder", "inside the capture smile"),
         (lambda subject: {"out": subject / "notes.txt"}, {}, "output folder", "a file"),
         (lambda subject: (subject / "smile").rename(subject / "index.html") and {}, {}, "output", "named index.html"),
-        (nothing, {"recipe": "drafty"}, "no such recipe", "drafty"),
-        (nothing, {"landmark_files": {"68": Path("nowhere.txt")}}, "cannot be read", "nowhere.txt"),
-        (nothing, {"model_path": Path("nowhere.npz")}, "", "nowhere.npz"),
+        (nothing, {"options": RegisterOptions(recipe="drafty")}, "no such recipe", "drafty"),
+        (
+            nothing,
+            {"options": RegisterOptions(landmark_files={"68": Path("nowhere.txt")})},
+            "cannot be read",
+            "nowhere.txt",
+        ),
+        (nothing, {"model": Path("nowhere.npz")}, "", "nowhere.npz"),
     ],
 )
 def test_bad_input_is_told_before_any_work(prepare, options, what, got, subject: Path, fake: FakeRegister):
@@ -85,6 +91,6 @@ def test_bad_input_is_told_before_any_work(prepare, options, what, got, subject:
     before = files(subject.parent)
     folder = options.pop("subject_dir", subject)
     with pytest.raises(InputError) as refused:
-        register_subject(folder, **{"model_path": MODEL, "out": subject.parent / "out", **options})
+        register_subject(folder, **{"model": MODEL, "out": subject.parent / "out", **options})
     assert what in refused.value.what and got in str(refused.value)
     assert fake.calls == [] and files(subject.parent) == before

@@ -15,6 +15,7 @@ import workflows.steps.subject
 from registration.errors import InputError
 from registration.evaluate.evaluation import evaluate_folder
 from registration.fit.recipes import RECIPES, Recipe, draft
+from registration.options import RegisterOptions
 from registration.register import register
 from registration.render import backend
 from registration.storage.registration_folder import AXES, load_registration, read_manifest
@@ -28,19 +29,21 @@ REFUSED = InputError("The lens is dirty", where="cam3", expected="a clean one", 
 
 def run(subject: Path, **options) -> Subject:
     out = options.pop("out", subject.parent / "out")
-    return register_subject(subject, model_path=MODEL, out=out, **options)
+    return register_subject(subject, MODEL, out, **options)
 
 
 def test_the_neutral_first_then_each_expression_from_it(subject: Path, fake: FakeRegister, tmp_path: Path):
     progress, out = Notes(), tmp_path / "out"
-    settings = dict(recipe="studio", views=3, seed=4, deterministic=True, force=True, variant="cuda")
-    scheme = synthetic.FIXTURES / "head_sparse_68.txt"
-    run(subject, progress=progress, landmark_files={"68": scheme}, **settings)
+    files = {"68": synthetic.FIXTURES / "head_sparse_68.txt"}
+    options = RegisterOptions(
+        recipe="studio", views=3, seed=4, deterministic=True, variant="cuda", landmark_files=files
+    )
+    run(subject, progress=progress, options=options, force=True)
     assert fake.calls == [
         ("rest", out / "rest", None),
         *((name, out / name, out / "rest") for name in ("jaw2", "jaw10", "smile")),
     ]
-    assert fake.settings == 4 * [{**settings, "model_path": MODEL, "landmark_files": {"68": scheme}}]
+    assert fake.settings == 4 * [{"model": MODEL, "options": options, "force": True}]
     assert progress.steps[:2] == ["rest (1 of 4): fitting", "jaw2 (2 of 4): fitting"]
     assert "smile (4 of 4): converged: it is converged" in progress.notes
 
@@ -239,12 +242,12 @@ def threads() -> Iterator[None]:
 
 def test_a_subject_equals_its_captures_registered_by_hand(tmp_path: Path, monkeypatch, threads: None):
     monkeypatch.setitem(RECIPES, "draft", hasty)
-    subject, out, settings = tmp_path / "tiny", tmp_path / "out", dict(model_path=MODEL, views=3, deterministic=True)
+    subject, out, options = tmp_path / "tiny", tmp_path / "out", RegisterOptions(views=3, deterministic=True)
     for expression in ("neutral", "smile"):
         synthetic.make(subject / expression, expression)
-    result = register_subject(subject, out=out, **settings)
+    result = register_subject(subject, MODEL, out, options)
     assert all(row.usable for row in result.rows), result.rows
-    by_hand = register(subject / "smile", out=tmp_path / "smile", neutral=out / "neutral", **settings)
+    by_hand = register(subject / "smile", MODEL, tmp_path / "smile", options, neutral=out / "neutral")
     stored = load_registration(out / "smile")
     for name in (*AXES, "texture"):
         first, second = (getattr(load_registration(path), name) for path in (out / "smile", tmp_path / "smile"))
@@ -260,5 +263,5 @@ def test_a_subject_equals_its_captures_registered_by_hand(tmp_path: Path, monkey
 
     monkeypatch.setattr(backend, "activate", stop)
     monkeypatch.setattr(workflows.steps.subject, "evaluate", stop)
-    register_subject(subject, out=out, **settings)
+    register_subject(subject, MODEL, out, options)
     assert manifest(out) == record

@@ -1,0 +1,208 @@
+"""Everything that decides a registration: read, checked, and hashed."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from registration.capture.doctor import validate
+from registration.capture.native import read
+from registration.capture.triangulation import triangulate
+from registration.errors import InputError
+from registration.fit.initialization import LEAST_LANDMARKS, spread_views
+from registration.fit.recipes import Recipe, expression_of, load_recipe
+from registration.fit.variables import pivot
+from registration.geometry.topology import edges
+from registration.model import gnm_npz
+from registration.model.atlas import texture_atlas
+from registration.model.landmarks import LandmarkScheme, read_scheme, schemes_beside
+from registration.model.regions import vertex_classes
+from registration.options import RegisterOptions
+from registration.storage import hashing
+from registration.storage.registration_folder import load_registration
+from registration.targets.classes import BACKGROUND
+from registration.types import Capture, Registration
+
+NOT_HASHED = {  # fields of the options that decide nothing by themselves, and why
+    "landmark_files": "their contents are hashed as the schemes",
+    "views": "the names of the selected views are hashed",
+}
+
+
+@dataclass(frozen=True, kw_only=True)
+class RegistrationInputs:
+    """All that a registration is made from, read and checked."""
+
+    capture: Capture  # with the selected views only
+    data: gnm_npz.GNMData
+    schemes: Mapping[str, LandmarkScheme]
+    landmarks: Mapping[str, Float[np.ndarray, "L 3"]]  # triangulated, of the schemes that capture and model share
+    recipe: Recipe
+    neutral: Registration | None
+    digests: Mapping[str, str]  # input -> sha256
+    config: Mapping[str, Any]  # the resolved options; decide the result together with the digests
+
+    @property
+    def input_hash(self) -> str:
+        """The `input_hash` of these inputs."""
+        return hashing.input_hash(self.digests, self.config)
+
+
+def read_inputs(
+    capture_path: Path, model_path: Path, options: RegisterOptions, neutral: Path | None = None
+) -> RegistrationInputs:
+    """Read and check everything that a registration is made from; of the views only landmarks are triangulated.
+
+    Args:
+        capture_path: a native capture folder.
+        model_path: a GNM NPZ file; landmark schemes lie next to it.
+        options: of the registration.
+        neutral: folder of the subject's neutral registration, if the fit starts from one.
+
+    Raises:
+        InputError: something cannot be used.
+    """
+    recipe = load_recipe(options.recipe)
+    capture = read(capture_path)
+    validate(capture)
+    selected = _select_views(capture, options.views)
+    data = gnm_npz.read(model_path)
+    _check_model(data)
+    start = None
+    if neutral is not None:
+        start = load_registration(neutral)
+        _check_topology(start, data, neutral, model_path)
+    schemes = read_schemes(model_path, data, options.landmark_files)
+    landmarks = _triangulated(selected, schemes)
+    _check_head_can_be_found(selected, landmarks)
+    digests, config = _deciding(capture, data, schemes, start, options)
+    return RegistrationInputs(
+        capture=selected,
+        data=data,
+        schemes=schemes,
+        landmarks=landmarks,
+        recipe=recipe if start is None else expression_of(recipe),
+        neutral=start,
+        digests=digests,
+        config=config,
+    )
+
+
+def read_schemes(model_path: Path, data: gnm_npz.GNMData, files: Mapping[str, Path]) -> dict[str, LandmarkScheme]:
+    """Return the landmark schemes next to a model's file, replaced or joined by those in `files`, by name.
+
+    Raises:
+        InputError: a file that cannot be read as a scheme of this model.
+    """
+    count = len(data.template_vertex_positions)
+    return schemes_beside(model_path, count) | {name: read_scheme(file, count, name) for name, file in files.items()}
+
+
+def input_hash(
+    capture: Capture,
+    data: gnm_npz.GNMData,
+    schemes: Mapping[str, LandmarkScheme],
+    neutral: Registration | None,
+    options: RegisterOptions,
+) -> str:
+    """Return the sha256 of all that decides a registration: equal for two that must have equal results.
+
+    It covers every field of these objects but those that `hashing.NOT_HASHED` lists with a reason, and the version of
+    this package.
+
+    Args:
+        capture: with all its views; `options.views` selects from them.
+        data: the head model.
+        schemes: of the model, as `read_schemes` returns them.
+        neutral: the subject's neutral registration that the fit starts from, if any.
+        options: of the registration; the recipe is hashed by its values, not by its name.
+
+    Raises:
+        InputError: there is no such recipe, or `options.views` is below 2.
+    """
+    return hashing.input_hash(*_deciding(capture, data, schemes, neutral, options))
+
+
+def _deciding(
+    capture: Capture,
+    data: gnm_npz.GNMData,
+    schemes: Mapping[str, LandmarkScheme],
+    neutral: Registration | None,
+    options: RegisterOptions,
+) -> tuple[dict[str, str], dict[str, Any]]:
+    """Digests of the inputs, and the resolved options as JSON values."""
+    recipe, selected = load_recipe(options.recipe), _select_views(capture, options.views)
+    digests = {"capture": hashing.hash_capture(selected), "model": gnm_npz.content_hash(data)}
+    digests |= {f"landmarks {name}": hashing.hash_fields(scheme) for name, scheme in schemes.items()}
+    if neutral is not None:
+        digests["neutral"] = hashing.hash_fields(neutral)
+        recipe = expression_of(recipe)
+    chosen = replace(options, recipe=recipe)
+    config = {name: hashing.to_jsonable(value) for name, value in hashing.hashed_fields(chosen, NOT_HASHED).items()}
+    return digests, {**config, "views": [view.name for view in selected.views]}
+
+
+def _select_views(capture: Capture, count: int | None) -> Capture:
+    """The capture with `count` views that are spread around the head; all of them for None."""
+    if count is None:
+        return capture
+    if count < 2:
+        raise InputError("Too few views", where="views", expected="at least 2", got=count, fix="use at least two views")
+    selected = spread_views([view.camera for view in capture.views], count)
+    return replace(capture, views=tuple(capture.views[i] for i in selected))
+
+
+def _triangulated(capture: Capture, schemes: Mapping[str, LandmarkScheme]) -> dict[str, Float[np.ndarray, "L 3"]]:
+    """Triangulated landmarks (world, metres; NaN = unseen) of every scheme that capture and model share."""
+    solved = {}
+    for name in sorted({name for view in capture.views for name in view.landmarks} & set(schemes)):
+        solved[name] = triangulate(capture, name)[0]
+        expected = len(schemes[name].indices)
+        if len(solved[name]) != expected:
+            raise InputError(
+                "Landmarks of another length than the model's scheme",
+                where=f"scheme {name} of {capture.root}",
+                expected=f"{expected} landmarks",
+                got=len(solved[name]),
+                fix=f"name the scheme otherwise, or give the model's with --landmarks {name}=FILE",
+            )
+    return solved
+
+
+def _check_model(data: gnm_npz.GNMData) -> None:
+    """Raise now what the fit would trip over: missing vertex groups or components, a mesh that is no manifold."""
+    vertex_classes(data)
+    pivot(data)
+    texture_atlas(data)
+    edges(data.triangles)
+
+
+def _check_head_can_be_found(capture: Capture, landmarks: Mapping[str, Float[np.ndarray, "L 3"]]) -> None:
+    counts = {name: int(np.isfinite(points).all(1).sum()) for name, points in landmarks.items()}
+    labelled = BACKGROUND in capture.classes and any(view.segmentation for view in capture.views)
+    if max(counts.values(), default=0) < LEAST_LANDMARKS and not labelled and not any(v.mask for v in capture.views):
+        found = [f"{count} triangulated of scheme {name}" for name, count in counts.items()]
+        raise InputError(
+            "Nothing tells where the head is",
+            where=capture.root,
+            expected=f"{LEAST_LANDMARKS} landmarks of a scheme that the model knows, or masks",
+            got=", ".join([*(found or ["no landmarks that the model knows"]), "no masks"]),
+            fix="add masks (or label maps with a background), landmarks, or the model's landmarks with --landmarks",
+        )
+
+
+def _check_topology(neutral: Registration, data: gnm_npz.GNMData, neutral_path: Path, model_path: Path) -> None:
+    same = gnm_npz.topology_hash(neutral.triangles) == gnm_npz.topology_hash(data.triangles)
+    sizes = (len(neutral.identity), len(neutral.expression), len(neutral.vertices))
+    expected = (len(data.vertex_identity_basis), len(data.expression_basis), len(data.template_vertex_positions))
+    if not same or sizes != expected:
+        raise InputError(
+            "The neutral was registered with another model",
+            where=neutral_path,
+            expected=f"identity, expression, vertices {expected} and the triangles of {model_path}",
+            got=f"{sizes}, {'the same' if same else 'other'} triangles",
+            fix="register the neutral with this model first",
+        )

@@ -1,0 +1,83 @@
+"""The options of a registration as one object, shared by the command line, the jobs of a farm and the library.
+
+Imports neither torch nor NumPy: the command line shows these fields before anything heavy is loaded.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from tyro.conf import arg
+from tyro.constructors import PrimitiveConstructorSpec
+
+from registration.errors import InputError
+from registration.fit.recipes import Recipe
+
+
+def _parse_landmark_files(pairs: list[str]) -> dict[str, Path]:
+    """`SCHEME=FILE` arguments as a mapping."""
+    files = {}
+    for pair in pairs:
+        scheme, _, file = pair.partition("=")
+        if not (scheme and file):
+            raise InputError(
+                "Cannot read a landmark file argument",
+                where="--landmarks",
+                expected="SCHEME=FILE, e.g. 68=head_sparse_68.txt",
+                got=pair,
+                fix="write the scheme's name, an equals sign and the path of the model's landmark file",
+            )
+        files[scheme] = Path(file)
+    return files
+
+
+# How tyro reads and shows the two fields whose types it does not know.
+_RECIPE: PrimitiveConstructorSpec[Any] = PrimitiveConstructorSpec(
+    nargs=1,
+    metavar="NAME",
+    instance_from_str=lambda words: words[0],
+    is_instance=lambda value: isinstance(value, (str, Recipe)),
+    str_from_instance=lambda value: [value if isinstance(value, str) else value.name],
+)
+_LANDMARK_FILES: PrimitiveConstructorSpec[Any] = PrimitiveConstructorSpec(
+    nargs="*",
+    metavar="[SCHEME=FILE ...]",
+    instance_from_str=_parse_landmark_files,
+    is_instance=lambda value: isinstance(value, Mapping),
+    str_from_instance=lambda value: [f"{scheme}={file}" for scheme, file in value.items()],
+)
+_LANDMARKS_ARGUMENT = arg(name="landmarks", help_behavior_hint="(optional)")
+
+
+@dataclass(frozen=True, kw_only=True)
+class RegisterOptions:
+    """Everything about a registration that may be chosen, besides its capture, model, neutral and output folder.
+
+    Every field decides the result (`registration.inputs.input_hash`).
+    """
+
+    recipe: Annotated[str | Recipe, _RECIPE] = "draft"
+    """Schedule of the fit. preview: seconds, small images. draft: minutes; shows whether a capture can be used.
+    studio: full quality. in_model: the model's parameters alone, without free offsets. Or the import path
+    MODULE:FUNCTION of a function that returns a Recipe."""
+
+    views: Annotated[int | None, arg(metavar="N", help_behavior_hint="(default: all)")] = None
+    """Use only this many views, at least 2, spread around the head."""
+
+    seed: Annotated[int, arg(metavar="S")] = 0
+    """Seed of the view subsets and of the silhouette samples."""
+
+    deterministic: bool = False
+    """Make every array equal from run to run on the CPU, in about twice the time."""
+
+    variant: Literal["llvm", "cuda"] = "llvm"
+    """Render on the CPU (llvm) or on an NVIDIA GPU (cuda)."""
+
+    landmark_files: Annotated[Mapping[str, Path], _LANDMARK_FILES, _LANDMARKS_ARGUMENT] = field(default_factory=dict)
+    """The model's vertices of a landmark scheme, instead of the file next to the model."""
+
+    @property
+    def recipe_name(self) -> str:
+        """The recipe as it is shown: its name or import path."""
+        return self.recipe if isinstance(self.recipe, str) else self.recipe.name
