@@ -17,11 +17,11 @@ from typing import Any
 import sqlalchemy as sa
 
 from bench.support.postgres_server import server
-from workflows.engine.client import Queue
+from workflows.engine.client import QueueClient
 from workflows.engine.database import checked_url, default_url, engine, is_sqlite, sqlite_file
 from workflows.engine.jobs import DRIVER, FlowJob, Job
 from workflows.engine.process import migrate
-from workflows.engine.reader import Reader, ended
+from workflows.engine.reader import QueueReader, ended
 
 MB = 2**20
 
@@ -46,13 +46,13 @@ def _measure(url: str, folder: Path, options: argparse.Namespace) -> None:
     captures: int = options.captures
     migrate(url)
     empty = _size_mb(url)
-    queue, reader = Queue(url), Reader(url)
+    queue, reader = QueueClient(url), QueueReader(url)
     arguments = {"capture": "/data/captures/subject_0000/expression_00", "model": "/data/model.npz", "seed": 0}
     jobs = (Job(id=f"bench/s{n:05d}", step="nothing", arguments={**arguments, "key": n}) for n in range(captures))
     begun = time.perf_counter()
-    queue.put(jobs)
+    queue.submit(jobs)
     took = time.perf_counter() - begun
-    queue.put([FlowJob(id="bench", flow="batch", queue=DRIVER)])
+    queue.submit([FlowJob(id="bench", flow="batch", queue=DRIVER)])
     _row("enqueue", f"{captures / took:.0f} jobs/s ({captures:,} in {took:.1f} s)")
     full = _size_mb(url)
     _row("database", f"{(full - empty) * 10_000 / captures:.1f} MB per 10,000 jobs that wait")
@@ -84,9 +84,9 @@ def _started(kind: str, url: str, folder: Path, name: str) -> "subprocess.Popen[
     return subprocess.Popen(command, cwd=Path(__file__).parents[1], stdout=subprocess.DEVNULL)
 
 
-def _asked(reader: Reader) -> float:
+def _asked(reader: QueueReader) -> float:
     begun = time.perf_counter()
-    reader.figures("bench")
+    reader.metrics("bench")
     return time.perf_counter() - begun
 
 

@@ -1,4 +1,4 @@
-"""Processes that end with the one that started them, however that ends, and share the machine's cores."""
+"""Child processes that terminate with their parent, however that ends, and share the machine's cores."""
 
 import ctypes
 import importlib
@@ -13,42 +13,46 @@ from typing import Any
 from pebble import ProcessExpired, ProcessPool
 
 _PR_SET_PDEATHSIG = 1
-_THREADS = "OMP_NUM_THREADS"  # libraries read it as they are loaded; the renderer does too
+_THREADS = "OMP_NUM_THREADS"  # libraries and the renderer read it when they are loaded
 
 
-def end_with(parent: int, number: signal.Signals = signal.SIGKILL) -> None:
-    """In a child, first of all: ask Linux for this signal when the parent ends.
+def terminate_with_parent(parent: int, number: signal.Signals = signal.SIGKILL) -> None:
+    """Ask Linux, in a child before anything else, to send it a signal when the parent ends.
 
-    The kernel means the *thread* that started the child: let that be one which lives as long as the process.
+    The kernel watches the *thread* that started the child: start it from one that lives as long as the process.
+
+    Args:
+        parent: process id of the parent.
+        number: the signal.
     """
     ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, number)
-    if os.getppid() != parent:  # it ended before the line above
+    if os.getppid() != parent:  # the parent ended before the call above
         os._exit(1)
 
 
-def warm_pool(jobs: int = 1, modules: tuple[str, ...] = ()) -> ProcessPool:
-    """Processes that end with this one and import `modules` when they start, not when their first job does."""
+def start_pool(jobs: int = 1, modules: tuple[str, ...] = ()) -> ProcessPool:
+    """Return a pool of processes that terminate with this one and import `modules` when they start."""
     return ProcessPool(
         max_workers=jobs,
         max_tasks=0,
-        initializer=_born,
+        initializer=_initialize_child,
         initargs=(os.getpid(), modules),
         context=get_context("spawn"),  # a fork would share the threads of torch and Dr.Jit
     )
 
 
-def _born(parent: int, modules: tuple[str, ...]) -> None:
-    end_with(parent)
+def _initialize_child(parent: int, modules: tuple[str, ...]) -> None:
+    terminate_with_parent(parent)
     for module in modules:
         importlib.import_module(module)
-    # Whatever libraries put there since: die at once, without a word, even while the interpreter's lock is held.
+    # Restore the default handler, which libraries may replace: terminate even while the interpreter's lock is held.
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
 
 
 @contextmanager
-def ending_with_us(jobs: int, modules: tuple[str, ...] = ()) -> Iterator[ProcessPool]:
-    """A warm pool; whatever it is doing when the context is left is killed."""
-    pool = warm_pool(jobs, modules)
+def terminated_with_us(jobs: int, modules: tuple[str, ...] = ()) -> Iterator[ProcessPool]:
+    """A pool as of `start_pool`, whose processes are killed at the end of the context."""
+    pool = start_pool(jobs, modules)
     try:
         yield pool
     finally:
@@ -56,34 +60,37 @@ def ending_with_us(jobs: int, modules: tuple[str, ...] = ()) -> Iterator[Process
         pool.join()
 
 
-def cores_each(jobs: int) -> str:
-    """The value of OMP_NUM_THREADS that gives each of so many processes its share."""
+def cores_per_worker(jobs: int) -> str:
+    """Return the value of OMP_NUM_THREADS that divides the cores among `jobs` processes."""
     return str(max(1, (os.cpu_count() or 1) // max(1, jobs)))
 
 
 @contextmanager
-def share_of_cores(jobs: int) -> Iterator[None]:
-    """Processes that are started meanwhile take their share of the cores, unless the environment says otherwise."""
+def shared_cores(jobs: int) -> Iterator[None]:
+    """Divide the cores among processes started in this context, unless the environment sets OMP_NUM_THREADS."""
     if jobs < 2 or _THREADS in os.environ:
         yield
         return
-    os.environ[_THREADS] = cores_each(jobs)
+    os.environ[_THREADS] = cores_per_worker(jobs)
     try:
         yield
     finally:
         del os.environ[_THREADS]
 
 
-def side_by_side(
+def run_parallel(
     function: Callable[..., str], calls: Mapping[str, Mapping[str, Any]], jobs: int
 ) -> Iterator[tuple[str, str]]:
-    """Call a function that returns its trouble, "" for none, with each of some named sets of keywords.
+    """Call a function in parallel processes, which share the cores; yield (name, failure) in order of completion.
 
-    Yields (name, trouble) as they end. A death of one process is the trouble of one call. The cores are shared.
+    Args:
+        function: returns the reason of its failure, "" for none.
+        calls: name -> keywords of the function.
+        jobs: number of processes. The death of a process is the failure of one call.
     """
     if not calls:
         return
-    with share_of_cores(jobs), ending_with_us(jobs, (function.__module__,)) as pool:
+    with shared_cores(jobs), terminated_with_us(jobs, (function.__module__,)) as pool:
         names: dict[Future[str], str] = {
             pool.schedule(function, kwargs=dict(keywords)): name for name, keywords in calls.items()
         }

@@ -4,7 +4,7 @@ import sys
 from pathlib import Path
 
 from workflows.engine.jobs import DRIVER, GPU, SUBJECTS, Step
-from workflows.engine.process import Process, serve
+from workflows.engine.process import EngineProcess, serve
 from workflows.farm.flows import FLOWS
 
 
@@ -15,7 +15,7 @@ def nothing(**arguments: object) -> None:
 if __name__ == "__main__":
     kind, url, folder, name = sys.argv[1:]
     serve(
-        Process(
+        EngineProcess(
             url=url,
             queues=(GPU,) if kind == "worker" else (DRIVER, SUBJECTS),
             logs=Path(folder) / "logs",

@@ -22,7 +22,7 @@ from tests.workflows.conftest import change
 from tests.workflows.farm.inline import Inline, really
 from tests.workflows.rounds import ACTS, MODEL, Finds, head, world, write_people, write_person
 from workflows.cli.app import main
-from workflows.engine.reader import Reader
+from workflows.engine.reader import QueueReader
 from workflows.engine.serialization import JobFailed
 from workflows.farm.coregistration import begin
 from workflows.farm.flows import coregister
@@ -329,7 +329,7 @@ def test_the_command(dataset, finds, tmp_path, capsys, monkeypatch):
     assert "There is no queue" in capsys.readouterr().err and not out.exists()
 
     def run(farm: LocalFarm, name: str, progress) -> Ended:
-        spec = Reader(farm.url).rows([name])[name].spec
+        spec = QueueReader(farm.url).rows([name])[name].spec
         try:
             asyncio.run(coregister(Inline(name, really(roots), []), **spec["arguments"]))
         except JobFailed as error:

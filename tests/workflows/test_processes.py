@@ -9,33 +9,33 @@ import time
 import pytest
 
 from tests.workflows.farm.harness import ROOT, alive, interruptible
-from workflows.processes import ending_with_us, share_of_cores, side_by_side
+from workflows.processes import run_parallel, shared_cores, terminated_with_us
 
 
 def test_processes_are_warm_and_share_the_cores(monkeypatch):
     monkeypatch.delenv("OMP_NUM_THREADS", raising=False)
     monkeypatch.setattr(os, "cpu_count", lambda: 8)
     for jobs, threads in ((4, "2"), (1, None)):
-        with share_of_cores(jobs), ending_with_us(jobs) as pool:
+        with shared_cores(jobs), terminated_with_us(jobs) as pool:
             assert pool.schedule(os.getenv, ("OMP_NUM_THREADS",)).result() == threads
     assert "OMP_NUM_THREADS" not in os.environ
     monkeypatch.setenv("OMP_NUM_THREADS", "3")
-    with share_of_cores(4), ending_with_us(1) as pool:
+    with shared_cores(4), terminated_with_us(1) as pool:
         assert pool.schedule(os.getenv, ("OMP_NUM_THREADS",)).result() == "3"
         assert len({pool.schedule(os.getpid).result() for _ in range(3)}) == 1
 
 
 def test_one_death_does_not_stop_the_others():
     calls = {"ann": {"key": "NO_SUCH", "default": ""}, "bob": {"key": "NO_SUCH", "default": "tired"}}
-    assert dict(side_by_side(os.getenv, calls, jobs=2)) == {"ann": "", "bob": "tired"}
-    assert dict(side_by_side(os._exit, {"cleo": {"status": 3}}, jobs=1)) == {"cleo": "its process died"}
+    assert dict(run_parallel(os.getenv, calls, jobs=2)) == {"ann": "", "bob": "tired"}
+    assert dict(run_parallel(os._exit, {"cleo": {"status": 3}}, jobs=1)) == {"cleo": "its process died"}
 
 
 SLEEPER = """
 import os, time
-from workflows.processes import ending_with_us
+from workflows.processes import terminated_with_us
 if __name__ == "__main__":
-    with ending_with_us(1) as pool:
+    with terminated_with_us(1) as pool:
         print(pool.schedule(os.getpid).result(), flush=True)
         pool.schedule(time.sleep, (600,)).result()
 """

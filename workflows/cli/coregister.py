@@ -59,7 +59,7 @@ def coregister(
     from coregister.stopping_rule import Rule
     from registration.progress import shown
     from workflows.engine.process import migrate
-    from workflows.farm.coregistration import coregister, put_coregistration
+    from workflows.farm.coregistration import coregister, submit_coregistration
     from workflows.farm.local import gpus_here
     from workflows.farm.plan import make_plan
     from workflows.records.coregistration import PAGE
@@ -78,7 +78,7 @@ def coregister(
     folder = farm.farm_folder(out)
     url = farm.url_for(folder)
     if not farm.local:
-        print(f"{put_coregistration(url, plan, variant=fit.variant)} is in the queue; see gnmreg status")
+        print(f"{submit_coregistration(url, plan, variant=fit.variant)} is in the queue; see gnmreg status")
         return 0
     migrate(url)
     gpus = gpus_here(None) if fit.variant == "cuda" else ()

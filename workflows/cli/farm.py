@@ -14,8 +14,8 @@ from registration.errors import InputError
 from workflows.cli.options import NOT_SET, FarmOptions, FitOptions, JobId, Port, RunName, RunOptions
 
 if TYPE_CHECKING:
-    from workflows.engine.client import Queue
-    from workflows.engine.reader import Figures, Row
+    from workflows.engine.client import QueueClient
+    from workflows.engine.reader import JobRow, QueueMetrics
 
 CAPTURES_PER_DAY = 10_000  # the throughput that status compares with
 REFRESH_S = 2.0
@@ -42,14 +42,14 @@ def worker(
         queue: Queues to take jobs from: gpu (registrations), rebuild (model building: much memory), or both.
     """
     os.environ["CUDA_VISIBLE_DEVICES"] = "" if gpu is None else str(gpu)  # before any library looks for a GPU
-    from workflows.engine.process import Process, known_queues, names, serve
+    from workflows.engine.process import EngineProcess, check_queues, names, serve
     from workflows.steps.table import STEPS
 
     folder = farm.directory.resolve()
     serve(
-        Process(
+        EngineProcess(
             url=farm.url,
-            queues=known_queues(queue),
+            queues=check_queues(queue),
             logs=folder / "logs",
             names=names("cpu") if gpu is None else names("gpu")[gpu : gpu + 1],
             roots=(str(folder), *root),
@@ -68,11 +68,11 @@ def coordinator(farm: FarmOptions = _FARM) -> int:
         farm: Which farm.
     """
     from workflows.engine.jobs import DRIVER, SUBJECTS
-    from workflows.engine.process import Process, names, serve
+    from workflows.engine.process import EngineProcess, names, serve
     from workflows.farm.flows import FLOWS
 
     logs = farm.directory.resolve() / "logs"
-    serve(Process(url=farm.url, queues=(DRIVER, SUBJECTS), logs=logs, names=names("coordinator"), flows=FLOWS))
+    serve(EngineProcess(url=farm.url, queues=(DRIVER, SUBJECTS), logs=logs, names=names("coordinator"), flows=FLOWS))
 
 
 def migrate(farm: FarmOptions = _FARM) -> int:
@@ -112,7 +112,7 @@ def batch(
     """
     from registration.progress import shown
     from workflows.engine.process import migrate
-    from workflows.farm.batch import batch_jobs, put_batch
+    from workflows.farm.batch import batch_jobs, submit_batch
     from workflows.farm.local import LocalFarm, gpus_here, run_until_done
 
     settings = {"recipe": fit.recipe, "views": fit.views, "seed": fit.seed, "variant": fit.variant}
@@ -121,7 +121,7 @@ def batch(
     url = farm.url_for(folder)
     if farm.local:
         migrate(url)
-    count = put_batch(url, jobs)
+    count = submit_batch(url, jobs)
     print(f"{jobs.run}: {count} captures are in the queue", flush=True)
     if not farm.local:
         return 0
@@ -233,7 +233,7 @@ def cancel(run: RunName, /, farm: FarmOptions = _FARM) -> int:
     return 0
 
 
-def _status_lines(figures: "Figures") -> list[str]:
+def _status_lines(figures: "QueueMetrics") -> list[str]:
     """What status prints."""
     total = sum(figures.counts.values())
     counts = ", ".join(f"{figures.counts[state]} {state}" for state in sorted(figures.counts)) or "none"
@@ -249,16 +249,16 @@ def _status_lines(figures: "Figures") -> list[str]:
     return lines
 
 
-def _figures(url: str, run: str | None) -> "Figures":
-    from workflows.engine.reader import Reader
+def _figures(url: str, run: str | None) -> "QueueMetrics":
+    from workflows.engine.reader import QueueReader
 
-    return Reader(url).figures(run)
+    return QueueReader(url).metrics(run)
 
 
-def _row(url: str, job: str) -> "Row":
-    from workflows.engine.reader import Reader
+def _row(url: str, job: str) -> "JobRow":
+    from workflows.engine.reader import QueueReader
 
-    row = Reader(url).rows([job]).get(job)
+    row = QueueReader(url).rows([job]).get(job)
     if row is None:
         raise InputError(
             "There is no such job", where="JOB", expected="an id that the queue knows", got=job, fix="see gnmreg status"
@@ -267,10 +267,10 @@ def _row(url: str, job: str) -> "Row":
 
 
 @contextmanager
-def _queue(url: str) -> Iterator["Queue"]:
-    from workflows.engine.client import Queue
+def _queue(url: str) -> Iterator["QueueClient"]:
+    from workflows.engine.client import QueueClient
 
-    queue = Queue(url)
+    queue = QueueClient(url)
     try:
         yield queue
     finally:

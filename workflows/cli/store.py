@@ -51,10 +51,10 @@ def retire(
         keep: Number of rounds to keep, the last ones.
         farm: Which farm.
     """
-    from workflows.engine.client import Queue
+    from workflows.engine.client import QueueClient
     from workflows.records.store import Store
 
-    opened = Queue(farm.url)
+    opened = QueueClient(farm.url)
     try:
         for part in Store(store).retire(run, keep):
             print(f"{part}: {opened.forget(part)} rows deleted")

@@ -1,4 +1,4 @@
-"""A worker's warm child process: it runs steps, can be killed, prints into the job's log, and dies with its parent.
+"""A worker's child process: it runs steps, can be killed, prints into the job's log, and terminates with its parent.
 
 A step may crash its process, hold the interpreter's lock or never end. The process that talks to the queue must survive
 all of that, so it runs no step itself. Whatever happens becomes an outcome, a small dict:
@@ -29,17 +29,17 @@ from pebble import ProcessExpired, ProcessPool
 from registration.errors import InputError
 from workflows.engine.jobs import MAX_BYTES, PermanentStepError
 from workflows.ids import redact
-from workflows.processes import warm_pool
+from workflows.processes import start_pool
 
-Outcome = dict[str, Any]
-RETRIED = ("failed", "died")  # bad input stays bad, and what ran out of time once would again
+StepOutcome = dict[str, Any]
+RETRIED = ("failed", "died")  # repeating bad input or a timeout would end in the same way
 
 
-class Slot:
-    """The child process of one worker. It starts with the first `warm` or `run` and serves until it must be killed."""
+class StepProcess:
+    """The child process of one worker. It starts with the first `warm` or `run` and is reused until it is killed."""
 
     def __init__(self, *, modules: tuple[str, ...] = ()) -> None:
-        """`modules` are imported when a child starts, not when its first job does."""
+        """`modules` are imported when a child starts, not when its first job starts."""
         self._modules = modules
         self._pool: ProcessPool | None = None
         self._stopping = False
@@ -47,54 +47,62 @@ class Slot:
     def warm(self) -> int:
         """Start the child, wait until it is ready and return its process id.
 
-        Call it in the main thread: the kernel's signal to an orphan is sent when the *thread* that started it ends.
+        Call it in the main thread: the kernel signals an orphan when the *thread* that started it ends.
         """
-        pid: int = self._scheduled(os.getpid, (), None).result()
+        pid: int = self._schedule(os.getpid, (), None).result()
         return pid
 
-    async def run(self, function: str, arguments: Mapping[str, Any], *, log: Path, hard_s: float) -> Outcome:
-        """Run "module:name" in the child, with everything that it prints appended to `log`.
+    async def run(self, function: str, arguments: Mapping[str, Any], *, log: Path, timeout_s: float) -> StepOutcome:
+        """Run "module:name" in the child and return its outcome.
 
-        Cancelling the awaiting task kills the child; so does running longer than `hard_s`.
+        Cancelling the awaiting task kills the child, and so does a run longer than `timeout_s`.
+
+        Args:
+            function: as in the table of steps.
+            arguments: keywords of the function.
+            log: file to which everything that it prints is appended.
+            timeout_s: time limit, seconds.
         """
-        begun = time.monotonic()
+        started_s = time.monotonic()
         log.parent.mkdir(parents=True, exist_ok=True)
         try:
-            future = self._scheduled(_call, (function, dict(arguments), str(log)), hard_s)
+            future = self._schedule(_call, (function, dict(arguments), str(log)), timeout_s)
             outcome = await asyncio.wrap_future(future)
         except TimeoutError:
-            outcome = _outcome("timed out", f"took longer than {hard_s:g} s and was killed")
+            outcome = _outcome("timed out", f"took longer than {timeout_s:g} s and was killed")
         except ProcessExpired as error:
-            outcome = _outcome("died", f"its process {_how(error.exitcode)}")
+            outcome = _outcome("died", f"its process {_exit_reason(error.exitcode)}")
         except BrokenProcessPool as error:
             outcome = _outcome("died", f"its process could not be started: {error}")
         if self._stopping:
-            await asyncio.Event().wait()  # the child was killed by us: that says nothing about the job
+            await asyncio.Event().wait()  # `kill` ended the child: this is no outcome of the job
         if outcome["status"] in ("timed out", "died"):
             with log.open("a") as file:
                 print(f"{outcome['status']}: {outcome['reason']}", file=file)
-        return {**outcome, "seconds": round(time.monotonic() - begun, 3)}
+        return {**outcome, "seconds": round(time.monotonic() - started_s, 3)}
 
     def kill(self) -> None:
-        """End the child at once; `run`s that wait for it never return."""
+        """Kill the child; calls of `run` that wait for it never return."""
         self._stopping = True
         if self._pool is not None:
             self._pool.stop()
             self._pool.join()
 
-    def _scheduled(self, function: Callable[..., Any], arguments: tuple[Any, ...], hard_s: float | None) -> Future[Any]:
+    def _schedule(
+        self, function: Callable[..., Any], arguments: tuple[Any, ...], timeout_s: float | None
+    ) -> Future[Any]:
         if self._pool is None:
-            self._pool = warm_pool(modules=self._modules)
+            self._pool = start_pool(modules=self._modules)
         try:
-            return self._pool.schedule(function, args=arguments, timeout=hard_s)
+            return self._pool.schedule(function, args=arguments, timeout=timeout_s)
         except RuntimeError:  # the pool gives up when a child dies between jobs
             self._pool.stop()
-            self._pool = warm_pool(modules=self._modules)
-            return self._pool.schedule(function, args=arguments, timeout=hard_s)
+            self._pool = start_pool(modules=self._modules)
+            return self._pool.schedule(function, args=arguments, timeout=timeout_s)
 
 
 class JsonlProgress:
-    """A progress that appends lines of JSON to a file, for whoever watches the job."""
+    """A progress that appends JSON lines to a file beside the job's log."""
 
     def __init__(self, file: Path) -> None:
         self._file = file
@@ -116,15 +124,15 @@ class JsonlProgress:
 
 
 def function_of(dotted: str) -> Callable[..., Any]:
-    """The function that a "module:name" of the table of steps means."""
+    """Return the function that a "module:name" of the table of steps names."""
     module, _, name = dotted.partition(":")
     function: Callable[..., Any] = getattr(importlib.import_module(module), name)
     return function
 
 
-def _call(dotted: str, arguments: dict[str, Any], log: str) -> Outcome:
-    """In the child: one step, its outcome, its prints in the log."""
-    with _printing_to(log):
+def _call(dotted: str, arguments: dict[str, Any], log: str) -> StepOutcome:
+    """Run one step in the child, with its output in the log."""
+    with _redirect_output(log):
         try:
             function = function_of(dotted)
             if "progress" in inspect.signature(function).parameters:
@@ -132,7 +140,7 @@ def _call(dotted: str, arguments: dict[str, Any], log: str) -> Outcome:
             inspect.signature(function).bind(**arguments)
         except (ImportError, AttributeError, TypeError) as error:
             print(traceback.format_exc(), flush=True)
-            return _outcome("bad input", f"the step cannot be called so: {error}")
+            return _outcome("bad input", f"the step cannot be called with these arguments: {error}")
         try:
             return _done(function(**arguments))
         except InputError as error:
@@ -141,13 +149,13 @@ def _call(dotted: str, arguments: dict[str, Any], log: str) -> Outcome:
         except PermanentStepError as error:
             print(error, flush=True)
             return _outcome("unusable", str(error))
-        except BaseException as error:  # also SystemExit: nothing that a step does may look like success
+        except BaseException as error:  # also SystemExit: no exit of a step may look like success
             print(redact(traceback.format_exc()), flush=True)
             first, *_ = str(error).splitlines() or [""]
             return _outcome("failed", f"{type(error).__name__}: {first}")
 
 
-def _done(result: Any) -> Outcome:
+def _done(result: Any) -> StepOutcome:
     try:
         size = len(json.dumps(result))
     except (TypeError, ValueError) as error:
@@ -157,11 +165,11 @@ def _done(result: Any) -> Outcome:
     return {**_outcome("done", ""), "result": result}
 
 
-def _outcome(status: str, reason: str) -> Outcome:
+def _outcome(status: str, reason: str) -> StepOutcome:
     return {"status": status, "reason": redact(reason)[:2000]}
 
 
-def _how(exitcode: int) -> str:
+def _exit_reason(exitcode: int) -> str:
     if exitcode < 0:
         try:
             return f"was killed by {signal.Signals(-exitcode).name}"
@@ -171,23 +179,23 @@ def _how(exitcode: int) -> str:
 
 
 @contextmanager
-def _printing_to(log: str) -> Iterator[None]:
-    """Point the file descriptors of stdout and stderr at the log, so that what C++ prints lands there too."""
+def _redirect_output(log: str) -> Iterator[None]:
+    """Redirect the file descriptors of stdout and stderr to the log, so that output of C++ code lands there too."""
     flush = ctypes.CDLL(None).fflush
 
-    def turn(out: int, err: int) -> None:
+    def redirect(out: int, err: int) -> None:
         sys.stdout.flush()
         sys.stderr.flush()
         flush(None)
         os.dup2(out, 1)
         os.dup2(err, 2)
 
-    kept = os.dup(1), os.dup(2)
+    saved = os.dup(1), os.dup(2)
     target = os.open(log, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o644)
-    turn(target, target)
+    redirect(target, target)
     try:
         yield
     finally:
-        turn(*kept)
-        for descriptor in (target, *kept):
+        redirect(*saved)
+        for descriptor in (target, *saved):
             os.close(descriptor)

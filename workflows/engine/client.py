@@ -1,4 +1,4 @@
-"""The queue from outside: put jobs in, cancel a run, retry what failed, forget old iterations. No process is needed."""
+"""Access to the queue without a process: submit jobs, cancel a run, retry failed jobs, delete old iterations."""
 
 import json
 import re
@@ -12,27 +12,27 @@ from dbos import DBOSClient, EnqueueOptions
 from registration.errors import InputError
 from workflows.engine.database import BELOW, below, checked_url, engine, require_queue, table
 from workflows.engine.jobs import MAX_BYTES, FlowJob, Job
-from workflows.engine.serialization import APPLICATION, VERSION, Json
+from workflows.engine.serialization import APPLICATION, VERSION, JsonSerializer
 from workflows.ids import check_id
 
-CHUNK = 1000  # jobs that are put in with one transaction
+CHUNK = 1000  # jobs submitted in one transaction
 ACTIVE = ("ENQUEUED", "PENDING", "DELAYED")
 FAILED = ("ERROR", "MAX_RECOVERY_ATTEMPTS_EXCEEDED")
 _ITERATION = re.compile(r"^[^/]+/(it[0-9]+)(?:/|$)")
 
 
-class Queue:
+class QueueClient:
     """A connection to the queue's database."""
 
     def __init__(self, url: str, *, known: bool = False) -> None:
-        """Raises InputError if there is no queue at the URL, unless one is `known` to be there: `migrate` makes it."""
+        """Open a queue that `migrate` created. Raises InputError if there is none, which `known` does not check."""
         self.url = checked_url(url)
         if not known:
             require_queue(self.url)
         self._engine = engine(self.url)
         self._client = DBOSClient(
             system_database_engine=self._engine,
-            serializer=Json(),
+            serializer=JsonSerializer(),
             application_name=APPLICATION,
             use_listen_notify=False,
         )
@@ -41,11 +41,11 @@ class Queue:
         self._client.destroy()
         self._engine.dispose()
 
-    def put(self, jobs: Iterable[Job | FlowJob]) -> int:
-        """Put jobs in; one whose id is there already is left as it is. Returns how many there were.
+    def submit(self, jobs: Iterable[Job | FlowJob]) -> int:
+        """Put jobs into their queues and return their number. A job whose id exists is left unchanged.
 
         Raises:
-            InputError: an id that cannot be used, or arguments that are not JSON or too large.
+            InputError: an id is invalid, or arguments are not JSON or too large.
         """
         count = 0
         for chunk in _chunks(jobs):
@@ -58,19 +58,19 @@ class Queue:
         return count
 
     def cancel(self, run: str) -> int:
-        """End a run, or a part of it: nothing more of it starts, and what is running is stopped. Returns how many.
+        """Cancel a run, or a part of it, including running jobs, and return the number of jobs and flows.
 
-        The driver is cancelled first, so that nothing puts new jobs in; looked for again until nothing is left.
+        The driver is cancelled first, so that it submits no new jobs; repeated until nothing is active.
         """
-        gone = 0
+        cancelled = 0
         while ids := self._ids(run, ACTIVE):
             for chunk in _chunks(ids):
                 self._client.cancel_workflows(chunk)
-            gone += len(ids)
-        return gone
+            cancelled += len(ids)
+        return cancelled
 
-    def again(self, ids: Sequence[str]) -> list[str]:
-        """Let flows that have ended begin anew, in place. Returns those that had."""
+    def requeue(self, ids: Sequence[str]) -> list[str]:
+        """Restart flows that have ended, under their ids. Returns the ids of those."""
         ended = [i for i in ids for row in [self._rows(i).get(i)] if row is not None and row["status"] not in ACTIVE]
         queues = self._queues(ended)
         for identity in ended:
@@ -78,19 +78,24 @@ class Queue:
         return ended
 
     def retry(self, run: str, *, failed: bool = True, cancelled: bool = False) -> list[str]:
-        """Put what failed in a run into its queue again, in place, and what followed from it. Returns the ids.
+        """Requeue the failed jobs of a run and their dependents, under their ids. Returns the ids.
 
-        What followed: the flows above a failed job, from their beginning, and those of their jobs that were put in
-        after it ended, a subject's record after an expression for one. What has the same input as before returns at
-        once. Of a run with iterations the last one is retried only: the others' models are superseded.
+        Dependents are the flows above a failed job, from their start, and those of their jobs that were submitted
+        after it ended, such as the record of a subject after a failed expression. Steps with unchanged inputs return
+        at once. Of a run with iterations only the last one is retried: the others' models are superseded.
+
+        Args:
+            run: id of the run.
+            failed: retry failed jobs.
+            cancelled: retry cancelled jobs.
         """
         rows = self._rows(check_id(run))
         iterations = [row["iteration"] for row in rows.values() if row["iteration"]]
         last = max(iterations, default="")
-        wanted = (*(FAILED if failed else ()), *(("CANCELLED",) if cancelled else ()))
-        found = {i: r for i, r in rows.items() if r["status"] in wanted and r["iteration"] in ("", last)}
-        chosen = set(found)
-        for identity, row in found.items():
+        statuses = (*(FAILED if failed else ()), *(("CANCELLED",) if cancelled else ()))
+        selected = {i: r for i, r in rows.items() if r["status"] in statuses and r["iteration"] in ("", last)}
+        chosen = set(selected)
+        for identity, row in selected.items():
             above = [i for i in _ancestors(identity) if i in rows]
             chosen |= {i for i in above if rows[i]["status"] not in ACTIVE}
             chosen |= {
@@ -108,17 +113,17 @@ class Queue:
         return ordered
 
     def forget(self, part: str) -> int:
-        """Delete the rows of a run or of an iteration of it that has ended. Returns how many.
+        """Delete the rows of a run, or of one of its iterations, and return their number.
 
         Raises:
-            InputError: some of it has not ended.
+            InputError: some of its jobs have not ended.
         """
         if running := self._ids(part, ACTIVE):
             raise InputError(
                 "The jobs have not ended",
                 where=part,
-                expected="a run or an iteration that is over",
-                got=f"{len(running)} that wait or run",
+                expected="a run or an iteration that has ended",
+                got=f"{len(running)} waiting or running",
                 fix="wait, or cancel it first",
             )
         ids = self._ids(part, ())
@@ -127,10 +132,10 @@ class Queue:
         return len(ids)
 
     def _ids(self, run: str, statuses: Sequence[str]) -> list[str]:
-        """Ids of a run in the given states (none: in any), the shortest first."""
+        """Ids of a run in the given states (none given: in any), the shortest first."""
         rows = self._rows(check_id(run))
-        found = [i for i, row in rows.items() if not statuses or row["status"] in statuses]
-        return sorted(found, key=lambda i: (len(i), i))
+        ids = [i for i, row in rows.items() if not statuses or row["status"] in statuses]
+        return sorted(ids, key=lambda i: (len(i), i))
 
     def _rows(self, run: str) -> dict[str, dict[str, Any]]:
         query = sa.text(
@@ -144,14 +149,14 @@ class Queue:
                     "status": status,
                     "created": created,
                     "ended": ended,
-                    "iteration": found[0] if (found := _ITERATION.findall(identity)) else "",
+                    "iteration": match[0] if (match := _ITERATION.findall(identity)) else "",
                 }
                 for identity, name, status, created, ended in connection.execute(query, below(run))
             }
 
     def _queues(self, ids: Sequence[str]) -> dict[str, str]:
-        """The queue of each job, as its input says: from dead letters and cancelled jobs it was taken."""
-        found = {}
+        """The queue of each job, from its input: rows of dead and cancelled jobs have lost it."""
+        queues = {}
         query = sa.text(
             f"SELECT w.workflow_uuid, coalesce(i.inputs, w.inputs) FROM {table(self.url, 'workflow_status')} w "
             f"LEFT JOIN {table(self.url, 'workflow_input')} i ON i.workflow_uuid = w.workflow_uuid "
@@ -160,8 +165,8 @@ class Queue:
         with self._engine.connect() as connection:
             for chunk in _chunks(ids):
                 for identity, inputs in connection.execute(query, {"ids": chunk}):
-                    found[identity] = json.loads(inputs)["kwargs"]["queue"]
-        return found
+                    queues[identity] = json.loads(inputs)["kwargs"]["queue"]
+        return queues
 
 
 def _ancestors(identity: str) -> list[str]:
@@ -199,7 +204,7 @@ def _check(job: Job | FlowJob) -> None:
             where=job.id,
             expected=f"arguments as JSON of at most {MAX_BYTES} bytes",
             got=problem,
-            fix="hand over paths, not data",
+            fix="pass paths, not data",
         )
 
 

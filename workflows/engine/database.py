@@ -1,6 +1,7 @@
 """The queue's database: a SQLite file in WAL mode on one machine, or PostgreSQL for many. Only the URL differs.
 
-Questions go straight to the drivers: `gnmreg status` shall not wait for SQLAlchemy, which only what writes imports.
+Queries go directly to the drivers, because importing SQLAlchemy would double the time of `gnmreg status`; only code
+that writes imports it.
 """
 
 import re
@@ -18,7 +19,7 @@ if TYPE_CHECKING:
 
 FILE = "queue.sqlite"
 SCHEMA = "dbos"  # on PostgreSQL
-ENVIRONMENT = "GNMREG_DB"  # where a URL with a password belongs: command lines can be read by everyone
+ENVIRONMENT = "GNMREG_DB"  # for URLs with a password: every user can read command lines
 _NETWORK = ("nfs", "nfs4", "cifs", "smb3", "smbfs", "9p", "lustre", "ceph", "glusterfs", "fuse.sshfs", "beegfs", "gpfs")
 _BUSY_S, _CONNECT_S = 30.0, 30
 _READ_ONLY = "-c default_transaction_read_only=on"
@@ -26,7 +27,7 @@ Ask = Callable[[str, Mapping[str, Any]], list[Any]]  # SQL with :names, their va
 
 
 def default_url(folder: Path) -> str:
-    """The SQLite database of a run's folder."""
+    """Return the URL of the SQLite database of a farm's folder."""
     return f"sqlite:///{Path(folder).resolve() / FILE}"
 
 
@@ -35,10 +36,10 @@ def is_sqlite(url: str) -> bool:
 
 
 def checked_url(url: str) -> str:
-    """The URL in the form that all of us use.
+    """Return the URL in the form that this package uses.
 
     Raises:
-        InputError: neither sqlite:///FILE nor postgresql://..., a SQLite file on a network disk, or no database's name.
+        InputError: neither sqlite:///FILE nor postgresql://..., a SQLite file on a network disk, or no database name.
     """
     try:
         parts = urlsplit(url)
@@ -62,7 +63,7 @@ def checked_url(url: str) -> str:
 
 
 def redacted_url(url: str) -> str:
-    """The URL without its password."""
+    """Return the URL without its password."""
     try:
         parts = urlsplit(url)
     except ValueError:
@@ -75,15 +76,15 @@ def redacted_url(url: str) -> str:
 
 
 def sqlite_file(url: str) -> Path:
-    """The file of a URL that `checked_url` returned."""
+    """Return the file of a URL that `checked_url` returned."""
     return Path(url.removeprefix("sqlite:///"))
 
 
 def prepare(url: str) -> None:
-    """Set what has to be set once: SQLite's folder and its write-ahead log, four times as fast as the default journal.
+    """Create SQLite's folder and set its write-ahead log, four times as fast as the default journal; or connect once.
 
     Raises:
-        InputError: the database cannot be reached or made.
+        InputError: the database cannot be reached or created.
     """
     import sqlalchemy as sa
 
@@ -103,17 +104,17 @@ def prepare(url: str) -> None:
         raise InputError(
             "The queue's database cannot be used",
             where=redacted_url(url),
-            expected="a SQLite file that can be written, or a PostgreSQL server that answers",
+            expected="a writable SQLite file, or a PostgreSQL server that answers",
             got=first,
             fix="check the URL, the server and its password",
         ) from None
 
 
 def require_queue(url: str) -> None:
-    """Make sure that there is a queue at the URL. Raises InputError if there is none, or it cannot be reached."""
+    """Raise InputError if there is no queue at the URL, or it cannot be reached."""
     got = ""
     if is_sqlite(url) and not sqlite_file(url).is_file():
-        got = "no such file"  # connecting would make it
+        got = "no such file"  # connecting would create it
     else:
         try:
             with reading(url) as ask:
@@ -131,38 +132,38 @@ def require_queue(url: str) -> None:
 
 
 def engine(url: str) -> "sa.Engine":
-    """Our own connections that write, one at a time."""
+    """Return an engine for writing, without a pool of connections."""
     import sqlalchemy as sa
 
     if not is_sqlite(url):
         return sa.create_engine(url, poolclass=sa.pool.NullPool, connect_args={"connect_timeout": _CONNECT_S})
-    made = sa.create_engine(url, poolclass=sa.pool.NullPool, connect_args={"timeout": _BUSY_S})
+    created = sa.create_engine(url, poolclass=sa.pool.NullPool, connect_args={"timeout": _BUSY_S})
 
-    @sa.event.listens_for(made, "connect")
+    @sa.event.listens_for(created, "connect")
     def _set(connection: Any, _record: object) -> None:
-        connection.isolation_level = "IMMEDIATE"  # a reader that becomes a writer may find the file busy for good
+        connection.isolation_level = "IMMEDIATE"  # a reader that becomes a writer may find the file busy forever
         connection.execute("PRAGMA foreign_keys=ON")
 
-    return made
+    return created
 
 
 @contextmanager
 def reading(url: str) -> Iterator[Ask]:
-    """A connection that the database itself keeps from writing. Raises `driver_errors`."""
+    """Open a connection that cannot write, and yield its query function. Raises `driver_errors`."""
     if is_sqlite(url):
         with closing(sqlite3.connect(sqlite_file(url), timeout=_BUSY_S)) as file:
             file.execute("PRAGMA query_only=ON")
-            yield lambda query, values: file.execute(*_bound(query, values)).fetchall()
+            yield lambda query, values: file.execute(*_bind(query, values, ":{}")).fetchall()
     else:
         import psycopg
 
         plain = url.replace("+psycopg", "", 1)
         with closing(psycopg.connect(plain, connect_timeout=_CONNECT_S, options=_READ_ONLY)) as server:
-            yield lambda query, values: server.execute(*_for_psycopg(*_bound(query, values))).fetchall()
+            yield lambda query, values: server.execute(*_bind(query.replace("%", "%%"), values, "%({})s")).fetchall()
 
 
 def driver_errors(url: str) -> type[Exception]:
-    """What `reading` and its questions raise: the database cannot be reached, or does not answer."""
+    """Return the error of `reading` and its queries: the database cannot be reached, or does not answer."""
     if is_sqlite(url):
         return sqlite3.Error
     import psycopg
@@ -170,30 +171,33 @@ def driver_errors(url: str) -> type[Exception]:
     return psycopg.Error
 
 
-def _bound(query: str, values: Mapping[str, Any]) -> tuple[str, dict[str, Any]]:
-    """A name for each element of a list."""
+def _bind(query: str, values: Mapping[str, Any], placeholder: str) -> tuple[Any, dict[str, Any]]:
+    """The query with a driver's placeholders for `:name`, and the values; a list becomes one placeholder an element.
+
+    What SQLAlchemy's `bindparam(expanding=True)` does, without importing it.
+    """
     bound: dict[str, Any] = {}
-    for name, value in values.items():
+
+    def placeholders(match: re.Match[str]) -> str:
+        name = match[1]
+        value = values[name]
         if not isinstance(value, Sequence) or isinstance(value, str):
             bound[name] = value
-            continue
-        bound |= {f"{name}_{number}": one for number, one in enumerate(value)}
-        names = ", ".join(f":{name}_{number}" for number in range(len(value)))
-        query = query.replace(f":{name}", f"({names})")
-    return query, bound
+            return placeholder.format(name)
+        elements = {f"{name}_{number}": element for number, element in enumerate(value)}
+        bound.update(elements)
+        return f"({', '.join(map(placeholder.format, elements))})"
 
-
-def _for_psycopg(query: str, values: dict[str, Any]) -> tuple[Any, dict[str, Any]]:
-    return re.sub(r"(?<!:):(\w+)", r"%(\1)s", query.replace("%", "%%")), values
+    return re.sub(r"(?<!:):(\w+)", placeholders, query), bound
 
 
 def table(url: str, name: str) -> str:
-    """The name of one of DBOS's tables in SQL."""
+    """Return the name of one of DBOS's tables in SQL."""
     return name if is_sqlite(url) else f"{SCHEMA}.{name}"
 
 
 def below(run: str) -> dict[str, str]:
-    """Parameters of `BELOW` for all jobs of a run, or of a part of it."""
+    """Return the parameters of `BELOW` for all jobs of a run, or of a part of it."""
     escaped = run.replace("\\", "\\\\").replace("%", "\\%").replace("_", "\\_")
     return {"run": run, "below": f"{escaped}/%"}
 
@@ -202,19 +206,19 @@ BELOW = "(workflow_uuid = :run OR workflow_uuid LIKE :below ESCAPE '\\')"
 
 
 def _filesystem(file: Path) -> str:
-    """The kind of filesystem that a path lies on, as /proc/mounts names it; empty where there is no such file."""
-    best, kind = "", ""
+    """The type of the filesystem of a path, as /proc/mounts names it; empty where there is no such file."""
+    longest, filesystem = "", ""
     try:
         lines = Path("/proc/mounts").read_text().splitlines()
     except OSError:
         return ""
     for line in lines:
-        _, point, found, *_ = line.split(" ")
+        _, point, kind, *_ = line.split(" ")
         point = point.replace("\\040", " ")
         inside = str(file) == point or str(file).startswith(point.rstrip("/") + "/")
-        if inside and len(point) >= len(best):
-            best, kind = point, found
-    return kind
+        if inside and len(point) >= len(longest):
+            longest, filesystem = point, kind
+    return filesystem
 
 
 def _refused(url: str, *, got: str) -> InputError:

@@ -1,7 +1,7 @@
-"""What workers may be asked to do: a job names a step of a fixed table and hands it small JSON arguments.
+"""Jobs of the queue: a job names a step of a fixed table and gives it small JSON arguments.
 
-A job comes out of a database that others can write to, so nothing in it is trusted: `checked` is called before
-anything runs.
+Others can write to the queue's database, so nothing in a job is trusted: `validate_arguments` is called before anything
+runs.
 """
 
 import json
@@ -12,22 +12,22 @@ from typing import Any
 from workflows.ids import check_location, job_refused, shortened
 
 GPU, SUBJECTS, DRIVER, REBUILD = "gpu", "subjects", "driver", "rebuild"  # the queues
-NEUTRAL_PRIORITY, EXPRESSION_PRIORITY, STABILIZE_PRIORITY = 5, 10, 3  # the lowest number goes first
-MAX_BYTES = 512 * 1024  # of a job's arguments, and of a step's result, as JSON: arrays travel as files
+NEUTRAL_PRIORITY, EXPRESSION_PRIORITY, STABILIZE_PRIORITY = 5, 10, 3  # the lowest number first
+MAX_BYTES = 512 * 1024  # of a job's arguments and of a step's result, as JSON: arrays are passed as files
 
 
 @dataclass(frozen=True, kw_only=True)
 class Step:
-    """A row of the table of steps."""
+    """An entry of the table of steps."""
 
     function: str  # "package.module:name", called in a child process with a job's arguments as keywords
-    places: tuple[str, ...] = ()  # the arguments that are paths or URLs: they must lie below the worker's roots
-    hard_s: float = 3 * 3600.0  # a job that takes longer is killed and not tried again
+    path_arguments: tuple[str, ...] = ()  # arguments that are paths or URLs: they must lie below the worker's roots
+    timeout_s: float = 3 * 3600.0  # a job that takes longer is killed and not repeated
 
 
 @dataclass(frozen=True, kw_only=True)
 class Job:
-    """One call of a step. Its id is also what keeps it from being done twice."""
+    """One call of a step. The queue runs each id once."""
 
     id: str  # RUN/..., e.g. RUN/it00/s0007/e03
     step: str
@@ -36,13 +36,13 @@ class Job:
     priority: int = EXPRESSION_PRIORITY
 
     def spec(self) -> dict[str, Any]:
-        """What a worker is handed."""
+        """Return what a worker receives."""
         return {"step": self.step, "arguments": dict(self.arguments)}
 
 
 @dataclass(frozen=True, kw_only=True)
 class FlowJob:
-    """One run of a flow: a function that makes jobs and waits for them, run by a coordinator."""
+    """One execution of a flow, a function that submits jobs and waits for them, by a coordinator."""
 
     id: str
     flow: str  # its name in the table of flows
@@ -51,25 +51,25 @@ class FlowJob:
     priority: int = EXPRESSION_PRIORITY
 
     def spec(self) -> dict[str, Any]:
-        """What a coordinator is handed."""
+        """Return what a coordinator receives."""
         return {"flow": self.flow, "arguments": dict(self.arguments)}
 
 
 class PermanentStepError(Exception):
-    """What a step made is no good, and trying again would not change that. The message is the reason."""
+    """A step's result is unusable, and repeating the step would not change that. The message is the reason."""
 
 
-def checked(spec: Any, steps: Mapping[str, Step], roots: Sequence[str]) -> tuple[Step, dict[str, Any]]:
-    """The step and the arguments of a job that a worker took from the queue.
+def validate_arguments(spec: Any, steps: Mapping[str, Step], roots: Sequence[str]) -> tuple[Step, dict[str, Any]]:
+    """Return the step and the arguments of a job that a worker took from the queue.
 
     Args:
-        spec: as `Job.spec` makes it, but from anyone.
+        spec: as `Job.spec` returns it, but from an untrusted source.
         steps: the table of steps.
-        roots: folders and URLs below which all places must lie, as `resolve_roots` returns them.
+        roots: folders and URLs below which all paths and URLs must lie, as `resolve_roots` returns them.
 
     Raises:
-        InputError: a spec of another form, a step that is not in the table, arguments that are too large, or a place
-            outside the roots.
+        InputError: the spec has another form, the step is not in the table, the arguments are too large, or a path or
+            URL lies outside the roots.
     """
     if not isinstance(spec, dict) or set(spec) != {"step", "arguments"}:
         raise job_refused("a job's form", expected="an object of step and arguments", got=shortened(spec))
@@ -80,10 +80,10 @@ def checked(spec: Any, steps: Mapping[str, Step], roots: Sequence[str]) -> tuple
         raise job_refused(name, expected="an object of arguments", got=type(arguments).__name__)
     if (size := len(json.dumps(arguments))) > MAX_BYTES:
         raise job_refused(name, expected=f"arguments of at most {MAX_BYTES} bytes", got=f"{size} bytes")
-    for key in steps[name].places:
+    for key in steps[name].path_arguments:
         value = arguments.get(key)
         value = list(value.values()) if isinstance(value, dict) else value
-        for place in value if isinstance(value, list) else [value]:
-            if place is not None:
-                check_location(place, roots, where=f"{name}: {key}")
+        for location in value if isinstance(value, list) else [value]:
+            if location is not None:
+                check_location(location, roots, where=f"{name}: {key}")
     return steps[name], arguments

@@ -1,8 +1,8 @@
-"""Who is alive: a lock that the kernel, or PostgreSQL's kernel connection, holds for every process that takes jobs.
+"""Detection of dead processes by locks: every process that takes jobs holds a file lock, or a lock of PostgreSQL.
 
 A heartbeat can be late because a step holds the interpreter's lock; a lock cannot. It is free exactly when its process
-is gone, or, on PostgreSQL, when the connection broke. As a restart of the server breaks all of them at once, the
-detector waits until a lock was free for a while and the server has been up for longer.
+has ended or, on PostgreSQL, when its connection broke. A restart of the server breaks all connections at once, so a
+process counts as dead only when its lock was free for some time and the server has been up for longer.
 """
 
 import fcntl
@@ -26,35 +26,35 @@ _CLASS = 0x676E6D  # "gnm": the first of the two numbers of our advisory locks
 
 
 @dataclass(frozen=True, kw_only=True)
-class Patience:
-    """How long the detector waits before it takes a process for dead."""
+class LivenessTimeouts:
+    """Times of the detector of dead processes, seconds."""
 
-    look_s: float = 2.0  # between two looks
-    free_s: float = 15.0  # its lock must have been free that long
-    up_s: float = 60.0  # and the server up that long
+    poll_s: float = 2.0  # between two queries
+    release_s: float = 15.0  # for which a dead process's lock must have been free
+    uptime_s: float = 60.0  # for which the server must have been up
 
 
-SQLITE_PATIENCE = Patience(free_s=2.0, up_s=0.0)  # a file's lock is lost with its process only
+SQLITE_TIMEOUTS = LivenessTimeouts(release_s=2.0, uptime_s=0.0)  # only a process's end releases a file lock
 
 
 class Locks(Protocol):
-    """The locks of one kind of database."""
+    """Locks of one kind of database."""
 
     def take(self, name: str) -> bool:
-        """Take the lock of this process and keep it; False if another process has it."""
+        """Take the lock of this process and keep it; return False if another process holds it."""
 
     def keep(self) -> None:
-        """Make sure that it is still held; raises if that cannot be told or done now."""
+        """Check that the lock is still held, or take it again; raises if that is impossible now."""
 
     def free(self, names: Iterable[str]) -> set[str]:
-        """Those of the names whose lock nobody holds."""
+        """Return those of the names whose lock no process holds."""
 
-    def up_s(self) -> float:
-        """How long the database has been up."""
+    def uptime_s(self) -> float:
+        """Return for how long the database has been up, seconds."""
 
 
 class FileLocks:
-    """flock on files beside the SQLite database."""
+    """flock on files next to the SQLite database."""
 
     def __init__(self, url: str) -> None:
         database = sqlite_file(url)
@@ -64,7 +64,7 @@ class FileLocks:
     def take(self, name: str) -> bool:
         self._folder.mkdir(parents=True, exist_ok=True)
         file = (self._folder / name).open("a")
-        for _ in range(5):  # someone else's look takes it for a moment
+        for _ in range(5):  # another process's query holds it for a moment
             try:
                 fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
             except OSError:
@@ -81,7 +81,7 @@ class FileLocks:
     def free(self, names: Iterable[str]) -> set[str]:
         return {name for name in names if self._is_free(name)}
 
-    def up_s(self) -> float:
+    def uptime_s(self) -> float:
         return float("inf")
 
     def _is_free(self, name: str) -> bool:
@@ -99,7 +99,7 @@ class FileLocks:
 
 
 class PostgresLocks:
-    """Advisory locks on a connection of their own. A lost connection is opened again and the lock taken again."""
+    """Advisory locks on a separate connection. After a lost connection, the lock is taken again on a new one."""
 
     def __init__(self, url: str) -> None:
         self._engine = engine(url)
@@ -112,7 +112,7 @@ class PostgresLocks:
 
     def keep(self) -> None:
         try:
-            # Asked for by name: a connection that was silently opened again answers, but holds nothing.
+            # By name: a connection that was silently reopened answers, but holds no lock.
             if self._connection is not None and self._name not in self.free([self._name]):
                 return
         except sa.exc.SQLAlchemyError:
@@ -129,7 +129,7 @@ class PostgresLocks:
         held = {row[0] for row in self._open().execute(query, {"class": _CLASS})}
         return {name for name, key in keys.items() if key % 2**32 not in held}
 
-    def up_s(self) -> float:
+    def uptime_s(self) -> float:
         query = sa.text("SELECT extract(epoch FROM now() - pg_postmaster_start_time())")
         return float(self._open().execute(query).scalar_one())
 
@@ -139,11 +139,11 @@ class PostgresLocks:
 
     def _open(self) -> sa.Connection:
         if self._connection is None:
-            fresh = self._engine.connect().execution_options(isolation_level="AUTOCOMMIT")
-            # Without these the server would hold the lock of a machine that lost its power for two hours.
+            connection = self._engine.connect().execution_options(isolation_level="AUTOCOMMIT")
+            # Without these, the server would hold the lock of a machine that lost power for two hours.
             for setting in ("tcp_keepalives_idle = 5", "tcp_keepalives_interval = 5", "tcp_keepalives_count = 2"):
-                fresh.execute(sa.text(f"SET {setting}"))
-            self._connection = fresh
+                connection.execute(sa.text(f"SET {setting}"))
+            self._connection = connection
         return self._connection
 
     def _drop(self) -> None:
@@ -156,62 +156,63 @@ class PostgresLocks:
 
 
 class Liveness:
-    """This process' lock, and the thread that looks for processes whose lock is free."""
+    """The lock of this process, and the thread that searches for processes whose lock is free."""
 
-    def __init__(self, url: str, patience: Patience | None = None) -> None:
+    def __init__(self, url: str, timeouts: LivenessTimeouts | None = None) -> None:
         self._url = url
-        self._patience = patience or (SQLITE_PATIENCE if is_sqlite(url) else Patience())
+        self._patience = timeouts or (SQLITE_TIMEOUTS if is_sqlite(url) else LivenessTimeouts())
         self._locks: Locks = FileLocks(url) if is_sqlite(url) else PostgresLocks(url)
         self._free_since: dict[str, float] = {}
-        self._me = ""
+        self._own_name = ""
 
     def join(self, names: Iterable[str]) -> str:
-        """Take the lock of the first name that nobody has, and return that name: this process' executor id.
+        """Take the lock of the first free name, and return that name: the executor id of this process.
 
         Raises:
             InputError: all names are taken.
         """
-        tried = []
+        taken = []
         for name in names:
             if self._locks.take(name):
-                self._me = name
+                self._own_name = name
                 return name
-            tried.append(name)
+            taken.append(name)
         raise InputError(
-            "Another process has this place",
-            where=", ".join(tried),
+            "Another process has this executor id",
+            where=", ".join(taken),
             expected="one worker for each GPU",
-            got="a worker that is running there already",
-            fix="stop that one, or choose another GPU",
+            got="a worker that is already running there",
+            fix="stop it, or choose another GPU",
         )
 
     def watch(self, version: str, recover: Callable[[str], None]) -> threading.Thread:
-        """Look for the dead from now on and hand each one's executor id to `recover`."""
+        """Start the search for dead processes; `recover` is called with each one's executor id."""
         thread = threading.Thread(target=self._watch, args=(version, recover), name="liveness", daemon=True)
         thread.start()
         return thread
 
     def _watch(self, version: str, recover: Callable[[str], None]) -> None:
         while True:
-            time.sleep(self._patience.look_s)
+            time.sleep(self._patience.poll_s)
             try:
                 self._locks.keep()
                 for name in self.dead(self._working(version), now=time.monotonic()):
-                    log.warning("%s is gone: its jobs are given to others", name)
+                    log.warning("%s is dead: its jobs are given to others", name)
                     recover(name)
-            except Exception as error:  # whatever it is, looking must go on: the server may be restarting
+            except Exception as error:  # continue after any error: the server may be restarting
                 self._free_since.clear()
-                log.warning("cannot look for dead workers now: %s", str(error).splitlines()[0] if str(error) else error)
+                first, *_ = str(error).splitlines() or [repr(error)]
+                log.warning("cannot search for dead workers now: %s", first)
 
     def dead(self, names: Iterable[str], *, now: float) -> list[str]:
-        """Those of the names that have been without a lock for long enough at the time `now` (monotonic, s)."""
-        free = self._locks.free(name for name in names if name != self._me)
+        """Return those of the names whose lock has been free for long enough at the time `now` (monotonic, s)."""
+        free = self._locks.free(name for name in names if name != self._own_name)
         self._free_since = {name: self._free_since.get(name, now) for name in free}
-        ripe = [name for name, since in self._free_since.items() if now - since >= self._patience.free_s]
-        return sorted(ripe) if ripe and self._locks.up_s() >= self._patience.up_s else []
+        dead = [name for name, since in self._free_since.items() if now - since >= self._patience.release_s]
+        return sorted(dead) if dead and self._locks.uptime_s() >= self._patience.uptime_s else []
 
     def _working(self, version: str) -> list[str]:
-        """Executor ids of which jobs are under way."""
+        """Executor ids that have running jobs."""
         query = (
             f"SELECT DISTINCT executor_id FROM {table(self._url, 'workflow_status')} "
             "WHERE status = 'PENDING' AND application_version = :version AND executor_id IS NOT NULL"

@@ -1,7 +1,7 @@
 """Processes that take jobs from the queue: workers run steps in a child, coordinators run flows.
 
-They are crash-only: ending one means killing it, and what it was doing is given to another. So there is one way to
-stop, and it is the one that the tests try hardest.
+They are crash-only: to stop a process is to kill it, and its jobs are given to others. So there is one way to stop,
+and the tests exercise it most.
 """
 
 import logging
@@ -17,67 +17,71 @@ from typing import Any, NoReturn
 from dbos import DBOS, DBOSConfig
 
 from registration.errors import InputError
-from workflows.engine.child import RETRIED, Outcome, Slot
+from workflows.engine.child import RETRIED, StepOutcome, StepProcess
 from workflows.engine.database import ENVIRONMENT, checked_url, prepare
-from workflows.engine.jobs import DRIVER, GPU, REBUILD, SUBJECTS, Step, checked
-from workflows.engine.liveness import Liveness, Patience
-from workflows.engine.scope import Scope
-from workflows.engine.serialization import APPLICATION, VERSION, JobFailed, Json
+from workflows.engine.jobs import DRIVER, GPU, REBUILD, SUBJECTS, Step, validate_arguments
+from workflows.engine.liveness import Liveness, LivenessTimeouts
+from workflows.engine.scope import FlowScope
+from workflows.engine.serialization import APPLICATION, VERSION, JobFailed, JsonSerializer
 from workflows.ids import check_id, redact, resolve_roots
 
 log = logging.getLogger("gnmreg")
 
-POLL_S = 0.25  # how often a process asks a queue for work
-QUEUES = {GPU: 1, REBUILD: 1, SUBJECTS: 64, DRIVER: 1}  # how much of a queue one process takes at a time
+POLL_S = 0.25  # between two queries of a process for work
+QUEUES = {GPU: 1, REBUILD: 1, SUBJECTS: 64, DRIVER: 1}  # jobs of a queue that one process runs at a time
 ATTEMPTS, BACK_OFF_S, BACK_OFF_FACTOR = 3, 10.0, 3.0
-RECOVERIES = 5  # a job that killed so many workers, and one more, is a dead letter
+RECOVERIES = 5  # a job that killed more workers than this is dead: it is not run again
 Flow = Callable[..., Awaitable[Any]]
 
 
 @dataclass(frozen=True, kw_only=True)
-class Process:
-    """What one process is to do."""
+class EngineProcess:
+    """Configuration of one process."""
 
     url: str  # of the queue's database
     queues: tuple[str, ...]
     logs: Path  # each job's log goes to logs/<job id>.log
-    names: tuple[str, ...]  # executor ids to choose from; the first whose lock is free
-    roots: tuple[str, ...] = ()  # places of jobs must lie below them
+    names: tuple[str, ...]  # possible executor ids; the first whose lock is free is taken
+    roots: tuple[str, ...] = ()  # paths and URLs of jobs must lie below them
     steps: Mapping[str, Step] = field(default_factory=dict)
     flows: Mapping[str, Flow] = field(default_factory=dict)
-    modules: tuple[str, ...] = ()  # that a child imports when it starts
-    patience: Patience | None = None  # None: what suits the database
+    modules: tuple[str, ...] = ()  # imported by a child when it starts
+    timeouts: LivenessTimeouts | None = None  # None: the default of the database
     back_off_s: float = BACK_OFF_S
 
 
 def names(kind: str, count: int = 64) -> tuple[str, ...]:
-    """Executor ids for processes of this machine, "host-gpu0" and so on."""
+    """Return executor ids for processes of this machine, "host-gpu0" and so on."""
     return tuple(f"{socket.gethostname()}-{kind}{number}" for number in range(count))
 
 
 def migrate(url: str) -> None:
-    """Create or bring up to date the tables of the queue. Any number of processes may do so at a time."""
+    """Create or update the tables of the queue. Several processes may do so at the same time.
+
+    Raises:
+        InputError: the database cannot be used.
+    """
     url = checked_url(url)
     prepare(url)
     DBOS.migrate(url)
 
 
-def serve(process: Process) -> NoReturn:
-    """Take jobs until SIGTERM or SIGINT; call it in the main thread, it never returns.
+def serve(process: EngineProcess) -> NoReturn:
+    """Take jobs until SIGTERM or SIGINT. Call it in the main thread; it never returns.
 
     Raises:
-        InputError: the database cannot be used, or another process has the place.
+        InputError: the database cannot be used, or another process has the executor id.
     """
     url = checked_url(process.url)
     os.environ.pop(ENVIRONMENT, None)  # children print their environment when they crash
-    _quiet()
+    _configure_logging()
     migrate(url)
-    liveness = Liveness(url, process.patience)
-    name = liveness.join(process.names)  # before launch, which takes back what this name was doing before it died
-    slot = Slot(modules=process.modules) if process.steps else None
-    if slot is not None:
-        slot.warm()
-    _registered(process, url, slot)
+    liveness = Liveness(url, process.timeouts)
+    name = liveness.join(process.names)  # before launch, which recovers this executor id's jobs
+    child = StepProcess(modules=process.modules) if process.steps else None
+    if child is not None:
+        child.warm()
+    _register_workflows(process, url, child)
     DBOS(config=_config(url, name))
     DBOS.listen_queues(list(process.queues))
     DBOS.launch()
@@ -89,8 +93,8 @@ def serve(process: Process) -> NoReturn:
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, lambda *_: ended.set())
     ended.wait()
-    if slot is not None:
-        slot.kill()
+    if child is not None:
+        child.kill()
     print(f"{name} ends", flush=True)
     os._exit(0)
 
@@ -104,35 +108,35 @@ def _config(url: str, name: str) -> DBOSConfig:
         "name": APPLICATION,
         "system_database_url": url,
         "executor_id": name,
-        "application_version": VERSION,  # by default a hash of the code: an edit would strand a backlog
+        "application_version": VERSION,  # DBOS's default is a hash of the code: an edit would strand the waiting jobs
         "sys_db_pool_size": 6,
-        "use_listen_notify": False,  # we count rows and wait for no events: a connection less for each process
+        "use_listen_notify": False,  # flows count rows instead of waiting for events: one connection fewer per process
         "notification_listener_polling_interval_sec": 30.0,
-        "serializer": Json(),
+        "serializer": JsonSerializer(),
         "log_level": "WARNING",
     }
 
 
-def _registered(process: Process, url: str, slot: Slot | None) -> None:
-    """Make the two kinds of workflows known: `job` runs one step, `flow` is a function that makes jobs and waits."""
+def _register_workflows(process: EngineProcess, url: str, child: StepProcess | None) -> None:
+    """Register the two kinds of workflows: `job` runs one step, `flow` runs a function that submits jobs and waits."""
     roots = resolve_roots(process.roots)
 
-    async def attempt(spec: Any, number: int) -> Outcome:
-        assert slot is not None
+    async def attempt(spec: Any, number: int) -> StepOutcome:
+        assert child is not None
         try:
-            step, arguments = checked(spec, process.steps, roots)
+            step, arguments = validate_arguments(spec, process.steps, roots)
             file = process.logs / f"{check_id(str(DBOS.workflow_id))}.log"
         except InputError as error:
             return {"status": "refused", "reason": f"{error.where}: expected {error.expected}, got {error.got}"}
         if number > 1:
             log.warning("%s: attempt %d", DBOS.workflow_id, number)
-        return await slot.run(step.function, arguments, log=file, hard_s=step.hard_s)
+        return await child.run(step.function, arguments, log=file, timeout_s=step.timeout_s)
 
     @DBOS.workflow(name="job", max_recovery_attempts=RECOVERIES)
     async def job(spec: Any, queue: str) -> Any:
         for number in range(1, ATTEMPTS + 1):
             options = {"name": f"attempt {number}", "preemptible": True}
-            outcome: Outcome = await DBOS.run_step_async(options, attempt, spec, number)  # type: ignore[call-overload]
+            outcome: StepOutcome = await DBOS.run_step_async(options, attempt, spec, number)  # type: ignore[call-overload]
             if outcome["status"] == "done":
                 return outcome
             if outcome["status"] not in RETRIED:
@@ -147,14 +151,14 @@ def _registered(process: Process, url: str, slot: Slot | None) -> None:
             function, arguments = process.flows[spec["flow"]], dict(spec["arguments"])
         except (KeyError, TypeError) as error:
             raise JobFailed({"status": "refused", "reason": f"there is no such flow: {error}"}) from None
-        return await function(Scope(url), **arguments)
+        return await function(FlowScope(url), **arguments)
 
 
 class _Redacting(logging.Filter):
-    """Passwords in URLs end here, whoever logs them; so do the tracebacks of jobs that failed."""
+    """Removes passwords from URLs in all log records, and the tracebacks of failed jobs."""
 
     def filter(self, record: logging.LogRecord) -> bool:
-        if record.exc_info and isinstance(record.exc_info[1], JobFailed):  # told in the job's row and log
+        if record.exc_info and isinstance(record.exc_info[1], JobFailed):  # reported in the job's row and log
             return False
         record.msg, record.args = redact(record.getMessage()), None
         if record.exc_info:
@@ -163,7 +167,7 @@ class _Redacting(logging.Filter):
         return True
 
 
-def _quiet() -> None:
+def _configure_logging() -> None:
     handler = logging.StreamHandler()
     handler.setFormatter(logging.Formatter("%(asctime)s %(name)s: %(message)s", datefmt="%H:%M:%S"))
     handler.addFilter(_Redacting())
@@ -173,15 +177,15 @@ def _quiet() -> None:
         logger.setLevel(logging.WARNING)
 
 
-def known_queues(listened: Sequence[str]) -> tuple[str, ...]:
-    """The names of queues as given. Raises InputError for one that does not exist."""
-    for name in listened:
+def check_queues(queues: Sequence[str]) -> tuple[str, ...]:
+    """Return the names of queues. Raises InputError for one that does not exist."""
+    for name in queues:
         if name not in QUEUES:
             raise InputError(
                 "There is no such queue",
                 where="--queue",
                 expected=", ".join(QUEUES),
                 got=name,
-                fix="choose among them",
+                fix="choose one of these",
             )
-    return tuple(listened)
+    return tuple(queues)

@@ -1,4 +1,4 @@
-"""What stands in the queue's rows, asked in SQL that cannot write."""
+"""Read-only queries of the queue's rows."""
 
 import json
 import time
@@ -25,7 +25,7 @@ DEAD = "killed its worker every time"
 
 
 @dataclass(frozen=True, kw_only=True)
-class Row:
+class JobRow:
     """One job or flow."""
 
     id: str
@@ -40,22 +40,22 @@ class Row:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Figures:
-    """A run, or all of the queue, in numbers; jobs only, flows aside."""
+class QueueMetrics:
+    """Counts of a run, or of the whole queue; of jobs unless stated otherwise."""
 
     counts: dict[str, int]  # state -> jobs
     flows: dict[str, int]  # state -> flows
     ended_last_hour: int
-    a_day: float  # jobs a day at the rate since the oldest of the last 1,000 that were done
+    a_day: float  # jobs per day at the rate since the oldest of the last 1,000 done
     failures: dict[str, int]  # "status: reason" -> jobs
-    workers: dict[str, int]  # executor id -> jobs that it runs
+    workers: dict[str, int]  # executor id -> running jobs
 
 
-class Reader:
-    """Read-only questions to the queue's database."""
+class QueueReader:
+    """Read-only queries of the queue's database."""
 
     def __init__(self, url: str, *, known: bool = False) -> None:
-        """Raises InputError if there is no queue at the URL, unless it is `known` that there is one."""
+        """Open a queue. Raises InputError if there is none at the URL, which `known` does not check."""
         self.url = checked_url(url)
         if not known:
             require_queue(self.url)
@@ -64,7 +64,7 @@ class Reader:
         )
 
     def counts(self, run: str, *, kind: str | None = None) -> dict[str, int]:
-        """State -> number of jobs and flows below a run, itself aside."""
+        """Return state -> number of jobs and flows below a run, without the run itself."""
         parameters = {"below": below(check_id(run))["below"]}
         query = f"SELECT status, count(*) FROM {self._status} WHERE workflow_uuid LIKE :below ESCAPE '\\'"
         if kind:
@@ -73,39 +73,25 @@ class Reader:
         return _by_state(self._rows(query + " GROUP BY status", parameters))
 
     def counts_of(self, ids: Sequence[str]) -> dict[str, int]:
-        """State -> how many of these are in it; ids that are not there are counted nowhere."""
+        """Return state -> number of these ids; ids that are not in the queue are not counted."""
         total: dict[str, int] = {}
         query = f"SELECT status, count(*) FROM {self._status} WHERE workflow_uuid IN :ids GROUP BY status"
         with reading(self.url) as ask:
             for start in range(0, len(ids), 1000):
-                found = _by_state(ask(query, {"ids": list(ids[start : start + 1000])}))
-                total = {state: total.get(state, 0) + found.get(state, 0) for state in {*total, *found}}
+                counts = _by_state(ask(query, {"ids": list(ids[start : start + 1000])}))
+                total = {state: total.get(state, 0) + counts.get(state, 0) for state in {*total, *counts}}
         return total
 
-    def rows(self, ids: Sequence[str]) -> dict[str, Row]:
-        """The jobs and flows of these ids."""
-        query, found = self._select("w.workflow_uuid IN :ids"), dict[str, Row]()
+    def rows(self, ids: Sequence[str]) -> dict[str, JobRow]:
+        """Return id -> row of those of these ids that are in the queue."""
+        query, rows = self._select("w.workflow_uuid IN :ids"), dict[str, JobRow]()
         with reading(self.url) as ask:
             for start in range(0, len(ids), 1000):
-                found |= {row[0]: _row(row) for row in ask(query, {"ids": list(ids[start : start + 1000])})}
-        return found
+                rows |= {row[0]: _row(row) for row in ask(query, {"ids": list(ids[start : start + 1000])})}
+        return rows
 
-    def failed(self, run: str, limit: int = 1000) -> list[Row]:
-        """The jobs and flows of a run that failed, the oldest first."""
-        among = BELOW.replace("workflow_uuid", "w.workflow_uuid")
-        query = self._select(f"{among} AND w.status IN {_FAILED} ORDER BY w.created_at LIMIT {int(limit)}")
-        return [_row(row) for row in self._rows(query, below(check_id(run)))]
-
-    def runs(self) -> list[str]:
-        """Ids of the drivers, the newest first."""
-        query = (
-            f"SELECT workflow_uuid FROM {self._status} WHERE name = 'flow' AND workflow_uuid NOT LIKE '%/%' "
-            "ORDER BY created_at DESC"
-        )
-        return [row[0] for row in self._rows(query, {})]
-
-    def figures(self, run: str | None = None) -> Figures:
-        """Everything that `gnmreg status` shows."""
+    def metrics(self, run: str | None = None) -> QueueMetrics:
+        """Return everything that `gnmreg status` shows, of a run or of the whole queue."""
         among = f"{BELOW} AND " if run else ""
         parameters = below(check_id(run)) if run else {}
         now_ms = time.time() * 1000
@@ -131,7 +117,7 @@ class Reader:
             )
             failures = self._failures(ask, among, parameters)
         done, since = last[0]
-        return Figures(
+        return QueueMetrics(
             counts=_by_state([row[1:] for row in jobs if row[0] == "job"]),
             flows=_by_state([row[1:] for row in jobs if row[0] == "flow"]),
             ended_last_hour=int(hour[0][0]),
@@ -170,7 +156,7 @@ class Reader:
 
 
 def ended(counts: dict[str, int]) -> int:
-    """How many of the counted have ended, one way or another."""
+    """Return how many of the counted jobs have ended, in whichever state."""
     return sum(counts.get(state, 0) for state in (DONE, FAILED, CANCELLED))
 
 
@@ -182,17 +168,17 @@ def _by_state(rows: Sequence[Any]) -> dict[str, int]:
     return counts
 
 
-def _row(row: Any) -> Row:
+def _row(row: Any) -> JobRow:
     identity, kind, status, executor, inputs, output, error, created, ended_ms = row
     state = STATES.get(status, status)
     dead = DEAD if status == "MAX_RECOVERY_ATTEMPTS_EXCEEDED" else ""
-    return Row(
+    return JobRow(
         id=identity,
         kind=kind,
         state=state,
         executor=executor,
-        spec=_loaded(inputs, {"args": [{}]})["args"][0],
-        result=_loaded(output, None),
+        spec=_parsed(inputs, {"args": [{}]})["args"][0],
+        result=_parsed(output, None),
         failure=_failure(error, dead) if state == FAILED else None,
         created=created / 1000,
         ended=ended_ms / 1000 if ended_ms else None,
@@ -200,14 +186,14 @@ def _row(row: Any) -> Row:
 
 
 def _failure(error: str | None, dead: str) -> dict[str, Any]:
-    record = _loaded(error, {}).get("error") if error else None
+    record = _parsed(error, {}).get("error") if error else None
     if isinstance(record, dict):
         return {"status": "failed", "reason": "", **record}
     return {"status": "dead", "reason": dead} if dead else {"status": "failed", "reason": str(error)}
 
 
-def _loaded(text: str | None, otherwise: Any) -> Any:
+def _parsed(text: str | None, default: Any) -> Any:
     try:
-        return json.loads(text) if text else otherwise
+        return json.loads(text) if text else default
     except ValueError:
-        return otherwise
+        return default

@@ -1,4 +1,4 @@
-"""How jobs, results and errors are written into the queue's rows: as JSON, which cannot run code when it is read."""
+"""Serialization of jobs, results and errors in the queue's rows: JSON, which cannot run code when it is read."""
 
 import json
 from typing import Any
@@ -6,20 +6,20 @@ from typing import Any
 from dbos import Serializer
 
 APPLICATION = "gnmreg"
-VERSION = "wf-1"  # to be changed only when the shape of a workflow changes: workers take jobs of their own version only
+VERSION = "wf-1"  # change it only with the structure of a workflow: workers take jobs of their own version only
 _ERROR = "error"
 
 
 class JobFailed(Exception):
-    """A job or flow that ended badly. Its record says how: {"status", "reason", ...}."""
+    """A job or flow failed. Its record has the keys "status", "reason" and others."""
 
     def __init__(self, record: dict[str, Any]) -> None:
         self.record = record
         super().__init__(f"{record.get('status')}: {record.get('reason')}")
 
 
-class Json(Serializer):
-    """Values as JSON; exceptions as {"error": record}."""
+class JsonSerializer(Serializer):
+    """Serialize values as JSON, exceptions as {"error": record}."""
 
     def serialize(self, data: Any) -> str:
         if isinstance(data, BaseException):

@@ -46,16 +46,16 @@ def batch_jobs(captures: Sequence[str], *, model: str, out: str, run: str | None
     return Batch(run=check_id(name), jobs=jobs, roots=(*sorted(inputs), _absolute(out)))
 
 
-def put_batch(url: str, batch: Batch) -> int:
+def submit_batch(url: str, batch: Batch) -> int:
     """Put the jobs and their driver into the queue at `url`; what is there already stays. Returns how many jobs."""
-    from workflows.engine.client import Queue
+    from workflows.engine.client import QueueClient
 
-    queue = Queue(url)
+    queue = QueueClient(url)
     try:
-        count = queue.put(batch.jobs)
+        count = queue.submit(batch.jobs)
         driver = FlowJob(id=batch.run, flow="batch", queue=DRIVER)
-        queue.put([driver])
-        queue.again([batch.run])  # it waits for what is new, if it had ended
+        queue.submit([driver])
+        queue.requeue([batch.run])  # it waits for what is new, if it had ended
     finally:
         queue.close()
     return count

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from registration.progress import Progress, Silent
-from workflows.engine.client import Queue
+from workflows.engine.client import QueueClient
 from workflows.engine.jobs import DRIVER, FlowJob
 from workflows.farm.local import LocalFarm, run_until_done
 from workflows.ids import check_id
@@ -16,7 +16,7 @@ from workflows.records.coregistration import FIRST, MANIFEST, Plan, State, write
 PLAN = "plan.json"  # in the output folder: what coordinators and workers read
 
 
-def put_coregistration(url: str, plan: Plan, *, run: str | None = None, variant: str = "llvm") -> str:
+def submit_coregistration(url: str, plan: Plan, *, run: str | None = None, variant: str = "llvm") -> str:
     """Write the plan into its output folder and put the driver into the queue at `url`. Returns the run's name.
 
     All processes of the farm must see the dataset, the model and the output folder under the same paths. What the
@@ -27,11 +27,11 @@ def put_coregistration(url: str, plan: Plan, *, run: str | None = None, variant:
         InputError: there is no queue, the name cannot be used, or a run of this name has not ended.
     """
     name = check_id(run or plan.out.resolve().name)
-    queue = Queue(url)
+    queue = QueueClient(url)
     try:
         queue.forget(name)
         arguments = {"plan": str(begin(plan)), "variant": variant}
-        queue.put([FlowJob(id=name, flow="coregister", arguments=arguments, queue=DRIVER)])
+        queue.submit([FlowJob(id=name, flow="coregister", arguments=arguments, queue=DRIVER)])
     finally:
         queue.close()
     return name
@@ -65,14 +65,14 @@ def coregister(
         workers: captures side by side; with `gpus` one for each of them instead.
 
     Raises:
-        InputError: as `put_coregistration`, or a process refused to start.
+        InputError: as `submit_coregistration`, or a process refused to start.
     """
-    queue = Queue(url)
+    queue = QueueClient(url)
     try:
         queue.cancel(check_id(plan.out.resolve().name))  # of a command that was killed
     finally:
         queue.close()
-    name = put_coregistration(url, plan, variant="cuda" if gpus else "llvm")
+    name = submit_coregistration(url, plan, variant="cuda" if gpus else "llvm")
     places = (plan.dataset, plan.model.parent, plan.out, folder)
     roots = tuple(str(place.resolve()) for place in places)
     farm = LocalFarm(url=url, folder=folder, roots=roots, workers=workers, gpus=gpus)

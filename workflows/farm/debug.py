@@ -11,9 +11,9 @@ from registration.fit.recipes import named_recipe
 from registration.options import RegisterOptions
 from registration.progress import Progress
 from workflows.engine.child import function_of
-from workflows.engine.jobs import checked
-from workflows.engine.reader import Row
-from workflows.records.remote import capture_here, fetch_folder, is_remote, local_path, model_here
+from workflows.engine.jobs import validate_arguments
+from workflows.engine.reader import JobRow
+from workflows.records.remote import fetch_capture, fetch_folder, fetch_model, is_remote, local_path
 from workflows.steps.register import REGISTRATION
 from workflows.steps.table import STEPS
 
@@ -24,7 +24,7 @@ PICTURES = "stages"
 INPUTS = "inputs"
 
 
-def debug(row: Row, out: Path, progress: Progress, *, port: int | None = None) -> "Debugged":
+def debug(row: JobRow, out: Path, progress: Progress, *, port: int | None = None) -> "Debugged":
     """Run a job's step again here, with its results below `out` instead of where they belong.
 
     Registrations leave a picture and the mesh of the fit at its start and after each stage in `out/stages`, and their
@@ -39,14 +39,14 @@ def debug(row: Row, out: Path, progress: Progress, *, port: int | None = None) -
         raise _wrong(row.id, expected="a job", got="a flow: see its jobs with `gnmreg status`")
     if out.exists() and any(out.iterdir()):
         raise _wrong(str(out), expected="a new or empty folder", got="one that holds something")
-    checked(row.spec, STEPS, roots=("/", "s3:/"))  # of the right form; a person asked for it, so any place will do
+    validate_arguments(row.spec, STEPS, roots=("/", "s3:/"))  # the operator chose it: any path will do
     name, arguments = row.spec["step"], row.spec["arguments"]
     if name in ("register", "register stored"):
         return _register(arguments, out, progress, port)
     if port is not None:
         raise _wrong(row.id, expected="a registration, to be viewed", got=f"the step {name!r}: leave out --view")
     step = STEPS[name]
-    changed = {"out": str(out / "product")} if "out" in step.places else {}
+    changed = {"out": str(out / "product")} if "out" in step.path_arguments else {}
     return Debugged(told=str(function_of(step.function)(**{**arguments, **changed}, progress=progress)))
 
 
@@ -67,8 +67,8 @@ def _register(arguments: Mapping[str, Any], out: Path, progress: Progress, port:
         fetch_folder(place, out / INPUTS / local_path(place).name)
         place = str(out / INPUTS / local_path(place).name)
     neutral = arguments.get("neutral")
-    with ExitStack() as until_done, capture_here(place) as capture:
-        model = model_here(str(arguments["model"]))
+    with ExitStack() as until_done, fetch_capture(place) as capture:
+        model = fetch_model(str(arguments["model"]))
         page = None if port is None else _page(out / PICTURES, capture, model, port, progress)
         if page is not None:
             until_done.callback(page.close)

@@ -1,7 +1,7 @@
 """The order of jobs on a farm: batches, subjects, and the coregistration loop. A coordinator runs them, durably.
 
-A flow is a function of a `Scope` and small JSON arguments. It makes jobs and waits; it computes nothing, and whatever
-it is told comes from a step, so that it takes the same way when it is started again.
+A flow is a function of a `FlowScope` and small JSON arguments. It submits jobs and waits; it computes nothing, and all
+its data come from steps, so that it is deterministic when it is restarted.
 """
 
 import hashlib
@@ -14,16 +14,16 @@ from workflows.records.coregistration import FIRST
 from workflows.steps import table
 
 if TYPE_CHECKING:
-    from workflows.engine.scope import Scope
+    from workflows.engine.scope import FlowScope
 
 
-async def batch(scope: "Scope") -> dict[str, int]:
+async def batch(scope: "FlowScope") -> dict[str, int]:
     """Wait for the jobs of a batch, which lie in the queue already. Returns state -> how many."""
     return await scope.wait_below(scope.id)
 
 
 async def subject(
-    scope: "Scope",
+    scope: "FlowScope",
     *,
     subject_dir: str,
     captures: Sequence[str],
@@ -47,20 +47,20 @@ async def subject(
         return Job(id=f"{scope.id}/{kind}", step=table.REGISTER, arguments=arguments, priority=priority)
 
     jobs = {name: job(number, name) for number, name in enumerate(captures)}
-    done = await scope.do([jobs[neutral]])
+    done = await scope.run([jobs[neutral]])
     if done:
-        done |= await scope.do([jobs[name] for name in others])
+        done |= await scope.run([jobs[name] for name in others])
     failures = await scope.failures([jobs[name] for name in (captures if done else [neutral])])
     leave = {name: failures[one.id] for name, one in jobs.items() if one.id in failures}
     if not done:
         leave |= {name: f"the neutral failed: {leave[neutral]}" for name in others}
     arguments = {"subject_dir": subject_dir, "out": out, "leave": leave, **_without(place, "variant")}
     identity = _named(f"{scope.id}/collect", arguments)
-    await scope.do([Job(id=identity, step=table.COLLECT, arguments=arguments, priority=STABILIZE_PRIORITY)])
+    await scope.run([Job(id=identity, step=table.COLLECT, arguments=arguments, priority=STABILIZE_PRIORITY)])
     return {"usable": len(done), "failed": len(captures) - len(done)}
 
 
-async def coregister(scope: "Scope", *, plan: str, variant: str = "llvm") -> dict[str, Any]:
+async def coregister(scope: "FlowScope", *, plan: str, variant: str = "llvm") -> dict[str, Any]:
     """Rounds of registering all, stabilizing, building, evaluating and deciding (`coregistration.py` as a flow)."""
     told = await scope.read(plan)
     out, model, rule = told["out"], told["model"], told["rule"]
@@ -105,7 +105,7 @@ async def coregister(scope: "Scope", *, plan: str, variant: str = "llvm") -> dic
     return {"rounds": len(rounds), "model": model, "reason": verdict["reason"]}
 
 
-async def _hold_out(scope: "Scope", told: Mapping[str, Any], settings: Mapping[str, Any]) -> dict[str, Any]:
+async def _hold_out(scope: "FlowScope", told: Mapping[str, Any], settings: Mapping[str, Any]) -> dict[str, Any]:
     """What models are measured on; who has no truth is registered with the first model."""
     run = f"{told['out']}/held_out/registrations"
     if told["bare"]:
@@ -123,7 +123,7 @@ async def _hold_out(scope: "Scope", told: Mapping[str, Any], settings: Mapping[s
 
 
 async def _register(
-    scope: "Scope",
+    scope: "FlowScope",
     part: str,
     told: Mapping[str, Any],
     names: Sequence[str],
@@ -146,19 +146,19 @@ async def _register(
         )
         for number, name in enumerate(names)
     ]
-    done = await scope.do(flows)
+    done = await scope.run(flows)
     total = sum(len(told["captures"][name]) for name in names)
     usable = sum(one["usable"] for one in done.values())
     if total - usable > told["rule"]["failures"] * total:
         raise scope.park(f"{part}: {total - usable} of {total} captures failed; look into them, then `gnmreg retry`")
 
 
-async def _one(scope: "Scope", part: str, step: str, **arguments: Any) -> dict[str, Any]:
+async def _one(scope: "FlowScope", part: str, step: str, **arguments: Any) -> dict[str, Any]:
     """One job's result; the run is parked if it fails."""
     queue = GPU if step == table.END_ROUND else REBUILD
     identity = _named(f"{scope.id}/{part}", arguments)
     job = Job(id=identity, step=step, arguments=arguments, queue=queue, priority=STABILIZE_PRIORITY)
-    done = await scope.do([job])
+    done = await scope.run([job])
     if job.id not in done:
         failures = await scope.failures([job])
         raise scope.park(f"{part}: {failures.get(job.id, 'cancelled')}")

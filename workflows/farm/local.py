@@ -13,11 +13,11 @@ from pathlib import Path
 from registration.errors import InputError
 from registration.progress import Progress
 from workflows.engine.database import ENVIRONMENT
-from workflows.engine.reader import CANCELLED, DONE, FAILED, RUNNING, WAITING, Reader, ended
-from workflows.processes import cores_each, end_with
+from workflows.engine.reader import CANCELLED, DONE, FAILED, RUNNING, WAITING, QueueReader, ended
+from workflows.processes import cores_per_worker, terminate_with_parent
 
-LOOK_S = 1.0
-AGAIN_S = 2.0  # after which a process that died is started again
+POLL_S = 1.0
+RETRY_S = 2.0  # after which a process that died is started again
 REFUSED = 2  # the exit code of a command that was given something unusable
 
 
@@ -54,7 +54,7 @@ def run_until_done(farm: LocalFarm, run: str, progress: Progress) -> Ended:
             "There is no worker", where="--workers", expected="from 1", got=farm.workers, fix="ask for one or more"
         )
     processes = _Processes(farm)
-    reader = Reader(farm.url)
+    reader = QueueReader(farm.url)
     try:
         while True:
             processes.look()
@@ -64,7 +64,7 @@ def run_until_done(farm: LocalFarm, run: str, progress: Progress) -> Ended:
             if row is not None and row.state in (DONE, FAILED, CANCELLED):
                 failure = row.failure
                 return Ended(counts=counts, reason=f"{failure['status']}: {failure['reason']}" if failure else "")
-            time.sleep(LOOK_S)
+            time.sleep(POLL_S)
     finally:
         processes.end()
 
@@ -100,7 +100,7 @@ class _Processes:
                     got=f"exit code {code}",
                     fix="see what it printed above",
                 )
-            if time.monotonic() - self._since[number] > AGAIN_S:
+            if time.monotonic() - self._since[number] > RETRY_S:
                 self._since[number] = time.monotonic()
                 self._processes[number] = self._started(number)
 
@@ -119,14 +119,14 @@ class _Processes:
     def _started(self, number: int) -> subprocess.Popen[bytes]:
         parent = os.getpid()
         environment = {**os.environ, **self._farm.environment, ENVIRONMENT: self._farm.url}
-        environment.setdefault("OMP_NUM_THREADS", cores_each(len(self._commands) - 1))
+        environment.setdefault("OMP_NUM_THREADS", cores_per_worker(len(self._commands) - 1))
         return subprocess.Popen(
             [sys.executable, "-m", "workflows.cli", *self._commands[number]],
             env=environment,
             stdin=subprocess.DEVNULL,
             stdout=sys.stderr.fileno(),
             start_new_session=True,  # Ctrl-C is for us; we end them
-            preexec_fn=lambda: end_with(parent, signal.SIGTERM),
+            preexec_fn=lambda: terminate_with_parent(parent, signal.SIGTERM),
         )
 
 

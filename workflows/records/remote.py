@@ -29,7 +29,7 @@ def local_path(place: str) -> Path:
 
 
 @contextmanager
-def capture_here(place: str) -> Iterator[Path]:
+def fetch_capture(place: str) -> Iterator[Path]:
     """A capture's folder as a local path; what was fetched for it is deleted in the end.
 
     Raises:
@@ -45,7 +45,7 @@ def capture_here(place: str) -> Iterator[Path]:
 
 
 def fetch_folder(place: str, folder: Path) -> None:
-    """Copy all files below a URL into a folder. Raises InputError as `capture_here`."""
+    """Copy all files below a URL into a folder. Raises InputError as `fetch_capture`."""
     fs, root = fsspec.core.url_to_fs(place)
     files = fs.find(root, detail=True)
     if not files:
@@ -61,7 +61,7 @@ def fetch_folder(place: str, folder: Path) -> None:
         fs.get_file(path, str(target))
 
 
-def model_here(place: str) -> Path:
+def fetch_model(place: str) -> Path:
     """A model's file as a local path, with its landmark schemes beside it; fetched once and then found in the cache.
 
     Raises:

@@ -14,7 +14,7 @@ from registration.render.backend import Variant
 from registration.storage import hashing
 from registration.storage.registration_folder import read_manifest
 from workflows.engine.jobs import PermanentStepError
-from workflows.records.remote import capture_here, model_here
+from workflows.records.remote import fetch_capture, fetch_model
 from workflows.records.store import Store
 from workflows.steps.subject import begin_subject
 
@@ -40,10 +40,10 @@ def register_stored(
         PermanentStepError: the registration's status is failed; it is published nevertheless, for inspection.
     """
     options = RegisterOptions(recipe=named_recipe(recipe), views=views, seed=seed, variant=variant)
-    file = model_here(model)
+    file = fetch_model(model)
     data = gnm_npz.read(file)
     schemes = read_schemes(file, data, options.landmark_files)
-    with capture_here(capture) as folder:
+    with fetch_capture(capture) as folder:
         wanted = input_hash(read(folder), data, schemes, None, options)
 
         def make(attempt: Path) -> dict[str, Any]:

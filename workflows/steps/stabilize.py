@@ -34,7 +34,7 @@ LOG = "decisions.jsonl"  # within the run
 
 
 @dataclass(frozen=True, kw_only=True)
-class Outcome:
+class StabilizationResult:
     """What a run of the command made, or found."""
 
     out: Path
@@ -54,7 +54,7 @@ def stabilize_run(
     force: bool = False,
     whatever_decided: bool = False,
     progress: Progress | None = None,
-) -> Outcome:
+) -> StabilizationResult:
     """Stabilize all registrations of a run and write the folder `out` (docs/formats.md), by default RUN/stabilized.
 
     The same as `stabilize` of the registrations, or of `only` the subjects in folders of these names. A folder made
@@ -77,7 +77,7 @@ def stabilize_run(
     if not force and disk.is_stabilized(out):
         manifest = disk.read_manifest(out)
         if manifest["input_hash"] == wanted or (whatever_decided and manifest["dataset"] == dataset):
-            return Outcome(out=out, dataset=dataset, figures=manifest["figures"])
+            return StabilizationResult(out=out, dataset=dataset, figures=manifest["figures"])
     with disk.fresh_set(out) as fresh:
         ids, components, moved = _write_subjects(fresh, found, data, head, settings, decided, progress)
         figures = _figures(components, moved, fresh, len(found.subjects))
@@ -97,7 +97,7 @@ def stabilize_run(
         subjects = (disk.read_subject(fresh, k) for k in range(len(found.subjects)))
         page = write_stabilize_page(manifest, components, subjects, head)
         (fresh / disk.PAGE).write_text(page, encoding="utf-8")
-    return Outcome(out=out, dataset=dataset, figures=figures)
+    return StabilizationResult(out=out, dataset=dataset, figures=figures)
 
 
 def stabilize_subjects(

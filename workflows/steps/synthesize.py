@@ -12,7 +12,7 @@ from registration.errors import InputError
 from registration.progress import Progress, Silent
 from registration.storage.files import atomic_write_text
 from registration.storage.hashing import to_jsonable, versions
-from workflows.processes import side_by_side
+from workflows.processes import run_parallel
 from workflows.records.dataset import HELD_OUT, KIND, MANIFEST, SCHEMA
 from workflows.records.subject import NEUTRAL
 
@@ -70,7 +70,7 @@ def synth_dataset(
     if calls:
         _save(out, told, complete=False)
     lost = {}
-    for done, (name, trouble) in enumerate(side_by_side(photograph, calls, jobs), 1):
+    for done, (name, trouble) in enumerate(run_parallel(photograph, calls, jobs), 1):
         progress.at(done, len(calls), name)
         if trouble:
             lost[name] = trouble

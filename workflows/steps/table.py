@@ -8,17 +8,22 @@ REGISTER, REGISTER_STORED, COLLECT = "register", "register stored", "collect"
 HOLD_OUT, STABILIZE, BUILD, EVALUATE, END_ROUND = "hold out", "stabilize", "build", "evaluate", "end round"
 
 STEPS: Mapping[str, Step] = {
-    REGISTER_STORED: Step(function="workflows.steps.register:register_stored", places=("capture", "model", "store")),
+    REGISTER_STORED: Step(
+        function="workflows.steps.register:register_stored", path_arguments=("capture", "model", "store")
+    ),
     REGISTER: Step(
         function="workflows.steps.register:register_capture",
-        places=("capture", "model", "out", "neutral", "subject_dir"),
+        path_arguments=("capture", "model", "out", "neutral", "subject_dir"),
     ),
-    COLLECT: Step(function="workflows.steps.subject:collect_subject", places=("subject_dir", "model", "out")),
-    HOLD_OUT: Step(function="workflows.steps.hold_out:hold_out", places=("dataset", "registrations", "model", "out")),
-    STABILIZE: Step(function="workflows.steps.stabilize:stabilize_subjects", places=("run", "model", "out")),
+    COLLECT: Step(function="workflows.steps.subject:collect_subject", path_arguments=("subject_dir", "model", "out")),
+    HOLD_OUT: Step(
+        function="workflows.steps.hold_out:hold_out", path_arguments=("dataset", "registrations", "model", "out")
+    ),
+    STABILIZE: Step(function="workflows.steps.stabilize:stabilize_subjects", path_arguments=("run", "model", "out")),
     BUILD: Step(
-        function="workflows.steps.build:build_next_model", places=("run", "steady", "dataset", "previous", "out")
+        function="workflows.steps.build:build_next_model",
+        path_arguments=("run", "steady", "dataset", "previous", "out"),
     ),
-    EVALUATE: Step(function="workflows.steps.evaluate:evaluate_round", places=("models", "people", "out")),
-    END_ROUND: Step(function="workflows.steps.round:end_round", places=("plan",)),
+    EVALUATE: Step(function="workflows.steps.evaluate:evaluate_round", path_arguments=("models", "people", "out")),
+    END_ROUND: Step(function="workflows.steps.round:end_round", path_arguments=("plan",)),
 }

@@ -31,7 +31,7 @@ TO_SCAN, MOVED, PLAIN = "distance to the scan", "moved in this stage", "nothing"
 _SKIN, _SCAN = (206, 176, 158), (96, 110, 128)
 _POINTS = 60_000  # of the scan, shown at most
 _THUMBNAIL_PX = 200  # height of the images in the cameras' frusta, at most
-_LOOK_S = 0.5
+_POLL_S = 0.5
 
 
 class FitPage(Served):
@@ -105,7 +105,7 @@ class FitPage(Served):
                 wxyz=turn,
                 position=camera.centre,
             )
-        while not self._closed.wait(_LOOK_S):
+        while not self._closed.wait(_POLL_S):
             self.refresh()
 
     def refresh(self) -> None:

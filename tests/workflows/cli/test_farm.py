@@ -14,10 +14,10 @@ from tests.registration.capture import small
 from tests.registration.register import synthetic
 from tests.workflows.farm.harness import ROOT, alive, interruptible
 from workflows.cli.app import main
-from workflows.engine.client import Queue
+from workflows.engine.client import QueueClient
 from workflows.engine.database import default_url
-from workflows.engine.reader import Reader
-from workflows.farm.batch import batch_jobs, put_batch
+from workflows.engine.reader import QueueReader
+from workflows.farm.batch import batch_jobs, submit_batch
 from workflows.records.store import Store
 
 
@@ -134,7 +134,7 @@ def test_a_local_farm_registers_and_is_interrupted_and_goes_on(tmp_path: Path) -
 
 def _done(url: str) -> bool:
     try:
-        return Reader(url).counts("out").get("done", 0) > 0
+        return QueueReader(url).counts("out").get("done", 0) > 0
     except Exception:  # there is no queue yet
         return False
 
@@ -155,10 +155,10 @@ def test_a_batch_that_ended_waits_again_for_what_is_added(captures: Path) -> Non
     main(["migrate", "--folder", str(captures)])
     url = default_url(captures)
     settings = {"model": str(synthetic.MODEL), "out": str(captures.parent / "out")}
-    assert put_batch(url, batch_jobs([f"{captures}/ann/rest"], run="r", **settings)) == 1
-    queue, reader = Queue(url), Reader(url)
+    assert submit_batch(url, batch_jobs([f"{captures}/ann/rest"], run="r", **settings)) == 1
+    queue, reader = QueueClient(url), QueueReader(url)
     queue.cancel("r")
     places = [f"{captures}/{name}/rest" for name in ("ann", "bob")]
-    assert put_batch(url, batch_jobs(places, run="r", **settings)) == 2
+    assert submit_batch(url, batch_jobs(places, run="r", **settings)) == 2
     assert reader.rows(["r"])["r"].state == "waiting"
     assert reader.counts("r") == {"cancelled": 1, "waiting": 1}

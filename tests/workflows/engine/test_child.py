@@ -10,24 +10,24 @@ from pathlib import Path
 import pytest
 
 from tests.workflows.farm.harness import ROOT, alive, children_of
-from workflows.engine.child import Slot
+from workflows.engine.child import StepProcess
 
 STEPS = "tests.workflows.farm.steps"
 
 
 @pytest.fixture(scope="module")
-def slot() -> Iterator[Slot]:
-    made = Slot(modules=(STEPS,))
+def slot() -> Iterator[StepProcess]:
+    made = StepProcess(modules=(STEPS,))
     made.warm()
     yield made
     made.kill()
 
 
-def run(slot: Slot, name: str, log: Path, hard_s: float = 30.0, **arguments: object) -> dict:
-    return asyncio.run(slot.run(f"{STEPS}:{name}", arguments, log=log, hard_s=hard_s))
+def run(slot: StepProcess, name: str, log: Path, timeout_s: float = 30.0, **arguments: object) -> dict:
+    return asyncio.run(slot.run(f"{STEPS}:{name}", arguments, log=log, timeout_s=timeout_s))
 
 
-def test_everything_a_step_prints_lands_in_its_log(slot: Slot, tmp_path: Path) -> None:
+def test_everything_a_step_prints_lands_in_its_log(slot: StepProcess, tmp_path: Path) -> None:
     log = tmp_path / "a" / "job.log"
     outcome = run(slot, "talk", log, text="from a note")
     assert (outcome["status"], outcome["result"]) == ("done", "from a note")
@@ -35,7 +35,7 @@ def test_everything_a_step_prints_lands_in_its_log(slot: Slot, tmp_path: Path) -
     assert '"done": 1' in log.with_suffix(".jsonl").read_text()
 
 
-def test_one_warm_process_serves_all_steps(slot: Slot, tmp_path: Path) -> None:
+def test_one_warm_process_serves_all_steps(slot: StepProcess, tmp_path: Path) -> None:
     before = slot.warm()
     run(slot, "talk", tmp_path / "log", text="")
     run(slot, "fail", tmp_path / "log")
@@ -50,13 +50,13 @@ def test_one_warm_process_serves_all_steps(slot: Slot, tmp_path: Path) -> None:
         ("leave", {}, "failed", "SystemExit: 0"),
         ("return_an_object", {}, "failed", "the step's result is not JSON"),
         ("return_much", {}, "failed", "more than 524288"),
-        ("talk", {"word": 1}, "bad input", "the step cannot be called so"),
-        ("nothing", {}, "bad input", "the step cannot be called so"),
+        ("talk", {"word": 1}, "bad input", "cannot be called with these arguments"),
+        ("nothing", {}, "bad input", "cannot be called with these arguments"),
         ("crash", {}, "died", "was killed by SIGSEGV"),
     ],
 )
 def test_what_goes_wrong_is_told_apart(
-    slot: Slot, tmp_path: Path, name: str, arguments: dict, status: str, reason: str
+    slot: StepProcess, tmp_path: Path, name: str, arguments: dict, status: str, reason: str
 ) -> None:
     outcome = run(slot, name, tmp_path / "log", **arguments)
     assert outcome["status"] == status
@@ -64,23 +64,25 @@ def test_what_goes_wrong_is_told_apart(
     assert "secret" not in (tmp_path / "log").read_text() + outcome["reason"]
 
 
-def test_a_step_that_takes_too_long_is_killed_though_it_holds_the_interpreter(slot: Slot, tmp_path: Path) -> None:
+def test_a_step_beyond_its_time_limit_is_killed_though_it_holds_the_interpreter(
+    slot: StepProcess, tmp_path: Path
+) -> None:
     trace = tmp_path / "trace"
     pid = slot.warm()
     begun = time.monotonic()
-    outcome = run(slot, "hold_gil", tmp_path / "log", hard_s=0.5, seconds=60, trace=str(trace))
+    outcome = run(slot, "hold_gil", tmp_path / "log", timeout_s=0.5, seconds=60, trace=str(trace))
     assert outcome["status"] == "timed out" and time.monotonic() - begun < 30
     assert not alive(pid)
     assert trace.read_text() == "begin gil 0\n"
     assert "timed out" in (tmp_path / "log").read_text()
 
 
-def test_cancelling_kills_the_child(slot: Slot, tmp_path: Path) -> None:
+def test_cancelling_kills_the_child(slot: StepProcess, tmp_path: Path) -> None:
     pid = slot.warm()
 
     async def cancelled() -> None:
         arguments = {"store": str(tmp_path), "key": "k", "seconds": 60.0}
-        task = asyncio.create_task(slot.run(f"{STEPS}:work", arguments, log=tmp_path / "log", hard_s=90))
+        task = asyncio.create_task(slot.run(f"{STEPS}:work", arguments, log=tmp_path / "log", timeout_s=90))
         while not list(tmp_path.glob("k/attempt-*")):
             await asyncio.sleep(0.05)
         task.cancel()
@@ -93,7 +95,7 @@ def test_cancelling_kills_the_child(slot: Slot, tmp_path: Path) -> None:
     assert not alive(pid)
 
 
-def test_a_child_that_dies_between_jobs_is_replaced(slot: Slot, tmp_path: Path) -> None:
+def test_a_child_that_dies_between_jobs_is_replaced(slot: StepProcess, tmp_path: Path) -> None:
     pid = slot.warm()
     os.kill(pid, signal.SIGKILL)
     time.sleep(0.5)
@@ -104,9 +106,9 @@ def test_a_child_that_dies_between_jobs_is_replaced(slot: Slot, tmp_path: Path) 
 def test_a_child_dies_with_its_parent(tmp_path: Path) -> None:
     code = """
 import time
-from workflows.engine.child import Slot
+from workflows.engine.child import StepProcess
 if __name__ == "__main__":
-    slot = Slot()
+    slot = StepProcess()
     print(slot.warm(), flush=True)
     time.sleep(60)
 """

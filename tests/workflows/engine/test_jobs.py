@@ -6,17 +6,17 @@ from pathlib import Path
 import pytest
 
 from registration.errors import InputError
-from workflows.engine.jobs import MAX_BYTES, Step, checked
+from workflows.engine.jobs import MAX_BYTES, Step, validate_arguments
 from workflows.ids import check_id, check_location, redact, resolve_roots
 
-STEPS = {"register": Step(function="m:f", places=("capture", "out"))}
+STEPS = {"register": Step(function="m:f", path_arguments=("capture", "out"))}
 
 
 def test_a_job_within_the_roots_is_accepted(tmp_path: Path) -> None:
     roots = resolve_roots((tmp_path, "s3://bucket/runs"))
     for place in (str(tmp_path / "a"), f"file://{tmp_path}/a", "s3://bucket/runs/a", str(tmp_path)):
         arguments = {"capture": place, "seed": 3}
-        step, got = checked({"step": "register", "arguments": arguments}, STEPS, roots)
+        step, got = validate_arguments({"step": "register", "arguments": arguments}, STEPS, roots)
         assert (step.function, got) == ("m:f", arguments)
 
 
@@ -35,7 +35,7 @@ def test_a_job_within_the_roots_is_accepted(tmp_path: Path) -> None:
 )
 def test_a_job_of_another_form_is_refused(spec: object, expected: str) -> None:
     with pytest.raises(InputError) as refused:
-        checked(spec, STEPS, ("/",))
+        validate_arguments(spec, STEPS, ("/",))
     assert expected in refused.value.expected
 
 
@@ -66,7 +66,7 @@ def test_a_foreign_place_is_refused(tmp_path: Path, place: object) -> None:
     (root / "link").symlink_to(tmp_path / "other")
     place = place.format(root=root) if isinstance(place, str) else place
     with pytest.raises(InputError) as refused:
-        checked(
+        validate_arguments(
             {"step": "register", "arguments": {"capture": place}}, STEPS, resolve_roots((root, "s3://bucket/runs"))
         )
     assert "secret" not in str(refused.value).replace("secrets", "")

@@ -9,7 +9,7 @@ import pytest
 from registration.errors import InputError
 from tests.workflows.farm.harness import ROOT
 from workflows.engine.database import checked_url, default_url, prepare, reading, redacted_url
-from workflows.engine.liveness import FileLocks, Liveness, Patience
+from workflows.engine.liveness import FileLocks, Liveness, LivenessTimeouts
 
 HOLD = """
 import sys, time
@@ -45,7 +45,7 @@ def test_a_lock_is_held_while_its_process_lives_even_frozen(tmp_path: Path) -> N
 
 
 def test_the_dead_are_told_when_patience_ends(tmp_path: Path) -> None:
-    liveness = Liveness(default_url(tmp_path), Patience(free_s=15.0, up_s=0.0))
+    liveness = Liveness(default_url(tmp_path), LivenessTimeouts(release_s=15.0, uptime_s=0.0))
     assert liveness.join(["me"]) == "me"
     assert liveness.dead(["w", "me"], now=100.0) == []
     assert liveness.dead(["w", "me"], now=114.0) == []
@@ -54,7 +54,7 @@ def test_the_dead_are_told_when_patience_ends(tmp_path: Path) -> None:
 
 def test_who_was_back_in_between_counts_anew(tmp_path: Path) -> None:
     url = default_url(tmp_path)
-    liveness = Liveness(url, Patience(free_s=15.0, up_s=0.0))
+    liveness = Liveness(url, LivenessTimeouts(release_s=15.0, uptime_s=0.0))
     assert liveness.dead(["w"], now=100.0) == []
     process = holder(url)
     assert liveness.dead(["w"], now=110.0) == []
@@ -65,10 +65,10 @@ def test_who_was_back_in_between_counts_anew(tmp_path: Path) -> None:
 
 
 def test_a_server_that_has_just_started_is_waited_for(tmp_path: Path) -> None:
-    liveness = Liveness(default_url(tmp_path), Patience(free_s=0.0, up_s=60.0))
-    liveness._locks.up_s = lambda: 59.0  # type: ignore[method-assign]
+    liveness = Liveness(default_url(tmp_path), LivenessTimeouts(release_s=0.0, uptime_s=60.0))
+    liveness._locks.uptime_s = lambda: 59.0  # type: ignore[method-assign]
     assert liveness.dead(["w"], now=1.0) == []
-    liveness._locks.up_s = lambda: 60.0  # type: ignore[method-assign]
+    liveness._locks.uptime_s = lambda: 60.0  # type: ignore[method-assign]
     assert liveness.dead(["w"], now=1.0) == ["w"]
 
 

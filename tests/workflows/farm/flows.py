@@ -3,11 +3,11 @@
 from typing import Any
 
 from workflows.engine.jobs import EXPRESSION_PRIORITY, NEUTRAL_PRIORITY, STABILIZE_PRIORITY, FlowJob, Job
-from workflows.engine.scope import Scope
+from workflows.engine.scope import FlowScope
 from workflows.farm.flows import batch
 
 
-async def graph(scope: Scope, *, subjects: int, expressions: int, folder: str, seconds: float) -> dict[str, Any]:
+async def graph(scope: FlowScope, *, subjects: int, expressions: int, folder: str, seconds: float) -> dict[str, Any]:
     """Subjects of a neutral, expressions and a stabilization each, then a rebuild."""
     flows = [
         FlowJob(
@@ -17,16 +17,16 @@ async def graph(scope: Scope, *, subjects: int, expressions: int, folder: str, s
         )
         for number in range(subjects)
     ]
-    results = await scope.do(flows)
-    rebuilt = await scope.do([_work(f"{scope.id}/rebuild", folder, seconds, queue="rebuild")])
+    results = await scope.run(flows)
+    rebuilt = await scope.run([_work(f"{scope.id}/rebuild", folder, seconds, queue="rebuild")])
     return {"subjects": len(results), "rebuilt": len(rebuilt)}
 
 
-async def subject(scope: Scope, *, expressions: int, folder: str, seconds: float) -> dict[str, Any]:
-    await scope.do([_work(f"{scope.id}/neutral", folder, seconds, priority=NEUTRAL_PRIORITY)])
+async def subject(scope: FlowScope, *, expressions: int, folder: str, seconds: float) -> dict[str, Any]:
+    await scope.run([_work(f"{scope.id}/neutral", folder, seconds, priority=NEUTRAL_PRIORITY)])
     jobs = [_work(f"{scope.id}/e{n:02d}", folder, seconds, priority=EXPRESSION_PRIORITY) for n in range(expressions)]
-    done = await scope.do(jobs)
-    await scope.do([_work(f"{scope.id}/stab", folder, seconds, priority=STABILIZE_PRIORITY)])
+    done = await scope.run(jobs)
+    await scope.run([_work(f"{scope.id}/stab", folder, seconds, priority=STABILIZE_PRIORITY)])
     return {"expressions": len(done)}
 
 

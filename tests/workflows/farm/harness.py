@@ -12,11 +12,11 @@ from pathlib import Path
 from typing import Any
 
 from tests.conftest import ROOT
-from workflows.engine.client import Queue
+from workflows.engine.client import QueueClient
 from workflows.engine.process import migrate
-from workflows.engine.reader import Reader
+from workflows.engine.reader import QueueReader
 
-QUICK = {"look_s": 0.3, "free_s": 1.0, "up_s": 0.0}
+QUICK = {"poll_s": 0.3, "release_s": 1.0, "uptime_s": 0.0}
 
 
 def interruptible() -> None:
@@ -27,13 +27,13 @@ def interruptible() -> None:
 class Farm:
     """A queue and its processes, named by their executor ids."""
 
-    def __init__(self, folder: Path, url: str, patience: dict[str, float] | None = None) -> None:
+    def __init__(self, folder: Path, url: str, timeouts: dict[str, float] | None = None) -> None:
         self.folder, self.url = folder, url
-        self.settings = {"patience": patience or QUICK}
+        self.settings = {"timeouts": timeouts or QUICK}
         self.processes: dict[str, subprocess.Popen[bytes]] = {}
         self.trace = folder / "trace.txt"
         migrate(url)
-        self.queue, self.reader = Queue(url), Reader(url)
+        self.queue, self.reader = QueueClient(url), QueueReader(url)
 
     def start(self, *names: str) -> None:
         """Names that begin with "c" are coordinators. Returns when all of them take jobs."""
@@ -87,7 +87,7 @@ class Farm:
         while not condition():
             if time.monotonic() - begun > within_s:
                 said = "\n".join(f"--- {n}\n{self.said(n)[-3000:]}" for n in self.processes)
-                raise AssertionError(f"waited {within_s} s for {what}\n{self.reader.figures()}\n{said}")
+                raise AssertionError(f"waited {within_s} s for {what}\n{self.reader.metrics()}\n{said}")
             time.sleep(0.05)
         return time.monotonic() - begun
 
@@ -105,8 +105,8 @@ class Farm:
 
 
 @contextmanager
-def farm(folder: Path, url: str | None = None, patience: dict[str, float] | None = None) -> Iterator[Farm]:
-    made = Farm(folder, url or f"sqlite:///{folder / 'queue.sqlite'}", patience)
+def farm(folder: Path, url: str | None = None, timeouts: dict[str, float] | None = None) -> Iterator[Farm]:
+    made = Farm(folder, url or f"sqlite:///{folder / 'queue.sqlite'}", timeouts)
     try:
         yield made
     finally:

@@ -7,7 +7,7 @@ from typing import Any
 
 from registration.errors import InputError
 from workflows.engine.child import function_of
-from workflows.engine.jobs import FlowJob, Job, PermanentStepError, checked
+from workflows.engine.jobs import FlowJob, Job, PermanentStepError, validate_arguments
 from workflows.engine.serialization import JobFailed
 from workflows.farm.flows import FLOWS
 from workflows.ids import check_id, resolve_roots
@@ -15,13 +15,13 @@ from workflows.steps.table import STEPS
 
 
 class Inline:
-    """Stands in for a `Scope`; `step` says what a job's result is, or raises."""
+    """Stands in for a `FlowScope`; `step` says what a job's result is, or raises."""
 
     def __init__(self, identity: str, step: Callable[[Job], Any], log: list[Job]) -> None:
         self.id, self._step, self.log = identity, step, log
         self._reasons: dict[str, str] = {}
 
-    async def do(self, jobs: Sequence[Job | FlowJob]) -> dict[str, Any]:
+    async def run(self, jobs: Sequence[Job | FlowJob]) -> dict[str, Any]:
         done = {}
         for job in sorted(jobs, key=lambda one: one.priority):
             try:
@@ -50,7 +50,7 @@ def really(roots: Sequence[Path]) -> Callable[[Job], Any]:
     """Jobs as workers do them, with all that goes through a queue as JSON: for `Inline`."""
 
     def step(job: Job) -> Any:
-        taken, arguments = checked(json.loads(json.dumps(job.spec())), STEPS, resolve_roots(roots))
+        taken, arguments = validate_arguments(json.loads(json.dumps(job.spec())), STEPS, resolve_roots(roots))
         try:
             return json.loads(json.dumps(function_of(taken.function)(**arguments)))
         except InputError as error:

@@ -7,14 +7,14 @@ from pathlib import Path
 from tests.workflows.farm.flows import FLOWS
 from tests.workflows.farm.steps import STEPS
 from workflows.engine.jobs import DRIVER, GPU, REBUILD, SUBJECTS
-from workflows.engine.liveness import Patience
-from workflows.engine.process import Process, serve
+from workflows.engine.liveness import LivenessTimeouts
+from workflows.engine.process import EngineProcess, serve
 
 if __name__ == "__main__":
     kind, name, url, folder, settings = sys.argv[1:]
     told = json.loads(settings)
     serve(
-        Process(
+        EngineProcess(
             url=url,
             queues=(GPU, REBUILD) if kind == "worker" else (DRIVER, SUBJECTS),
             logs=Path(folder) / "logs",
@@ -22,7 +22,7 @@ if __name__ == "__main__":
             roots=(folder,),
             steps=STEPS if kind == "worker" else {},
             flows=FLOWS if kind == "coordinator" else {},
-            patience=Patience(**told["patience"]) if told.get("patience") else None,
+            timeouts=LivenessTimeouts(**told["timeouts"]) if told.get("timeouts") else None,
             back_off_s=told.get("back_off_s", 0.2),
         )
     )

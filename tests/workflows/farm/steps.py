@@ -86,8 +86,8 @@ def _step(name: str, **settings: Any) -> Step:
 
 
 STEPS = {
-    "work": _step("work", places=("store", "trace")),
-    "brief": _step("work", places=("store", "trace"), hard_s=1.0),
+    "work": _step("work", path_arguments=("store", "trace")),
+    "brief": _step("work", path_arguments=("store", "trace"), timeout_s=1.0),
     "talk": _step("talk"),
     "refuse": _step("refuse"),
     "fail": _step("fail"),

@@ -7,12 +7,12 @@ import pytest
 from registration.errors import InputError
 from registration.progress import Silent
 from tests.workflows.rounds import MODEL, write_people
-from workflows.engine.client import Queue
+from workflows.engine.client import QueueClient
 from workflows.engine.database import default_url
 from workflows.engine.jobs import Job
 from workflows.engine.process import migrate
-from workflows.engine.reader import Reader
-from workflows.farm.coregistration import PLAN, put_coregistration
+from workflows.engine.reader import QueueReader
+from workflows.farm.coregistration import PLAN, submit_coregistration
 from workflows.farm.local import LocalFarm, run_until_done
 from workflows.farm.plan import make_plan
 
@@ -22,19 +22,19 @@ def test_a_run_that_goes_on_stays_and_one_that_ended_is_forgotten(capture: Path,
     url, out = default_url(tmp_path), tmp_path / "june"
     plan = make_plan(dataset, model_path=MODEL, out=out, components=(2,))
     with pytest.raises(InputError, match="There is no queue"):
-        put_coregistration(url, plan)
+        submit_coregistration(url, plan)
     assert not out.exists()
     migrate(url)
-    assert put_coregistration(url, plan) == "june"
-    queue, reader = Queue(url), Reader(url)
+    assert submit_coregistration(url, plan) == "june"
+    queue, reader = QueueClient(url), QueueReader(url)
     row = reader.rows(["june"])["june"]
     assert row.state == "waiting"
     assert row.spec == {"flow": "coregister", "arguments": {"plan": str(out / PLAN), "variant": "llvm"}}
-    queue.put([Job(id="june/it00/s00000/neutral", step="register")])
+    queue.submit([Job(id="june/it00/s00000/neutral", step="register")])
     with pytest.raises(InputError, match="have not ended"):
-        put_coregistration(url, plan)
+        submit_coregistration(url, plan)
     queue.cancel("june")
-    put_coregistration(url, plan)
+    submit_coregistration(url, plan)
     assert reader.rows(["june"])["june"].state == "waiting" and not reader.counts("june", kind="job")
 
 

@@ -13,12 +13,12 @@ from registration.progress import Silent
 from tests.registration.capture import small
 from tests.registration.register import synthetic
 from tests.registration.report.test_page import a_registration
-from workflows.engine.reader import Row
+from workflows.engine.reader import JobRow
 from workflows.farm.debug import debug
 
 
-def row(step: str = "register", kind: str = "job", **arguments: Any) -> Row:
-    return Row(
+def row(step: str = "register", kind: str = "job", **arguments: Any) -> JobRow:
+    return JobRow(
         id="run/s1/e001",
         kind=kind,
         state="failed",
@@ -65,7 +65,7 @@ def test_a_capture_from_a_url_is_kept_for_looking(
     calls: list[dict[str, Any]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("workflows.farm.debug.fetch_folder", lambda place, folder: folder.mkdir(parents=True))
-    monkeypatch.setattr("workflows.farm.debug.model_here", lambda place: Path("/cache/m.npz"))
+    monkeypatch.setattr("workflows.farm.debug.fetch_model", lambda place: Path("/cache/m.npz"))
     stored = row("register stored", capture="s3://b/c/e", model="s3://b/m.npz", store="s3://b/s", key="k")
     debug(stored, tmp_path / "out", Silent())
     assert calls[0]["capture"] == tmp_path / "out" / "inputs" / "e" and calls[0]["capture"].is_dir()

@@ -60,7 +60,7 @@ def executor(made: Farm, identity: str) -> str:
 
 def test_a_killed_worker(made: Farm) -> None:
     made.start("w0", "w1")
-    made.queue.put([work(made, "run/a", seconds=3.0)])
+    made.queue.submit([work(made, "run/a", seconds=3.0)])
     begun(made, "run/a")
     dead = executor(made, "run/a")
     child = children_of(made.processes[dead].pid)
@@ -75,7 +75,7 @@ def test_a_killed_worker(made: Farm) -> None:
 def test_a_killed_worker_that_comes_back(made: Farm) -> None:
     """Alone, under its own name: it takes up its job at once."""
     made.start("w0")
-    made.queue.put([work(made, "run/a", seconds=1.0)])
+    made.queue.submit([work(made, "run/a", seconds=1.0)])
     begun(made, "run/a")
     made.kill("w0")
     made.start("w0")
@@ -86,7 +86,7 @@ def test_a_killed_worker_that_comes_back(made: Farm) -> None:
 def test_a_killed_driver(made: Farm) -> None:
     made.start("w0", "c0", "c1")
     arguments = {"subjects": 2, "expressions": 2, "folder": str(made.folder), "seconds": 0.3}
-    made.queue.put([FlowJob(id="run", flow="graph", queue="driver", arguments=arguments)])
+    made.queue.submit([FlowJob(id="run", flow="graph", queue="driver", arguments=arguments)])
     begun(made, "run")
     made.kill(executor(made, "run"))
     made.ends("run")
@@ -96,11 +96,11 @@ def test_a_killed_driver(made: Farm) -> None:
 
 def test_a_frozen_worker_is_not_taken_for_dead(made: Farm) -> None:
     made.start("w0", "w1")
-    made.queue.put([work(made, "run/a", seconds=1.0)])
+    made.queue.submit([work(made, "run/a", seconds=1.0)])
     begun(made, "run/a")
     frozen = executor(made, "run/a")
     made.signal(frozen, signal.SIGSTOP)
-    time.sleep(8 * QUICK["free_s"])
+    time.sleep(8 * QUICK["release_s"])
     assert made.job("run/a")["state"] == "running" and executor(made, "run/a") == frozen
     made.signal(frozen, signal.SIGCONT)
     made.ends("run/a")
@@ -113,7 +113,7 @@ def test_a_frozen_worker_whose_connection_broke_is_fenced(made: Farm) -> None:
     if made.url.startswith("sqlite"):
         pytest.skip("a file's lock cannot be lost")
     made.start("w0", "w1")
-    made.queue.put([work(made, "run/a", seconds=4.0)])
+    made.queue.submit([work(made, "run/a", seconds=4.0)])
     begun(made, "run/a")
     frozen = executor(made, "run/a")
     made.signal(frozen, signal.SIGSTOP)
@@ -126,7 +126,7 @@ def test_a_frozen_worker_whose_connection_broke_is_fenced(made: Farm) -> None:
     made.signal(frozen, signal.SIGCONT)
     made.ends("run/a")
     assert made.job("run/a")["state"] == "done" and executor(made, "run/a") != frozen
-    made.queue.put([work(made, f"run/b{n}") for n in range(6)])
+    made.queue.submit([work(made, f"run/b{n}") for n in range(6)])
     made.ends(*(f"run/b{n}" for n in range(6)))
     found = Store(made.folder / "store").verify()
     assert found.sound and found.artifacts == 7
@@ -140,7 +140,7 @@ def _key(name: str) -> int:
 
 def test_a_poison_job_becomes_a_dead_letter(made: Farm) -> None:
     made.start("w0")
-    made.queue.put([Job(id="run/poison", step="poison", arguments={"trace": str(made.trace)})])
+    made.queue.submit([Job(id="run/poison", step="poison", arguments={"trace": str(made.trace)})])
     for time_ in range(1, 7):
         begun(made, "poison", time_)
         made.until(lambda: not made.runs("w0"), what="w0 to die")
@@ -149,7 +149,7 @@ def test_a_poison_job_becomes_a_dead_letter(made: Farm) -> None:
     made.ends("run/poison")
     assert made.job("run/poison")["failure"] == {"status": "dead", "reason": "killed its worker every time"}
     assert made.lines("begin poison").total() == 6
-    made.queue.put([work(made, "run/a")])
+    made.queue.submit([work(made, "run/a")])
     made.ends("run/a")
     assert made.job("run/a")["state"] == "done"
 
@@ -157,7 +157,7 @@ def test_a_poison_job_becomes_a_dead_letter(made: Farm) -> None:
 def test_a_job_that_holds_the_interpreter_runs_once(made: Farm) -> None:
     made.start("w0", "w1")
     arguments = {"seconds": 20, "trace": str(made.trace)}
-    made.queue.put([Job(id="run/gil", step="hold_gil", arguments=arguments)])
+    made.queue.submit([Job(id="run/gil", step="hold_gil", arguments=arguments)])
     made.ends("run/gil")
     assert made.job("run/gil")["result"]["result"] == "held"
     assert made.lines() == {"begin gil": 1, "end gil": 1}
@@ -166,12 +166,12 @@ def test_a_job_that_holds_the_interpreter_runs_once(made: Farm) -> None:
 def test_cancelling_a_tree(made: Farm) -> None:
     made.start("w0", "w1", "c0")
     arguments = {"subjects": 3, "expressions": 2, "folder": str(made.folder), "seconds": 600.0}
-    made.queue.put([FlowJob(id="run", flow="graph", queue="driver", arguments=arguments)])
+    made.queue.submit([FlowJob(id="run", flow="graph", queue="driver", arguments=arguments)])
     made.until(lambda: made.lines("begin run").total() == 2)
     assert made.queue.cancel("run") == 7  # the driver, three subjects and their neutrals
     pids = [int(line.split()[-1]) for line in made.trace.read_text().splitlines()]
     made.until(lambda: not any(map(alive, pids)), what="the children to die")
-    made.queue.put([work(made, "next/a")])
+    made.queue.submit([work(made, "next/a")])
     made.ends("next/a")
     time.sleep(3)
     assert made.job("run")["state"] == "cancelled"
@@ -181,11 +181,11 @@ def test_cancelling_a_tree(made: Farm) -> None:
 
 def test_postgres_restarts(postgres: Server, tmp_path: Path) -> None:
     """All locks are lost at once, with the detector on: nobody is taken for dead, what runs runs once."""
-    patience = {"look_s": 0.3, "free_s": 3.0, "up_s": 8.0}
-    with farm(tmp_path, postgres.url, patience) as made:
+    timeouts = {"poll_s": 0.3, "release_s": 3.0, "uptime_s": 8.0}
+    with farm(tmp_path, postgres.url, timeouts) as made:
         made.start("w0", "w1", "c0")
         arguments = {"subjects": 3, "expressions": 2, "folder": str(made.folder), "seconds": 1.0}
-        made.queue.put([FlowJob(id="run", flow="graph", queue="driver", arguments=arguments)])
+        made.queue.submit([FlowJob(id="run", flow="graph", queue="driver", arguments=arguments)])
         made.until(lambda: made.lines("end run").total() >= 2)
         postgres.stop()
         time.sleep(5)  # jobs end meanwhile
@@ -196,7 +196,7 @@ def test_postgres_restarts(postgres: Server, tmp_path: Path) -> None:
         assert all(made.runs(name) for name in made.processes)
         assert "is gone" not in "".join(map(made.said, made.processes))
         made.kill("w0")  # and it still finds the dead
-        made.queue.put([work(made, f"more/{n}") for n in range(4)])
+        made.queue.submit([work(made, f"more/{n}") for n in range(4)])
         made.ends(*(f"more/{n}" for n in range(4)))
 
 
@@ -205,7 +205,7 @@ def test_a_graph_with_kills_in_the_middle(made: Farm) -> None:
     made.start("w0", "w1", "c0")
     subjects, expressions = 10, 5
     arguments = {"subjects": subjects, "expressions": expressions, "folder": str(made.folder), "seconds": 0.4}
-    made.queue.put([FlowJob(id="run", flow="graph", queue="driver", arguments=arguments)])
+    made.queue.submit([FlowJob(id="run", flow="graph", queue="driver", arguments=arguments)])
     total = subjects * (expressions + 2) + 1
     for share, name in ((0.1, "w0"), (0.25, "c0"), (0.4, "w1"), (0.6, "c0"), (0.8, "w0")):
         made.until(lambda share=share: made.lines("end run").total() >= share * total, what=f"{share:.0%}")

@@ -25,7 +25,7 @@ def work(small: Farm, identity: str, seconds: float = 0.0, **settings: object) -
 
 def test_jobs_that_fail_leave_workers_alive(small: Farm) -> None:
     foreign = {"store": "/etc", "key": "k"}
-    small.queue.put(
+    small.queue.submit(
         [
             Job(id="bad/input", step="refuse"),
             Job(id="bad/step", step="os:system"),
@@ -47,13 +47,13 @@ def test_jobs_that_fail_leave_workers_alive(small: Farm) -> None:
         "brief": ("timed out", 1),
     }
     assert small.runs("w0") and small.runs("w1")
-    figures = small.reader.figures("bad")
+    figures = small.reader.metrics("bad")
     assert figures.counts == {"failed": 6} and sum(figures.failures.values()) == 6
     assert "secret" not in str(figures) + small.said("w0") + small.said("w1")
 
 
 def test_a_killed_workers_job_goes_to_a_peer(small: Farm) -> None:
-    small.queue.put([work(small, "kill/a", seconds=1.5)])
+    small.queue.submit([work(small, "kill/a", seconds=1.5)])
     small.until(lambda: small.lines("begin kill/a").total() == 1)
     small.until(lambda: small.reader.rows(["kill/a"])["kill/a"].executor is not None)
     small.kill(str(small.reader.rows(["kill/a"])["kill/a"].executor))
@@ -67,7 +67,7 @@ def test_a_flow_is_done_once_and_again_is_nothing(small: Farm) -> None:
     arguments = {"subjects": 2, "expressions": 2, "folder": str(small.folder), "seconds": 0.0}
     flow = FlowJob(id="flow", flow="graph", queue="driver", arguments=arguments)
     for _ in range(2):
-        small.queue.put([flow])
+        small.queue.submit([flow])
         small.ends("flow")
     assert small.job("flow")["result"] == {"subjects": 2, "rebuilt": 1}
     assert set(small.lines("end flow").values()) == {1} and len(small.lines("end flow")) == 9
@@ -75,9 +75,9 @@ def test_a_flow_is_done_once_and_again_is_nothing(small: Farm) -> None:
 
 
 def test_a_batch_ends_when_the_last_of_its_jobs_does(small: Farm) -> None:
-    small.queue.put([work(small, f"many/ann/e{n}", seconds=0.4) for n in range(4)])
-    small.queue.put([Job(id="many/bob/e0", step="refuse")])
-    small.queue.put([FlowJob(id="many", flow="batch", queue="driver")])
+    small.queue.submit([work(small, f"many/ann/e{n}", seconds=0.4) for n in range(4)])
+    small.queue.submit([Job(id="many/bob/e0", step="refuse")])
+    small.queue.submit([FlowJob(id="many", flow="batch", queue="driver")])
     small.ends("many")
     assert small.job("many")["result"] == {"done": 4, "failed": 1}
 
@@ -86,7 +86,7 @@ def test_what_failed_is_retried_in_place(small: Farm) -> None:
     blocked = small.folder / "store2"
     blocked.write_text("in the way")
     arguments = {"store": str(blocked), "key": "k"}
-    small.queue.put([Job(id="again/a", step="work", arguments=arguments), work(small, "again/b")])
+    small.queue.submit([Job(id="again/a", step="work", arguments=arguments), work(small, "again/b")])
     small.ends("again/a", "again/b")
     assert small.job("again/a")["failure"]["status"] == "failed"
     blocked.unlink()
@@ -97,21 +97,21 @@ def test_what_failed_is_retried_in_place(small: Farm) -> None:
 
 
 def test_cancelling_stops_what_runs_and_what_waits(small: Farm) -> None:
-    small.queue.put([work(small, f"stop/{n}", seconds=60.0) for n in range(4)])
+    small.queue.submit([work(small, f"stop/{n}", seconds=60.0) for n in range(4)])
     small.until(lambda: small.lines("begin stop").total() == 2)
     assert small.queue.cancel("stop") == 4
-    small.queue.put([work(small, "after/a")])
+    small.queue.submit([work(small, "after/a")])
     small.ends("after/a")
     assert small.reader.counts("stop") == {"cancelled": 4}
     assert small.lines("begin stop").total() == 2 and not small.lines("end stop")
 
 
 def test_forgetting_needs_an_end(small: Farm) -> None:
-    small.queue.put([work(small, "old/it00/a"), work(small, "old/it01/a")])
+    small.queue.submit([work(small, "old/it00/a"), work(small, "old/it01/a")])
     small.ends("old/it00/a", "old/it01/a")
     assert small.queue.forget("old/it00") == 1
     assert small.reader.counts("old") == {"done": 1}
-    small.queue.put([work(small, "old/it02/a", seconds=1.0)])
+    small.queue.submit([work(small, "old/it02/a", seconds=1.0)])
     with pytest.raises(InputError, match="have not ended"):
         small.queue.forget("old")
     small.ends("old/it02/a")
@@ -119,7 +119,7 @@ def test_forgetting_needs_an_end(small: Farm) -> None:
 
 def test_a_place_is_taken_once_and_sigterm_ends(small: Farm) -> None:
     kept = small.processes["w1"]
-    with pytest.raises(AssertionError, match="Another process has this place"):
+    with pytest.raises(AssertionError, match="Another process has this executor id"):
         small.start("w1")
     small.processes["w1"] = kept
     small.start("w2")

@@ -22,8 +22,8 @@ import pytest
 from registration.errors import InputError
 from tests.conftest import FIXTURES
 from tests.registration.capture import small
-from workflows.engine.child import Slot
-from workflows.engine.jobs import MAX_BYTES, checked
+from workflows.engine.child import StepProcess
+from workflows.engine.jobs import MAX_BYTES, validate_arguments
 from workflows.ids import resolve_roots
 from workflows.records.store import MANIFEST, Store
 from workflows.steps.table import STEPS
@@ -42,8 +42,8 @@ class Trap:
 
 
 @pytest.fixture(scope="module")
-def slot() -> Iterator[Slot]:
-    made = Slot(modules=("workflows.steps.register",))
+def slot() -> Iterator[StepProcess]:
+    made = StepProcess(modules=("workflows.steps.register",))
     made.warm()
     yield made
     made.kill()
@@ -160,12 +160,12 @@ SPOILS: dict[str, tuple[Callable[[Path], None], str]] = {
 
 
 @pytest.mark.parametrize("name", SPOILS)
-def test_a_hostile_capture_or_model_is_refused_and_the_worker_lives(slot: Slot, root: Path, name: str) -> None:
+def test_a_hostile_capture_or_model_is_refused_and_the_worker_lives(slot: StepProcess, root: Path, name: str) -> None:
     spoil, words = SPOILS[name]
     spoil(root)
     pid = slot.warm()
-    step, arguments = checked(job(root), STEPS, resolve_roots((root,)))
-    outcome = asyncio.run(slot.run(step.function, arguments, log=root.parent / "log", hard_s=120.0))
+    step, arguments = validate_arguments(job(root), STEPS, resolve_roots((root,)))
+    outcome = asyncio.run(slot.run(step.function, arguments, log=root.parent / "log", timeout_s=120.0))
     assert outcome["status"] == "bad input" and words in outcome["reason"], outcome
     assert not (root.parent / "sprung").exists()
     assert not [path for path in (root / "store").rglob("*") if path.is_file()]
@@ -190,14 +190,14 @@ def test_a_job_with_a_foreign_place_never_reaches_the_child(root: Path, changed:
     (root / "out" / "link").symlink_to(root.parent)
     changed = {key: value.replace("{root}", str(root)) for key, value in changed.items()}
     with pytest.raises(InputError) as refused:
-        checked(job(root, **changed), STEPS, resolve_roots((root,)))
+        validate_arguments(job(root, **changed), STEPS, resolve_roots((root,)))
     assert "password" not in str(refused.value)
 
 
 def test_a_step_that_is_not_in_the_table_never_reaches_the_child(root: Path) -> None:
     for step in ("os:system", "workflows.steps.register:register_stored", "__import__", ""):
         with pytest.raises(InputError, match="refused"):
-            checked({"step": step, "arguments": {}}, STEPS, resolve_roots((root,)))
+            validate_arguments({"step": step, "arguments": {}}, STEPS, resolve_roots((root,)))
 
 
 def test_a_key_that_leads_out_of_the_store_is_refused(tmp_path: Path) -> None:

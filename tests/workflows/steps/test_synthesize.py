@@ -14,7 +14,7 @@ from coregister.synthetic.capture import Studio
 from registration.errors import InputError
 from registration.storage.hashing import hash_file
 from workflows.cli.app import main
-from workflows.processes import side_by_side
+from workflows.processes import run_parallel
 from workflows.records.dataset import read_dataset, split
 from workflows.steps.synthesize import Population, photograph, synth_dataset
 
@@ -49,7 +49,7 @@ def photographs(monkeypatch) -> Photographs:
     def here(function, calls, jobs) -> Iterator[tuple[str, str]]:
         yield from ((name, function(**call)) for name, call in calls.items())
 
-    monkeypatch.setattr(workflows.steps.synthesize, "side_by_side", here)
+    monkeypatch.setattr(workflows.steps.synthesize, "run_parallel", here)
     return found
 
 
@@ -141,7 +141,7 @@ def test_one_trouble_in_another_process_does_not_stop_the_others(tmp_path):
         "ann": {"root": tmp_path / "ann", "seed": 0, "expression": "neutral", "tags": {}, "studio": bad},
         "bob": {"place": tmp_path / "bob"},
     }
-    found = dict(side_by_side(photograph, calls, jobs=2))
+    found = dict(run_parallel(photograph, calls, jobs=2))
     assert "number of cameras" in found["ann"] and found["bob"].startswith("TypeError")
 
 
