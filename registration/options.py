@@ -42,7 +42,7 @@ _RECIPE: PrimitiveConstructorSpec[Any] = PrimitiveConstructorSpec(
 )
 _LANDMARK_FILES: PrimitiveConstructorSpec[Any] = PrimitiveConstructorSpec(
     nargs="*",
-    metavar="[SCHEME=FILE ...]",
+    metavar="SCHEME=FILE ...",
     instance_from_str=_parse_landmark_files,
     is_instance=lambda value: isinstance(value, Mapping),
     str_from_instance=lambda value: [f"{scheme}={file}" for scheme, file in value.items()],
@@ -54,28 +54,25 @@ _LANDMARKS_ARGUMENT = arg(name="landmarks", help_behavior_hint="(optional)")
 class RegisterOptions:
     """Everything about a registration that may be chosen, besides its capture, model, neutral and output folder.
 
-    Every field decides the result (`registration.inputs.input_hash`).
+    All of it decides the result (`registration.inputs.input_hash`).
+
+    Attributes:
+        recipe: Schedule of the fit. preview: seconds, small images. draft: minutes; shows whether a capture can be
+            used. studio: full quality. in_model: the model's parameters alone, without free offsets. Or the import
+            path MODULE:FUNCTION of a function that returns a Recipe.
+        views: Use only this many views, at least 2, spread around the head.
+        seed: Seed of the view subsets and of the silhouette samples.
+        deterministic: Make every array equal from run to run on the CPU, in about twice the time.
+        variant: Render on the CPU (llvm) or on an NVIDIA GPU (cuda).
+        landmark_files: The model's vertices of landmark schemes, instead of the files next to the model.
     """
 
     recipe: Annotated[str | Recipe, _RECIPE] = "draft"
-    """Schedule of the fit. preview: seconds, small images. draft: minutes; shows whether a capture can be used.
-    studio: full quality. in_model: the model's parameters alone, without free offsets. Or the import path
-    MODULE:FUNCTION of a function that returns a Recipe."""
-
     views: Annotated[int | None, arg(metavar="N", help_behavior_hint="(default: all)")] = None
-    """Use only this many views, at least 2, spread around the head."""
-
     seed: Annotated[int, arg(metavar="S")] = 0
-    """Seed of the view subsets and of the silhouette samples."""
-
     deterministic: bool = False
-    """Make every array equal from run to run on the CPU, in about twice the time."""
-
     variant: Literal["llvm", "cuda"] = "llvm"
-    """Render on the CPU (llvm) or on an NVIDIA GPU (cuda)."""
-
     landmark_files: Annotated[Mapping[str, Path], _LANDMARK_FILES, _LANDMARKS_ARGUMENT] = field(default_factory=dict)
-    """The model's vertices of a landmark scheme, instead of the file next to the model."""
 
     @property
     def recipe_name(self) -> str:

@@ -38,7 +38,10 @@ def test_the_command_line_fills_every_field() -> None:
     )
 
 
-def test_help_shows_every_field_with_its_docstring(capsys: pytest.CaptureFixture[str]) -> None:
+def test_help_shows_every_field_with_its_docstring(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("COLUMNS", "300")
     with pytest.raises(SystemExit):
         parsed("--help")
     text = capsys.readouterr().out

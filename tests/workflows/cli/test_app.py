@@ -91,7 +91,7 @@ def test_recipes_and_queues_in_the_help_are_those_that_exist(
     for command in ("register", "subject", "batch", "coregister"):
         with pytest.raises(SystemExit):
             main([command, "--help"])
-        row = re.search(r"--recipe.*", capsys.readouterr().out)
+        row = re.search(r"--recipe.*?--views", capsys.readouterr().out, re.DOTALL)
         assert row and all(f"{name}: " in row[0] for name in RECIPES)
     assert set(get_args(QueueName)) == {GPU, REBUILD}
 
