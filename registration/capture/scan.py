@@ -9,7 +9,7 @@ import trimesh
 from jaxtyping import Float, Int
 
 from registration.errors import InputError
-from registration.storage.npz import check_unpacked
+from registration.storage.npz import check_unpacked_size
 
 MAX_TRUTH_BYTES = 2**30  # 40 million vertices
 
@@ -55,7 +55,7 @@ def read_truth(path: Path) -> Float[np.ndarray, "N 3"]:
         )
 
     try:
-        check_unpacked(path, MAX_TRUTH_BYTES)
+        check_unpacked_size(path, MAX_TRUTH_BYTES)
         with np.load(path, allow_pickle=False) as content:
             if "vertices" not in content.files:
                 raise refuse('a field "vertices"', f"fields {', '.join(content.files)}")

@@ -96,20 +96,12 @@ class Record:
             InputError: there is no such file, it is no JSON object, of another kind or of another schema version, or a
                 field is missing, unknown or of a wrong type. The message names the file and the field.
         """
-        try:
-            content = Path(file).read_bytes()
-        except OSError as error:
-            raise cls.invalid(file, expected="a readable file", got=error.strerror or error) from error
-        return cls.from_text(content, where=file)
+        return cls.from_json(read_json(file, title=cls.TITLE, fix=cls.FIX), where=file)
 
     @classmethod
     def from_text(cls: type[R], content: str | bytes, *, where: object) -> R:
         """Read a record from the content of its file. `where` names the file in messages. Raises as `read`."""
-        try:
-            value = json.loads(content, parse_constant=_refuse_constant)
-        except (ValueError, RecursionError) as error:
-            raise cls.invalid(where, expected="a JSON object", got=f"no JSON: {error}") from error
-        return cls.from_json(value, where=where)
+        return cls.from_json(_parse(content, where, cls.TITLE, cls.FIX), where=where)
 
     @classmethod
     def from_json(cls: type[R], value: Any, *, where: object) -> R:
@@ -145,6 +137,20 @@ class Record:
                 got=_shown(schema),
                 fix="read it with the version of gnmreg that wrote it" + (", or update gnmreg" if newer else ""),
             )
+
+
+def read_json(file: Path, *, title: str = "record", fix: str = Record.FIX) -> Any:
+    """Read the value in a JSON file.
+
+    Raises:
+        InputError: the file cannot be read, or is no JSON.
+    """
+    try:
+        content = Path(file).read_bytes()
+    except OSError as error:
+        got = error.strerror or error
+        raise InputError.unreadable(title, where=file, expected="a readable file", got=got, fix=fix) from error
+    return _parse(content, file, title, fix)
 
 
 def structure(value: Any, type_: Any, *, where: object, title: str = "record", fix: str = Record.FIX) -> Any:
@@ -202,6 +208,14 @@ def _as_mismatch(error: BaseException) -> _MismatchError | None:
     if isinstance(error, KeyError):
         return _MismatchError("this field", "no such field")
     return None
+
+
+def _parse(content: str | bytes, where: object, title: str, fix: str) -> Any:
+    try:
+        return json.loads(content, parse_constant=_refuse_constant)
+    except (ValueError, RecursionError) as error:
+        got = f"no JSON: {error}"
+        raise InputError.unreadable(title, where=where, expected="a JSON object", got=got, fix=fix) from error
 
 
 def _refuse_constant(name: str) -> None:

@@ -1,13 +1,12 @@
-"""A `Registration` <-> its folder on disk. The files and fields are described in docs/formats.md.
+"""Read and write a `Registration` as a folder on disk. The files and fields are described in docs/formats.md.
 
-A folder appears, or is replaced, in one rename; its content id is a digest of its arrays, checked on reading.
+A folder appears, or is replaced, in one rename; its content id is a digest of its arrays and is checked on reading.
 """
 
-import json
 import math
 import os
-import zipfile
 from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -16,14 +15,16 @@ import numpy as np
 from registration.errors import InputError
 from registration.frames import linear_to_srgb, srgb_to_linear
 from registration.storage.files import atomic_directory, atomic_write_text, has_kind, write_json
-from registration.storage.hashing import content_id, input_hash, versions
+from registration.storage.hashing import content_id, input_hash, to_jsonable, versions
 from registration.storage.mesh import write_obj, write_ply
-from registration.types import Registration
+from registration.storage.npz import Kind, NpzSchema
+from registration.storage.records import Record, read_json, structure
+from registration.types import Registration, Status
 
-SCHEMA = 1
 KIND = "gnm-registration"
+MANIFEST = "manifest.json"
 FILES = (
-    "manifest.json",
+    MANIFEST,
     "history.json",
     "registration.npz",
     "mesh.ply",
@@ -46,38 +47,73 @@ AXES = {
     "corner_uvs": "F 3 2",
 }
 LANDMARKS = "landmarks_"  # prefix of the arrays that hold one scheme's landmarks each
+_TITLE = "registration"
+_FIX = "give the folder that `gnmreg register` wrote, or register again"
+_INTEGERS = ("triangles",)
+_FIELDS: dict[str, tuple[Kind, str]] = {
+    name: ("integer" if name in _INTEGERS else "float", axes) for name, axes in AXES.items()
+}
+SCHEMA = NpzSchema(
+    title=_TITLE, fix=_FIX, fields=_FIELDS, families={LANDMARKS: ("float", "L 3")}, indices={"triangles": "V"}
+)
+
+
+@dataclass(frozen=True, kw_only=True)
+class RegistrationManifest(Record, kind=KIND, schema=1, title=_TITLE, fix=_FIX):
+    """`manifest.json` of a registration folder."""
+
+    status: Status
+    reason: str
+    content_id: str  # sha256 of the arrays and the texture
+    input_hash: str  # sha256 of inputs, config and the project's version
+    figures: Mapping[str, Any]
+    seconds: Mapping[str, float | None]  # per stage
+    inputs: Mapping[str, str]  # name -> sha256
+    versions: Mapping[str, str]
+    config: Mapping[str, Any]  # the resolved configuration, as `to_jsonable` returns it
 
 
 def check_output_folder(out: Path) -> None:
     """Refuse, before any compute, an output folder that is not ours to replace.
 
     Raises:
-        InputError: `out` is a file, is a folder holding anything that we did not write, or cannot be created.
+        InputError: `out` is a file, is a folder that holds anything that we did not write, or cannot be created.
     """
     out = Path(out).resolve()
+    ours = "a new or empty folder, or one that gnmreg wrote"
     if out.exists() and not out.is_dir():
-        raise _refused(out, got="a file", fix="choose another output folder")
+        raise InputError.output_folder(out, expected=ours, got="a file")
     if out.is_dir() and (names := sorted(p.name for p in out.iterdir())):
         if not is_registration(out):
-            raise _refused(out, got=f"a folder that holds {_listed(names)}", fix="choose another output folder")
+            raise InputError.output_folder(out, expected=ours, got=f"a folder that holds {_listed(names)}")
         if foreign := [name for name in names if name not in FILES]:
-            raise _refused(out, got=f"also {_listed(foreign)}", fix="move these files away, they would be lost")
+            fix = "move these files elsewhere: they would be lost"
+            raise InputError.output_folder(out, expected=ours, got=f"also {_listed(foreign)}", fix=fix)
     parent = out.parent
     while not parent.exists():
         parent = parent.parent
     if not parent.is_dir() or not os.access(parent, os.W_OK):
-        raise _refused(out, got=f"no folder can be made in {parent}", fix="choose a folder that you may write to")
+        got, fix = f"no folder can be created in {parent}", "choose a folder that you may write to"
+        raise InputError.output_folder(out, expected=ours, got=got, fix=fix)
 
 
 def is_registration(path: Path) -> bool:
-    """Whether the folder holds a manifest that we wrote, of any schema version."""
-    return has_kind(Path(path) / "manifest.json", KIND)
+    """Return whether the folder holds a manifest that we wrote, of any schema version."""
+    return has_kind(Path(path) / MANIFEST, KIND)
 
 
 def save_registration(registration: Registration, out: Path, report_html: str | None = None) -> Path:
-    """Write the whole folder beside `out` and move it there in one rename; our former folder is replaced.
+    """Write the whole folder; one that we wrote before is replaced in one rename.
 
-    Returns the folder. Arrays are stored as float32 (triangles int32), the texture as 16 bit sRGB.
+    Arrays are stored as float32 (triangles as int32), the texture as 16 bit sRGB.
+
+    Args:
+        registration: the result.
+        out: the folder.
+        report_html: the content of `report.html`; None: no report.
+
+    Returns:
+        The folder, as an absolute path.
 
     Raises:
         InputError: as `check_output_folder`.
@@ -86,62 +122,62 @@ def save_registration(registration: Registration, out: Path, report_html: str | 
     out = Path(out).resolve()
     check_output_folder(out)
     arrays = _arrays(registration)
-    if problem := _problem(arrays, finite=registration.status != "failed"):
-        raise ValueError("{}: expected {}, got {}".format(*problem))
+    if defect := SCHEMA.find_defect(arrays, finite=registration.status != "failed"):
+        raise ValueError(f"{defect.name}: expected {defect.expected}, got {defect.got}")
     texture = _encode_texture(registration.texture)
-    with atomic_directory(out) as fresh:
-        np.savez(fresh / "registration.npz", allow_pickle=False, **arrays)
-        _write_png(fresh / "texture.png", texture)
-        write_ply(fresh / "mesh.ply", arrays["vertices"], arrays["triangles"])
-        write_obj(fresh / "mesh.obj", arrays["vertices"], arrays["triangles"], arrays["corner_uvs"], "texture.png")
-        write_json(fresh / "history.json", registration.history)
+    with atomic_directory(out) as temporary:
+        np.savez(temporary / "registration.npz", allow_pickle=False, **arrays)
+        _write_png(temporary / "texture.png", texture)
+        write_ply(temporary / "mesh.ply", arrays["vertices"], arrays["triangles"])
+        write_obj(temporary / "mesh.obj", arrays["vertices"], arrays["triangles"], arrays["corner_uvs"], "texture.png")
+        write_json(temporary / "history.json", registration.history)
         if report_html is not None:
-            (fresh / "report.html").write_text(report_html, encoding="utf-8")
-        write_json(fresh / "manifest.json", _manifest(registration, content_id(arrays, texture)))
+            (temporary / "report.html").write_text(report_html, encoding="utf-8")
+        _manifest(registration, content_id(arrays, texture)).write(temporary / MANIFEST)
     return out
 
 
 def load_registration(path: Path) -> Registration:
-    """Read a folder of `save_registration`; the texture comes back as linear float32.
+    """Read a folder of `save_registration`. The texture comes back as linear float32.
 
     Raises:
-        InputError: no folder of ours, a newer schema, a field that is missing, of a wrong shape, not finite or
+        InputError: no folder of ours, another schema version, a field that is missing, of a wrong shape, not finite or
             pickled, an unreadable texture, or arrays that do not have the manifest's content id.
     """
     path = Path(path)
     manifest = read_manifest(path)
-    arrays = _read_arrays(path / "registration.npz")
+    arrays = SCHEMA.read(path / "registration.npz")
     texture = _read_png(path / "texture.png")
-    history = _read_json(path / "history.json")
-    if (found := content_id(arrays, texture)) != manifest["content_id"]:
+    history = _read_history(path / "history.json")
+    if (actual := content_id(arrays, texture)) != manifest.content_id:
         raise InputError(
             "The registration was changed after it was written",
             where=path,
-            expected=f"content id {manifest['content_id']}",
-            got=found,
+            expected=f"content id {manifest.content_id}",
+            got=actual,
             fix="register again, or restore registration.npz and texture.png",
         )
     return Registration(
-        status=manifest["status"],
-        reason=manifest["reason"],
+        status=manifest.status,
+        reason=manifest.reason,
         **{name: arrays[name] for name in AXES},
         texture=srgb_to_linear((texture / 65535.0).astype(np.float32)),
         landmarks={name.removeprefix(LANDMARKS): a for name, a in arrays.items() if name.startswith(LANDMARKS)},
-        seconds=manifest["seconds"],
-        history={stage: {term: _floats(v) for term, v in terms.items()} for stage, terms in history.items()},
-        figures=manifest["figures"],
-        config=manifest["config"],
-        inputs=manifest["inputs"],
+        seconds={stage: _number(seconds) for stage, seconds in manifest.seconds.items()},
+        history=history,
+        figures=manifest.figures,
+        config=manifest.config,
+        inputs=manifest.inputs,
     )
 
 
-def find_existing(out: Path, wanted: str) -> Registration | None:
-    """What `out` already holds if it was made from the same inputs (`input_hash`) and is intact, else None.
+def find_existing(out: Path, expected_hash: str) -> Registration | None:
+    """Return the registration in `out` if it is intact and has this `input_hash`, else None.
 
-    Its status may be any; the caller decides whether a failure is worth another try.
+    Its status may be any; the caller decides whether to retry a failed one.
     """
     try:
-        return load_registration(out) if read_manifest(out)["input_hash"] == wanted else None
+        return load_registration(out) if read_manifest(out).input_hash == expected_hash else None
     except InputError:
         return None
 
@@ -154,101 +190,52 @@ def update_figures(path: Path, figures: Mapping[str, Any], report_html: str | No
     """
     path = Path(path)
     manifest = read_manifest(path)
-    manifest["figures"] = {**manifest["figures"], **figures}
-    write_json(path / "manifest.json", manifest)
+    replace(manifest, figures={**manifest.figures, **figures}).write(path / MANIFEST)
     if report_html is not None:
         atomic_write_text(path / "report.html", report_html)
 
 
-def read_manifest(path: Path) -> dict[str, Any]:
-    """The manifest of a registration folder, without reading its arrays.
+def read_manifest(path: Path) -> RegistrationManifest:
+    """Read the manifest of a registration folder, without its arrays.
 
     Raises:
-        InputError: no manifest, not ours, an unknown schema version, or a missing entry.
+        InputError: no manifest, not ours, another schema version, or a field that is missing or of a wrong type.
     """
-    file = Path(path) / "manifest.json"
-    manifest = _read_json(file)
-    if manifest.get("kind") != KIND:
-        raise _unreadable(file, expected=f'"kind": "{KIND}"', got=repr(manifest.get("kind")))
-    if manifest.get("schema") != SCHEMA:
-        raise InputError(
-            "The registration has another schema version",
-            where=file,
-            expected=SCHEMA,
-            got=manifest.get("schema"),
-            fix="read it with the version of gnmreg that wrote it, or register again",
-        )
-    needed = ("status", "reason", "content_id", "input_hash", "inputs", "figures", "config", "seconds")
-    if missing := [name for name in needed if name not in manifest]:
-        raise _unreadable(file, expected=f"the entry {missing[0]!r}", got="no such entry")
-    return manifest
+    return RegistrationManifest.read(Path(path) / MANIFEST)
 
 
 def _arrays(registration: Registration) -> dict[str, np.ndarray]:
-    arrays = {name: np.asarray(getattr(registration, name), np.float32) for name in AXES if name != "triangles"}
-    arrays["triangles"] = np.asarray(registration.triangles, np.int32)
+    arrays = {
+        name: np.asarray(getattr(registration, name), np.int32 if name in _INTEGERS else np.float32) for name in AXES
+    }
     for scheme, points in registration.landmarks.items():
         arrays[LANDMARKS + scheme] = np.asarray(points, np.float32)
     return arrays
 
 
-def _problem(arrays: Mapping[str, np.ndarray], finite: bool = True) -> tuple[str, str, str] | None:
-    """The first field that breaks the format: (name, expected, got)."""
-    lengths: dict[str, int] = {}
-    marks = {name: "L 3" for name in arrays if name.startswith(LANDMARKS)}
-    for name, axes in {**AXES, **marks}.items():
-        letters = axes.split()
-        expected = f"shape ({', '.join(str(lengths.get(a, a)) for a in letters)})"
-        if name not in arrays:
-            return name, expected, "no such field"
-        array = arrays[name]
-        if array.dtype.kind not in ("iu" if name == "triangles" else "f"):
-            return name, "integers" if name == "triangles" else "floats", str(array.dtype)
-        if name not in marks:
-            pairs = list(zip(letters, array.shape, strict=False))
-            lengths |= {a: n for a, n in pairs if not a.isdigit() and a not in lengths}
-        known = [int(a) if a.isdigit() else lengths.get(a) for a in letters]
-        if array.ndim != len(letters) or any(n not in (None, m) for n, m in zip(known, array.shape, strict=True)):
-            return name, expected, f"shape {array.shape}"
-        if finite and not np.isfinite(array).all():
-            return name, "finite numbers", f"{np.count_nonzero(~np.isfinite(array))} that are not"
-    triangles, count = arrays["triangles"], lengths["V"]
-    if triangles.size and not (0 <= triangles.min() and triangles.max() < count):
-        return "triangles", f"indices below {count}", f"{triangles.min()} to {triangles.max()}"
-    return None
+def _manifest(registration: Registration, content: str) -> RegistrationManifest:
+    return RegistrationManifest(
+        status=registration.status,
+        reason=registration.reason,
+        content_id=content,
+        input_hash=input_hash(registration.inputs, registration.config),
+        figures=registration.figures,
+        seconds=registration.seconds,
+        inputs=registration.inputs,
+        versions=versions(),
+        config=to_jsonable(registration.config),
+    )
 
 
-def _read_arrays(file: Path) -> dict[str, np.ndarray]:
-    arrays, name = {}, ""
-    try:
-        with np.load(file, allow_pickle=False) as archive:
-            if not isinstance(archive, np.lib.npyio.NpzFile):
-                raise _unreadable(file, expected="an NPZ archive", got="a single array")
-            for name in archive.files:
-                arrays[name] = archive[name]
-    except (OSError, ValueError, EOFError, KeyError, zipfile.BadZipFile, NotImplementedError) as error:
-        where = f"{file}, field {name!r}" if name else file
-        raise _unreadable(where, expected="an NPZ archive of plain arrays", got=error) from error
-    if problem := _problem(arrays):
-        field, expected, got = problem
-        raise _unreadable(f"{file}, field {field!r}", expected=expected, got=got)
-    return arrays
+def _read_history(file: Path) -> dict[str, dict[str, list[float]]]:
+    """Loss values: stage -> term -> value per step. Values that were not finite are NaN."""
+    history = read_json(file, title=_TITLE, fix=_FIX)
+    stages = structure(history, Mapping[str, Mapping[str, list[float | None]]], where=file, title=_TITLE, fix=_FIX)
+    return {stage: {term: [_number(v) for v in values] for term, values in s.items()} for stage, s in stages.items()}
 
 
-def _manifest(registration: Registration, content: str) -> dict[str, Any]:
-    return {
-        "kind": KIND,
-        "schema": SCHEMA,
-        "status": registration.status,
-        "reason": registration.reason,
-        "content_id": content,
-        "input_hash": input_hash(registration.inputs, registration.config),
-        "figures": registration.figures,
-        "seconds": registration.seconds,
-        "inputs": registration.inputs,
-        "versions": versions(),
-        "config": registration.config,
-    }
+def _number(value: float | None) -> float:
+    return math.nan if value is None else value
 
 
 def _encode_texture(texture: np.ndarray) -> np.ndarray:
@@ -268,43 +255,9 @@ def _read_png(file: Path) -> np.ndarray:
     texture = cv2.imread(str(file), cv2.IMREAD_UNCHANGED) if file.is_file() else None
     if texture is None or texture.dtype != np.uint16 or texture.ndim != 3 or texture.shape[2] != 3:
         got = "nothing readable" if texture is None else f"{texture.dtype} of shape {texture.shape}"
-        raise _unreadable(file, expected="a 16 bit RGB PNG", got=got)
+        raise InputError.unreadable(_TITLE, where=file, expected="a 16 bit RGB PNG", got=got, fix=_FIX)
     return np.ascontiguousarray(texture[..., ::-1])
-
-
-def _floats(values: list[float | None]) -> list[float]:
-    return [math.nan if value is None else value for value in values]
-
-
-def _read_json(file: Path) -> dict[str, Any]:
-    try:
-        value = json.loads(file.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
-        raise _unreadable(file, expected="a JSON object", got=error) from error
-    if not isinstance(value, dict):
-        raise _unreadable(file, expected="a JSON object", got=type(value).__name__)
-    return value
 
 
 def _listed(names: list[str]) -> str:
     return ", ".join(names[:3]) + (f" and {len(names) - 3} more" if len(names) > 3 else "")
-
-
-def _refused(out: Path, *, got: str, fix: str) -> InputError:
-    return InputError(
-        "The output folder cannot be used",
-        where=out,
-        expected="a new or empty folder, or one that gnmreg wrote",
-        got=got,
-        fix=fix,
-    )
-
-
-def _unreadable(where: object, *, expected: object, got: object) -> InputError:
-    return InputError(
-        "The registration cannot be read",
-        where=where,
-        expected=expected,
-        got=got,
-        fix="give the folder that `gnmreg register` wrote, or register again",
-    )

@@ -71,7 +71,7 @@ def read_run(folder: Path, data: GNMData, *, skip_failed: bool = False, only: Co
                     got=one.subject,
                     fix="move one of them away, or correct `subject` in its capture.toml files",
                 )
-            inputs[key] = read_manifest(one.folder / name)["content_id"]
+            inputs[key] = read_manifest(one.folder / name).content_id
             _check_arrays(one.folder / name, wanted, data)
     return Run(subjects=subjects, inputs=inputs, skin=skin)
 

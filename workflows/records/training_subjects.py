@@ -45,7 +45,7 @@ class Registered:
     def inputs(self) -> dict[str, str]:
         """Content ids of everything that is read."""
         ids = {
-            f"{name}/{folder}": read_manifest(self.run / name / folder)["content_id"]
+            f"{name}/{folder}": read_manifest(self.run / name / folder).content_id
             for name, one in self.usable.items()
             for folder in (one.neutral, *(one.expressions if self.steady else ()))
         }

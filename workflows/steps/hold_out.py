@@ -62,4 +62,4 @@ def _sources(found: Dataset, registrations: Path, name: str, true: bool) -> dict
         return {f"{folder} {label}": hashing.hash_file(file) for folder, label, file in truths if file is not None}
     one = read_usable(registrations / name)
     folders = () if one is None else (one.neutral, *one.expressions)
-    return {folder: str(read_manifest(registrations / name / folder)["content_id"]) for folder in folders}
+    return {folder: str(read_manifest(registrations / name / folder).content_id) for folder in folders}

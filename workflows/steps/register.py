@@ -85,4 +85,4 @@ def register_capture(
     result = register(Path(capture), Path(model), Path(out), options, neutral=start, progress=progress)
     if result.status == "failed":
         raise PermanentStepError(f"registration failed: {result.reason}")
-    return {"out": out, "status": result.status, "content_id": read_manifest(Path(out))["content_id"]}
+    return {"out": out, "status": result.status, "content_id": read_manifest(Path(out)).content_id}

@@ -110,7 +110,7 @@ def _contents(place: Path, names: Sequence[str] | Mapping[str, str]) -> dict[str
     found = {}
     for name in names:
         try:
-            found[name] = str(read_manifest(place / name)["content_id"])
+            found[name] = str(read_manifest(place / name).content_id)
         except InputError:
             continue
     return found

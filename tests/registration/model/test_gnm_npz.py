@@ -75,7 +75,7 @@ def test_round_trip_of_the_full_head(tmp_path):
 def test_missing_field_is_named(tmp_path, arrays, name):
     del arrays[name]
     text = refusal(save(tmp_path, arrays))
-    assert f"lacks the field '{name}'" in text and "22 of them" in text
+    assert f"field '{name}' is missing" in text and "22 of them" in text
 
 
 @pytest.mark.parametrize("name", [k for k, (_, axes) in gnm_npz.AXES.items() if axes])
@@ -136,7 +136,7 @@ def test_files_that_are_no_archive_are_refused(tmp_path, arrays):
         path = tmp_path / "broken.npz"
         path.write_bytes(content)
         assert "cannot be read" in refusal(path)
-    assert "there is no model file" in refusal(tmp_path / "absent.npz")
+    assert "The head model is missing" in refusal(tmp_path / "absent.npz")
 
 
 def test_damaged_and_foreign_members_are_named(tmp_path):

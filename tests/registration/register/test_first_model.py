@@ -29,7 +29,7 @@ def test_neutral(model: Path, tmp_path: Path) -> None:
     """The demo's bound: scan to mesh on the face, mean, mm."""
     root = capture(tmp_path / "capture", seed=8)
     register(root, model, tmp_path / "out")
-    figures = read_manifest(tmp_path / "out")["figures"]
+    figures = read_manifest(tmp_path / "out").figures
     print(figures["scan_to_mesh"]["face"], figures["vertex_error"]["face"])
     assert figures["scan_to_mesh"]["face"]["mean_mm"] <= 0.20
 

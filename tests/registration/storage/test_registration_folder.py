@@ -190,11 +190,11 @@ def rewrite_manifest(folder: Path, **changes) -> None:
 
 BROKEN = {
     "missing field": (lambda d: rewritten(d, drop="offsets"), "offsets"),
-    "wrong length": (lambda d: rewritten(d, offsets=np.zeros((5, 3), np.float32)), r"vertices'[\s\S]*\(5, 3\)"),
+    "wrong length": (lambda d: rewritten(d, offsets=np.zeros((5, 3), np.float32)), r"vertices'[\s\S]*\(V=5, 3\)"),
     "wrong rank": (lambda d: rewritten(d, confidence=np.zeros((4, 1), np.float32)), "confidence"),
     "not finite": (lambda d: rewritten(d, expression=np.full(7, np.nan, np.float32)), "expression"),
     "pickle": (lambda d: rewritten(d, identity=np.array([print], object)), "identity"),
-    "wrong type": (lambda d: rewritten(d, triangles=np.zeros((4, 3))), "triangles'[\\s\\S]*integers"),
+    "wrong type": (lambda d: rewritten(d, triangles=np.zeros((4, 3))), "triangles'[\\s\\S]*integer array"),
     "bad index": (lambda d: rewritten(d, triangles=np.full((4, 3), 9)), "triangles"),
     "changed array": (lambda d: rewritten(d, identity=np.zeros(5, np.float32)), "changed after"),
     "truncated archive": (lambda d: os.truncate(d / "registration.npz", 900), "registration.npz"),

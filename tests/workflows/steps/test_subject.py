@@ -76,9 +76,9 @@ def test_the_drift_is_that_of_evaluate(subject: Path, fake: FakeRegister, tmp_pa
     out = tmp_path / "out"
     add_truths(subject, "rest", "smile")
     run(subject)
-    figures = read_manifest(out / "smile")["figures"]
+    figures = read_manifest(out / "smile").figures
     assert figures["drift"]["face"]["mean_mm"] == pytest.approx(1.0, abs=0.05)
-    assert "drift" not in read_manifest(out / "rest")["figures"]
+    assert "drift" not in read_manifest(out / "rest").figures
     told = manifest(out)["captures"][-1]["figures"]
     assert told == {name: {"face": figures[name]["face"]} for name in ("scan_to_mesh", "drift")}
     by_hand = evaluate_folder(out / "smile", subject / "smile", out / "rest", subject / "rest").figures
@@ -252,7 +252,7 @@ def test_a_subject_equals_its_captures_registered_by_hand(tmp_path: Path, monkey
     for name in (*AXES, "texture"):
         first, second = (getattr(load_registration(path), name) for path in (out / "smile", tmp_path / "smile"))
         np.testing.assert_array_equal(first, second)
-    assert read_manifest(out / "smile")["input_hash"] == read_manifest(tmp_path / "smile")["input_hash"]
+    assert read_manifest(out / "smile").input_hash == read_manifest(tmp_path / "smile").input_hash
     assert by_hand.inputs["neutral"] == stored.inputs["neutral"]
     assert stored.figures["drift"]["face"]["mean_mm"] < 2.0
     record = manifest(out)
