@@ -6,7 +6,7 @@ FROM debian:13-slim
 
 RUN apt-get update \
  && apt-get install -y --no-install-recommends ca-certificates make python3 python3-venv \
-      libllvm19 libatomic1 libgl1 libopengl0 \
+      libllvm19 libatomic1 \
  && rm -rf /var/lib/apt/lists/*
 
 # Any user may run the image: caches (compiled kernels, model weights) go to a home that all can write.

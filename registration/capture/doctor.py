@@ -26,6 +26,7 @@ EYE_DISTANCE_M = (0.05, 0.15)  # between the outer corners; adults have 0.08 to 
 OUTER_EYES = (36, 45)  # of the 68 scheme
 SMALL_PIXELS = 2**22  # images up to this size are decoded whole when a capture is validated
 SCAN_NEAR_MM = 10.0  # median distance of the landmarks from the scan; landmarks lie on skin that it shows
+NO_TOPOLOGY = "not checked, PyMeshLab is not installed or cannot start (make setup-mesh)"
 _LENSES = {0: "pinhole", 4: "k1 k2 p1 p2", 5: "k1 k2 p1 p2 k3", 8: "k1 k2 p1 p2 k3..k6"}
 
 
@@ -232,8 +233,9 @@ class Report:
         if self.scan is not None:
             extent = " x ".join(f"{MM_PER_M * side:.0f}" for side in np.ptp(self.scan.vertices, axis=0))
             facts.append(f"scan: {len(self.scan.vertices)} vertices, {len(self.scan.triangles)} faces, {extent} mm")
-            if len(self.scan.triangles) and (topology := scan_topology(self.scan.vertices, self.scan.triangles)):
-                facts.append(f"scan's surface: {topology}")
+            if len(self.scan.triangles):
+                topology = scan_topology(self.scan.vertices, self.scan.triangles)
+                facts.append(f"scan's topology: {topology or NO_TOPOLOGY}")
         if capture.ground_truth is not None:
             facts.append(f"ground truth: {len(read_truth(capture.ground_truth))} vertices")
         if self.sheet is not None:

@@ -8,11 +8,11 @@ so that l is what was asked for where edges are longer, or where it is asked to 
 import warnings
 from typing import Any
 
-import cholespy
 import numpy as np
 import torch
 from jaxtyping import Float, Int
 from scipy.sparse import coo_matrix, csr_matrix, diags, identity
+from scipy.sparse.linalg import SuperLU, splu
 from torch import Tensor
 
 
@@ -67,7 +67,11 @@ def to_torch(matrix: csr_matrix, device: torch.device) -> Tensor:
 
 
 class LargeSteps:
-    """M of one mesh, factorised once. Edge and smoothing lengths are one number or one a vertex."""
+    """M of one mesh, factorised once, in double precision. Edge and smoothing lengths are one number or one a vertex.
+
+    The factor lies in host memory (docs/adr/0006-no-gpl-by-default.md): with tensors on a GPU every solve copies its
+    right-hand side to the host and the solution back.
+    """
 
     def __init__(
         self,
@@ -80,14 +84,10 @@ class LargeSteps:
     ):
         strength = np.broadcast_to(np.square(np.divide(smoothing_m, edge_length_m)) / 1.5, vertex_count)
         matrix = identity(vertex_count) + combinatorial_laplacian(triangles, vertex_count, strength)
-        coo = matrix.tocoo()
         self._matrix = to_torch(matrix.tocsr(), device)
-        self._solver = cholespy.CholeskySolverF(
-            vertex_count,
-            torch.as_tensor(coo.row.astype(np.int32), device=device),
-            torch.as_tensor(coo.col.astype(np.int32), device=device),
-            torch.as_tensor(coo.data, device=device),
-            cholespy.MatrixType.COO,
+        # M is symmetric and diagonally dominant: no pivoting, so that rows keep the columns' fill-reducing order.
+        self._factor = splu(
+            matrix.tocsc(), permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True}
         )
 
     def latent(self, displacement: Float[Tensor, "V 3"]) -> Float[Tensor, "V 3"]:
@@ -96,20 +96,24 @@ class LargeSteps:
 
     def displacement(self, latent: Float[Tensor, "V 3"]) -> Float[Tensor, "V 3"]:
         """d = M^-1 u; differentiable."""
-        return _Solve.apply(latent, self._solver)
+        return _Solve.apply(latent, self._factor)
 
 
 class _Solve(torch.autograd.Function):
     @staticmethod
-    def forward(ctx: Any, right: Tensor, solver: cholespy.CholeskySolverF) -> Tensor:
-        ctx.solver = solver
-        out = torch.zeros_like(right)
-        solver.solve(right.detach().contiguous(), out)
-        return out
+    def forward(ctx: Any, right: Tensor, factor: SuperLU) -> Tensor:
+        ctx.factor = factor
+        return _solve(factor, right)
 
     @staticmethod
     def backward(ctx: Any, *grad_outputs: Tensor) -> tuple[Tensor, None]:
         # M is symmetric, so its adjoint is the same solve.
-        out = torch.zeros_like(grad_outputs[0])
-        ctx.solver.solve(grad_outputs[0].contiguous(), out)
-        return out, None
+        return _solve(ctx.factor, grad_outputs[0]), None
+
+
+def _solve(factor: SuperLU, right: Tensor) -> Tensor:
+    """The solution in the right-hand side's type and on its device."""
+    # NumPy converts: for so few numbers PyTorch would start its threads, which costs more than the solve.
+    host = right.detach().cpu().numpy()
+    solution = factor.solve(host.astype(np.float64))
+    return torch.from_numpy(np.ascontiguousarray(solution, dtype=host.dtype)).to(right.device)

@@ -1,4 +1,4 @@
-"""What PyMeshLab tells about a raw scan. The only file that imports it: it is GPL and an extra (`mesh`)."""
+"""Topology of a raw scan, by PyMeshLab. Only this file imports it: it is GPL and an extra (`mesh`)."""
 
 from dataclasses import dataclass
 
@@ -34,12 +34,12 @@ def scan_topology(vertices: Float[np.ndarray, "V 3"], triangles: Int[np.ndarray,
         return None
     meshes = pymeshlab.MeshSet(verbose=False)
     meshes.add_mesh(pymeshlab.Mesh(vertices.astype(np.float64), triangles.astype(np.int32)))
-    found = meshes.get_topological_measures()
+    measures = meshes.get_topological_measures()
     return ScanTopology(
-        components=found["connected_components_number"],
-        holes=found["number_holes"],
-        boundary_edges=found["boundary_edges"],
+        components=measures["connected_components_number"],
+        holes=measures["number_holes"],
+        boundary_edges=measures["boundary_edges"],
         # MeshLab's own count is of memory that nothing was written to.
         non_manifold_edges=int((edges_of(triangles)[2] > 2).sum()),
-        non_manifold_vertices=found["non_two_manifold_vertices"],
+        non_manifold_vertices=measures["non_two_manifold_vertices"],
     )

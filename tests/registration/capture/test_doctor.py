@@ -1,4 +1,5 @@
 import json
+import sys
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -9,7 +10,7 @@ import pytest
 
 from registration.capture import native
 from registration.capture.contact_sheet import CAPTION_PX, TILE_WIDTH_PX
-from registration.capture.doctor import check, validate
+from registration.capture.doctor import NO_TOPOLOGY, check, validate
 from registration.capture.native_writer import write
 from registration.capture.scan import Scan
 from registration.errors import InputError
@@ -44,6 +45,13 @@ def test_the_report_of_a_good_capture(tmp_path: Path) -> None:
     ):
         assert part in text
     assert "warning" not in text
+
+
+def test_the_report_says_when_the_topology_of_the_scan_is_not_checked(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "pymeshlab", None)
+    assert f"scan's topology: {NO_TOPOLOGY}" in str(check(make(tmp_path / "capture")))
 
 
 def spoil_landmarks(root: Path, name: str, change: Callable[[np.ndarray], None]) -> None:

@@ -6,6 +6,7 @@ import sys
 import numpy as np
 import pytest
 import torch
+from scipy.spatial import Delaunay
 
 from registration.fit.optimizer import AdamUniformBlock, minimise
 from registration.fit.recipes import Rate
@@ -63,6 +64,53 @@ def test_laplacians_by_hand():
     points = np.random.default_rng(0).random((5, 3)).astype(np.float32)
     product = to_torch(mean, CPU) @ torch.tensor(points)
     np.testing.assert_allclose(product[1], points[1] - (points[0] + points[2]) / 2, atol=1e-6)
+
+
+def random_case(seed: int = 0) -> tuple[LargeSteps, np.ndarray, np.ndarray]:
+    """Large steps of an open mesh with lengths that vary a hundredfold, their matrix M, dense, and right-hand sides."""
+    rng = np.random.default_rng(seed)
+    points = rng.random((600, 2))
+    triangles = Delaunay(points).simplices
+    edge_m, smoothing_m = rng.uniform(0.001, 0.01, 600), rng.uniform(0.001, 0.1, 600)
+    steps = LargeSteps(triangles, 600, edge_length_m=edge_m, smoothing_m=smoothing_m, device=CPU)
+    dense = np.eye(600) + combinatorial_laplacian(triangles, 600, (smoothing_m / edge_m) ** 2 / 1.5).toarray()
+    return steps, dense, rng.standard_normal((600, 3))
+
+
+@pytest.mark.parametrize("dtype, tolerance", [(torch.float32, 1e-7), (torch.float64, 1e-13)])
+def test_solutions_and_gradients_against_a_dense_solve(dtype, tolerance):
+    """Exact to the rounding of the tensors' own type, because the solve itself is in double precision."""
+    steps, dense, numbers = random_case()
+    right = torch.tensor(numbers.T.copy(), dtype=dtype).T.requires_grad_()  # not contiguous
+    weight = torch.tensor(numbers[::-1].copy(), dtype=dtype)
+    solution = steps.displacement(right)
+    (solution * weight).sum().backward()
+    assert solution.dtype == right.grad.dtype == dtype
+    for result, given in ((solution, right), (right.grad, weight)):
+        expected = np.linalg.solve(dense, given.detach().double().numpy())
+        assert np.abs(result.detach().double().numpy() - expected).max() < tolerance * np.abs(expected).max()
+
+
+def test_every_factor_gives_the_same_bits():
+    numbers = torch.tensor(random_case()[2], dtype=torch.float32)
+    first, second = (random_case()[0].displacement(numbers) for _ in range(2))
+    assert torch.equal(first, second)
+
+
+@pytest.mark.cuda
+def test_tensors_on_a_gpu_are_solved_as_on_the_cpu():
+    _, triangles = lattice(20, 24)
+    lengths = {"edge_length_m": EDGE_M, "smoothing_m": 0.008}
+    latent = torch.randn(480, 3, generator=torch.Generator().manual_seed(0))
+    results = []
+    for device in (CPU, torch.device("cuda")):
+        steps = LargeSteps(triangles, 480, device=device, **lengths)
+        right = latent.to(device).requires_grad_()
+        solution = steps.displacement(right)
+        assert solution.device.type == device.type
+        solution.square().sum().backward()
+        results.append((solution.detach().cpu(), right.grad.cpu()))
+    torch.testing.assert_close(results[1], results[0])
 
 
 @pytest.mark.parametrize("smoothing_mm", [3.0, 8.0, 20.0])
