@@ -1,8 +1,6 @@
 """The HTML page of a subject: a row for each capture; self-contained but for the links to the reports beside it."""
 
 from collections.abc import Mapping
-from html import escape
-from urllib.parse import quote
 
 import cv2
 import numpy as np
@@ -12,18 +10,12 @@ from jaxtyping import Float
 from registration.frames import axis_angle_to_matrix, linear_to_srgb
 from registration.geometry.rasterizer import rasterize
 from registration.report.pictures import PAPER, data_uri
-from registration.report.style import document
 from registration.types import Camera, Registration
-from workflows.records.subject import Row, Subject
+from workflows.pages.base import render
+from workflows.records.subject import Subject
 
 _WIDTH_PX, _HEIGHT_PX = 144, 192  # of a thumbnail
 _OVERSAMPLING = 2
-_CSS = """
-.error { background: var(--bad); } .waiting, .skipped { background: var(--soft); }
-td .badge { margin-left: 0; vertical-align: 0; } td { vertical-align: middle; }
-.thumb { width: 110px; display: block; border-radius: 7px; } main { padding-top: 28px; }
-.reason { color: var(--soft); font-size: 13.5px; max-width: 52ch; overflow-wrap: anywhere; }
-"""
 
 
 def thumbnail(registration: Registration) -> str | None:
@@ -57,41 +49,11 @@ def _front(head: Float[np.ndarray, "V 3"], width_px: int, height_px: int) -> Cam
 
 
 def write_subject_page(subject: Subject, thumbnails: Mapping[str, str]) -> str:
-    """The whole page; `thumbnails` are data URIs by the name of the row."""
-    usable = sum(row.usable for row in subject.rows)
-    waiting = sum(row.status == "waiting" for row in subject.rows)
-    lead = f"{usable} of {len(subject.rows)} captures have a usable registration"
-    lead += f", {waiting} {'is' if waiting == 1 else 'are'} waiting." if waiting else "."
-    rows = "".join(_row(row, thumbnails.get(row.name)) for row in subject.rows)
-    name = escape(subject.subject)
-    body = (
-        f'<header><div class="top"><div class="eyebrow">Head registrations of a subject</div><h1>{name}</h1>'
-        f'<p class="lead">{lead}</p></div></header><main><div class="panel"><table><tr><th></th><th>capture</th>'
-        '<th></th><th class="num">scan to mesh, mean</th><th class="num">median</th><th class="num">drift, mean</th>'
-        f'<th class="num">time</th><th class="note">why</th></tr>{rows}</table></div>'
-        f"<footer>Figures are of the face, in millimetres. Recipe {escape(subject.recipe)}; expressions start from "
-        f'{escape(subject.neutral)}; model <span class="mono">{escape(subject.model[:16])}</span>.</footer></main>'
+    """Return the page; `thumbnails` are data URIs by the name of the row."""
+    return render(
+        "subject.html",
+        subject=subject,
+        thumbnails=thumbnails,
+        usable=sum(row.usable for row in subject.rows),
+        waiting=sum(row.status == "waiting" for row in subject.rows),
     )
-    return document(f"{name} – registrations", body, css=_CSS, zooms=False)
-
-
-def _row(row: Row, picture: str | None) -> str:
-    name = escape(row.name)
-    shown = f'<img class="thumb" alt="{name} from the front" src="{picture}">' if picture else ""
-    if row.folder is not None:
-        link = f'href="{quote(row.folder)}/report.html"'
-        name, shown = f"<a {link}>{name}</a>", f"<a {link}>{shown}</a>"
-    expression = f'<br><span class="reason">{escape(row.expression)}</span>' if row.expression != row.name else ""
-    figures = (("scan_to_mesh", "mean_mm"), ("scan_to_mesh", "median_mm"), ("drift", "mean_mm"))
-    cells = "".join(f'<td class="num">{_mm(row, *figure)}</td>' for figure in figures)
-    return (
-        f"<tr><td>{shown}</td><td>{name}{expression}</td>"
-        f'<td><span class="badge {row.status}">{row.status}</span></td>{cells}'
-        f'<td class="num">{"" if row.seconds is None else f"{row.seconds:.0f} s"}</td>'
-        f'<td class="note reason">{escape(row.reason)}</td></tr>'
-    )
-
-
-def _mm(row: Row, figure: str, statistic: str) -> str:
-    value = row.figures.get(figure, {}).get("face", {}).get(statistic)
-    return "–" if value is None else f"{value:.3f}"
