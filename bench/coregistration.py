@@ -25,8 +25,8 @@ from coregister.evaluate.linear_fit import LinearPart, fit, identity_part, surfa
 from coregister.evaluate.scan_fit import fit_scan
 from coregister.evaluate.specificity import specificity_mm
 from coregister.first_model import build as bootstrap
-from coregister.next_model.build import build
-from coregister.next_model.training_data import NEUTRAL, Mesh, Subject
+from coregister.next_model.build import build_model
+from coregister.next_model.training_data import NEUTRAL, TrainingMesh, TrainingSubject
 from coregister.stopping_rule import Rule
 from coregister.synthetic.capture import Studio
 from registration.capture.scan import read_truth
@@ -41,7 +41,6 @@ from workflows.farm.coregistration import coregister
 from workflows.farm.plan import make_plan
 from workflows.records.coregistration import FIRST
 from workflows.records.held_out import read_held_out
-from workflows.steps.build import builder
 from workflows.steps.hold_out import PEOPLE
 from workflows.steps.synthesize import Population, synth_dataset
 
@@ -53,15 +52,15 @@ POINTS = 2000  # of a true surface
 STUDIO = Studio(cameras=8, size_px=(256, 256), texture_size=512, quality=Quality(pixel_samples=2, light_rays=32))
 
 
-def own_samples(data: GNMData, count: int, seed: int) -> list[Subject]:
+def own_samples(data: GNMData, count: int, seed: int) -> list[TrainingSubject]:
     """Random heads of a model, coefficients of unit variance, seen everywhere."""
     drawn = np.random.default_rng(seed).standard_normal((count, len(data.vertex_identity_basis)))
     heads = data.template_vertex_positions + np.tensordot(drawn, data.vertex_identity_basis, 1)
     sure = np.ones(len(data.template_vertex_positions), np.float32)
     subjects = []
     for number, head in enumerate(heads.astype(np.float32)):
-        mesh = Mesh(name=NEUTRAL, label=NEUTRAL, vertices=head, confidence=sure, triangles=data.triangles)
-        subjects.append(Subject(name=f"sample_{number:03d}", neutral=mesh))
+        mesh = TrainingMesh(name=NEUTRAL, label=NEUTRAL, vertices=head, confidence=sure, triangles=data.triangles)
+        subjects.append(TrainingSubject(name=f"sample_{number:03d}", neutral=mesh))
     return subjects
 
 
@@ -139,7 +138,7 @@ def main() -> None:
     people = read_held_out(options.out / "rounds" / "held_out" / PEOPLE).subjects
     models = {name: gnm_npz.read(Path(file)) for name, file in told["models"].items()}
     samples = own_samples(models[FIRST], options.training, options.seed)
-    models[CONTROL] = build(samples, models[FIRST], builder()).data
+    models[CONTROL] = build_model(samples, models[FIRST]).data
     figures = {}
     for measure, (distance_mm, part_of) in MEASURES.items():
         print(f"{measure:44}" + "".join(f"{k:>9} mm" for k in COMPONENTS))

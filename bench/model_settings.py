@@ -1,6 +1,6 @@
 """What the settings of a build are worth where subjects are few: people of the synthetic population, meshes as true.
 
-    python -m bench.model_settings [--draws 3] [--previous 0.2 0.4 chosen] [--by-area no yes] [--mirrored no yes]
+    python -m bench.model_settings [--draws 3] [--shrinkage 0.2 0.4 chosen] [--by-area no yes] [--mirrored no yes]
                                    [--noise-mm 0] [--control]
 
 Each draw is people that the first model does not span: `--training` of them make the next model, `--held-out` others
@@ -29,14 +29,16 @@ from coregister.first_model import build as bootstrap
 from coregister.first_model import makehuman, population
 from coregister.first_model.assembly import Anatomy
 from coregister.next_model import identity
-from coregister.next_model.build import Build, build
-from coregister.next_model.identity import Identity
-from coregister.next_model.training_data import Mesh, Subject
+from coregister.next_model.build import build_model
+from coregister.next_model.identity import IdentitySettings
+from coregister.next_model.recipes import true_meshes
+from coregister.next_model.training_data import TrainingMesh, TrainingSubject
 from registration.model import gnm_npz
 from registration.model.gnm_npz import GNMData
 
 COMPONENTS = (10, 20, 40)
-MADE = Identity(share=1.0, most=COMPONENTS[-1], lids_rest=False)  # lids are few vertices, and take half the time
+# Eyelids are few vertices, and their correction takes half the time.
+SETTINGS = IdentitySettings(variance_ratio=1.0, max_components=COMPONENTS[-1], eyelids_follow=False)
 _SEED = 2026
 _WAVE = 2 * np.pi / 30e-3  # of the noise, radians a metre
 _WAVES = 60
@@ -51,7 +53,7 @@ def people(anatomy: Anatomy, moves: Moves, count: int, draw: int) -> Float[np.nd
 
 def of_model(data: GNMData, count: int, draw: int) -> Float[np.ndarray, "N V 3"]:
     """Heads that the model itself draws."""
-    head = np.setdiff1d(np.arange(len(data.vertex_identity_basis)), identity.carried(data))
+    head = np.setdiff1d(np.arange(len(data.vertex_identity_basis)), identity.transfer_components(data))
     drawn = np.random.default_rng([_SEED, draw]).standard_normal((count, len(head)))
     moved = np.tensordot(drawn, data.vertex_identity_basis[head], 1)
     return (data.template_vertex_positions + moved).astype(np.float32)
@@ -68,15 +70,16 @@ def noisy(heads: Float[np.ndarray, "N V 3"], rms_mm: float, draw: int) -> Float[
     return np.stack(found).astype(np.float32)
 
 
-def next_model(heads: Float[np.ndarray, "N V 3"], previous: GNMData, settings: Identity) -> GNMData:
+def next_model(heads: Float[np.ndarray, "N V 3"], previous: GNMData, settings: IdentitySettings) -> GNMData:
     """Of neutrals alone."""
     sure = np.ones(heads.shape[1], np.float32)
     triangles = previous.triangles
     meshes = [
-        Mesh(name=str(k), label="neutral", vertices=h, confidence=sure, triangles=triangles)
+        TrainingMesh(name=str(k), label="neutral", vertices=h, confidence=sure, triangles=triangles)
         for k, h in enumerate(heads)
     ]
-    return build([Subject(name=one.name, neutral=one) for one in meshes], previous, Build(identity=settings)).data
+    subjects = [TrainingSubject(name=mesh.name, neutral=mesh) for mesh in meshes]
+    return build_model(subjects, previous, replace(true_meshes(), identity=settings)).data
 
 
 def errors_mm(data: GNMData, heads: Float[np.ndarray, "N V 3"]) -> Float[np.ndarray, "k"]:
@@ -95,7 +98,7 @@ def main() -> None:
     parser.add_argument("--draws", type=int, default=3)
     parser.add_argument("--training", type=int, default=40)
     parser.add_argument("--held-out", type=int, default=10)
-    parser.add_argument("--previous", nargs="*", default=["0.2", "0.3", "0.4", "0.5", "chosen"])
+    parser.add_argument("--shrinkage", nargs="*", default=["0.2", "0.3", "0.4", "0.5", "chosen"])
     for name in ("--by-area", "--mirrored"):
         parser.add_argument(name, nargs="*", choices=("no", "yes"), default=["no", "yes"])
     parser.add_argument("--noise-mm", type=float, default=0.0)
@@ -113,10 +116,10 @@ def main() -> None:
     before = np.array([errors_mm(first, held_out) for _, held_out, _ in sets])
     wide = np.array([specific_mm(first, heads, options.samples) for _, _, heads in sets])
     print("first model: held-out mm", before.mean(0).round(3), "specificity mm", wide.mean(0).round(3), flush=True)
-    for by_area, mirrored, share in product(options.by_area, options.mirrored, options.previous):
+    for by_area, mirrored, share in product(options.by_area, options.mirrored, options.shrinkage):
         begun = time.perf_counter()
         known = None if share == "chosen" else float(share)
-        settings = replace(MADE, previous=known, by_area=by_area == "yes", mirrored=mirrored == "yes")
+        settings = replace(SETTINGS, shrinkage=known, by_area=by_area == "yes", mirrored=mirrored == "yes")
         found, special = [], []
         for training, held_out, heads in sets:
             data = next_model(training, first, settings)

@@ -17,6 +17,7 @@ Tables of mm and of the ratio next / MODEL by subject; the last lines are the sc
 
 import argparse
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -26,9 +27,10 @@ from rich.table import Table
 
 from coregister.evaluate.linear_fit import Fit, fit, identity_part
 from coregister.evaluate.scan_fit import fit_scan
-from coregister.next_model.build import Build, build
-from coregister.next_model.identity import Identity
-from coregister.next_model.training_data import Mesh, Subject, unposed
+from coregister.next_model.build import build_model
+from coregister.next_model.identity import IdentitySettings
+from coregister.next_model.recipes import true_meshes
+from coregister.next_model.training_data import TrainingMesh, TrainingSubject, unpose
 from registration.capture.native import read
 from registration.capture.scan import read_scan
 from registration.errors import InputError
@@ -57,15 +59,15 @@ def registered(captures: Sequence[Path], model: Path, out: Path) -> list[tuple[C
     return found
 
 
-def subject_of(capture: Capture, registration: Registration, model: GNM) -> Subject:
-    mesh = Mesh(
+def subject_of(capture: Capture, registration: Registration, model: GNM) -> TrainingSubject:
+    mesh = TrainingMesh(
         name=capture.subject,
         label="neutral",
-        vertices=unposed(registration, model),
+        vertices=unpose(registration, model),
         confidence=registration.confidence,
         triangles=registration.triangles,
     )
-    return Subject(name=capture.subject, neutral=mesh)
+    return TrainingSubject(name=capture.subject, neutral=mesh)
 
 
 def face_points(capture: Capture, registration: Registration) -> Float[np.ndarray, "P 3"]:
@@ -95,7 +97,7 @@ def _means(fits: Sequence[Fit]) -> list[float]:
 
 
 def left_out(
-    pairs: Sequence[tuple[Capture, Registration]], previous: GNMData, settings: Identity, counts: Sequence[int]
+    pairs: Sequence[tuple[Capture, Registration]], previous: GNMData, settings: IdentitySettings, counts: Sequence[int]
 ) -> Float[np.ndarray, "N 2 2 k"]:
     """Subject by model (previous, next) by way (scan, vertices) by number of components: mm."""
     function = GNM(previous)
@@ -110,7 +112,7 @@ def left_out(
                 for other, (_, registration) in enumerate(pairs)
                 if other != number and registration.status in USABLE
             ]
-            rebuilt = build(others, previous, Build(identity=settings)).data
+            rebuilt = build_model(others, previous, replace(true_meshes(), identity=settings)).data
             found.append([errors_mm(data, one, points, counts) for data in (previous, rebuilt)])
     return np.array(found)
 
@@ -134,9 +136,9 @@ def main() -> None:
     parser.add_argument("--out", required=True, type=Path)
     parser.add_argument("--components", type=int, nargs="*", default=[5, 10, 20, 40])
     parser.add_argument("--headline", type=int, default=20)
-    parser.add_argument("--previous", default=str(Identity().previous))
+    parser.add_argument("--shrinkage", default=str(true_meshes().identity.shrinkage))
     for name in ("by-area", "mirrored"):
-        default = getattr(Identity(), name.replace("-", "_"))
+        default = getattr(true_meshes().identity, name.replace("-", "_"))
         parser.add_argument(f"--{name}", action=argparse.BooleanOptionalAction, default=default)
     options = parser.parse_args()
     pairs = registered(options.captures, options.model, options.out)
@@ -147,10 +149,14 @@ def main() -> None:
     for capture, one in pairs:
         if one.status not in USABLE:
             print(f"{capture.subject} is in no model: {one.reason}")
-    share = None if options.previous == "chosen" else float(options.previous)
+    share = None if options.shrinkage == "chosen" else float(options.shrinkage)
     counts = sorted({*options.components, options.headline})
-    settings = Identity(
-        previous=share, by_area=options.by_area, mirrored=options.mirrored, share=1.0, most=counts[-1]
+    settings = IdentitySettings(
+        variance_ratio=1.0,
+        max_components=counts[-1],
+        shrinkage=share,
+        by_area=options.by_area,
+        mirrored=options.mirrored,
     )  # as many as MODEL is measured with
     figures = left_out(pairs, gnm_npz.read(options.model), settings, counts)
     show([capture.subject for capture, _ in pairs], figures, counts)

@@ -1,5 +1,5 @@
-"""Neutral heads laid upon one another: generalised Procrustes alignment, and a test of who does not belong
-[GNM, Head Identity], [Gower 1975]; docs/algorithms.md, "Alignment of neutrals"."""
+"""Generalized Procrustes alignment of neutral heads with outlier rejection [GNM, Head Identity], [Gower 1975];
+docs/algorithms.md, "Alignment of neutrals"."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -15,39 +15,46 @@ from registration.model import regions
 from registration.model.gnm_npz import GNMData
 from registration.stabilize.subject_meshes import SkullSkin
 
-_NONE = 1e-300  # a weight that nothing has
-LEAST_TO_COMPARE = 5  # heads; among fewer nobody can tell which one is spoiled
+_EPSILON = 1e-300  # below any weight
+MIN_SAMPLES_FOR_OUTLIERS = 5  # a median of fewer is no reference
 
 
 @dataclass(frozen=True, kw_only=True)
-class Alignment:
-    """How neutrals are aligned, and when one is refused."""
+class AlignmentSettings:
+    """When alignment has converged, and when a mesh is an outlier.
 
-    tolerance_m: float = 1e-6  # rms change of the mean at which rounds end
-    rounds: int = 100
-    deviations: float = 5.0  # robust ones of a figure's logarithm, and
-    times: float = 2.0  # as many times the others' median: then a head is spoiled
+    Attributes:
+        tolerance_m: rms change of the mean at which iterations end.
+        max_iterations: of the alignment.
+        max_deviations: robust standard deviations of a statistic's logarithm; an outlier exceeds them, and
+        min_ratio: this multiple of the statistic's median.
+    """
+
+    tolerance_m: float = 1e-6
+    max_iterations: int = 100
+    max_deviations: float = 5.0
+    min_ratio: float = 2.0
 
 
 @dataclass(frozen=True, kw_only=True)
-class Rejected:
-    """A registration that is left out."""
+class RejectedSubject:
+    """A subject's neutral, or one of its expressions, that is excluded as an outlier."""
 
     name: str
     reason: str
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Aligned:
-    """N heads in the frame of their mean, which lies on the template as it is best laid there. Metres."""
+class AlignedNeutrals:
+    """N heads in the frame of their mean, which is aligned with the template. Metres."""
 
-    kept: Int[np.ndarray, "N"]  # which of the heads that came in
+    kept: Int[np.ndarray, "N"]  # indices into the heads that were given
     vertices: Float[np.ndarray, "N V 3"]  # float32
     T_model_head: Float[np.ndarray, "N 4 4"]
     mean: Float[np.ndarray, "V 3"]
     residual_mm: Float[np.ndarray, "N"]  # rms distance from the mean over the stable skin
-    rounds: int
-    rejected: tuple[Rejected, ...]
+    iterations: int
+    rejected: tuple[RejectedSubject, ...]
 
 
 def align_neutrals(
@@ -55,127 +62,169 @@ def align_neutrals(
     confidence: Float[np.ndarray, "M V"],
     names: Sequence[str],
     data: GNMData,
-    settings: Alignment | None = None,
+    settings: AlignmentSettings | None = None,
     *,
     mirrored: bool = False,
-) -> Aligned:
-    """Rigid, never scaled, never a reflection, by the skin on the skull; weights are its area times the confidence.
+) -> AlignedNeutrals:
+    """Align neutrals with their mean and reject outliers, one at a time.
 
-    `mirrored`: to the mean of the heads and their mirror images, about the model's plane x = 0.
+    Rigid, without scale and without reflection, by the skin over the skull, weighted by area times confidence. After
+    each alignment the worst outlier is excluded and the others are aligned again.
 
-    Heads stand anywhere at first. After each alignment the head that stands out most from the others is left out, and
-    the rest is aligned again, until none does: among at least LEAST_TO_COMPARE.
+    Args:
+        vertices: heads in the topology of `data`, metres, each in any frame.
+        confidence: of the vertices, 0 to 1; 0: not observed.
+        names: of the heads.
+        data: the previous model, whose template defines the frame.
+        settings: tolerances.
+        mirrored: align with the mean of the heads and their mirror images about the model's plane x = 0.
+
+    Returns:
+        The aligned heads without outliers, and the outliers' names and reasons.
     """
-    settings = settings or Alignment()
+    settings = settings or AlignmentSettings()
     template = data.template_vertex_positions.astype(np.float64)
     stable = SkullSkin.of(data).area
-    looks = Looks(data)
+    statistics = OutlierStatistics(data)
     mirror = data.mirror_indices if mirrored else None
-    kept, rejected = np.arange(len(vertices)), list[Rejected]()
+    kept, rejected = np.arange(len(vertices)), list[RejectedSubject]()
     while True:
-        T, mean, rounds = procrustes(vertices[kept], confidence[kept] * stable, template, settings, mirror)
-        moved = np.stack([transform_points(t, v).astype(np.float32) for t, v in zip(T, vertices[kept], strict=True)])
-        figures = np.stack([looks.figures(m - mean, sure) for m, sure in zip(moved, confidence[kept], strict=True)])
-        found = spoiled(figures, "the mean", settings)
-        if found is None:
+        weights = confidence[kept] * stable
+        T, mean, iterations = generalized_procrustes(vertices[kept], weights, template, settings, mirror)
+        pairs = zip(T, vertices[kept], strict=True)
+        aligned = np.stack([transform_points(t, head).astype(np.float32) for t, head in pairs])
+        rows = zip(aligned, confidence[kept], strict=True)
+        values = np.stack([statistics(head - mean, observed) for head, observed in rows])
+        outlier = find_outlier(values, "the mean", settings)
+        if outlier is None:
             break
-        worst, reason = found
-        rejected.append(Rejected(name=names[kept[worst]], reason=reason))
-        kept = np.delete(kept, worst)
-    away = ((moved - mean) ** 2).sum(-1)
-    return Aligned(
+        index, reason = outlier
+        rejected.append(RejectedSubject(name=names[kept[index]], reason=reason))
+        kept = np.delete(kept, index)
+    squares = ((aligned - mean) ** 2).sum(-1)
+    return AlignedNeutrals(
         kept=kept,
-        vertices=moved,
+        vertices=aligned,
         T_model_head=T,
         mean=mean,
-        residual_mm=MM_PER_M * np.sqrt(away @ stable / stable.sum()),
-        rounds=rounds,
+        residual_mm=MM_PER_M * np.sqrt(squares @ stable / stable.sum()),
+        iterations=iterations,
         rejected=tuple(rejected),
     )
 
 
-def procrustes(
+def generalized_procrustes(
     vertices: Float[np.ndarray, "N V 3"],
     weights: Float[np.ndarray, "N V"],
     template: Float[np.ndarray, "V 3"],
-    settings: Alignment,
+    settings: AlignmentSettings,
     mirror: Int[np.ndarray, "V"] | None = None,
 ) -> tuple[Float[np.ndarray, "N 4 4"], Float[np.ndarray, "V 3"], int]:
-    """T_model_head of each head, their mean (all vertices, metres), and how many rounds it took.
+    """Align all heads with their weighted mean, alternately, until the mean converges [Gower 1975].
 
-    In turn all heads are aligned with the mean and the mean is taken anew, each vertex' by its weights; it is then laid
-    on the template, since nothing else says where it stands. `mirror` makes mean and template symmetric.
+    Every new mean is aligned with the template, which defines its frame.
+
+    Args:
+        vertices: of the heads, metres.
+        weights: of the vertices.
+        template: in the model's frame, metres.
+        settings: tolerance and number of iterations.
+        mirror: each vertex' mirror image; makes mean and template symmetric.
+
+    Returns:
+        T_model_head of every head, the mean of all vertices (metres), and the number of iterations.
     """
     weighted = np.asarray(weights.any(0))
     rows = np.flatnonzero(weighted if mirror is None else weighted | weighted[mirror])
-    source, own = vertices[:, rows].astype(np.float64), weights[:, rows]
-    twins = None if mirror is None else np.searchsorted(rows, mirror[rows])
-    total = own.sum(0)
-    aim = _both_sides(template[rows], np.ones_like(total), twins)[0]
-    mean, T, round_ = aim, np.tile(np.eye(4), (len(vertices), 1, 1)), 0
-    while round_ < settings.rounds:
-        round_ += 1
-        T = align(source, mean, own)
-        moved = np.einsum("ncd,npd->npc", T[:, :3, :3], source) + T[:, None, :3, 3]
-        fresh, both = _both_sides(np.einsum("np,npc->pc", own, moved) / np.maximum(total, _NONE)[:, None], total, twins)
-        home = align(fresh[None], aim, both[None])[0]
-        fresh, T = transform_points(home, fresh), home @ T
-        change = np.sqrt(((fresh - mean) ** 2).sum(1) @ both / both.sum())
-        mean = fresh
+    source, row_weights = vertices[:, rows].astype(np.float64), weights[:, rows]
+    mirror_rows = None if mirror is None else np.searchsorted(rows, mirror[rows])
+    total = row_weights.sum(0)
+    target = _symmetric_mean(template[rows], np.ones_like(total), mirror_rows)[0]
+    mean, T, iteration = target, np.tile(np.eye(4), (len(vertices), 1, 1)), 0
+    while iteration < settings.max_iterations:
+        iteration += 1
+        T = align(source, mean, row_weights)
+        aligned = np.einsum("ncd,npd->npc", T[:, :3, :3], source) + T[:, None, :3, 3]
+        head_mean = np.einsum("np,npc->pc", row_weights, aligned) / np.maximum(total, _EPSILON)[:, None]
+        new_mean, mean_weights = _symmetric_mean(head_mean, total, mirror_rows)
+        T_template_mean = align(new_mean[None], target, mean_weights[None])[0]
+        new_mean, T = transform_points(T_template_mean, new_mean), T_template_mean @ T
+        change = np.sqrt(((new_mean - mean) ** 2).sum(1) @ mean_weights / mean_weights.sum())
+        mean = new_mean
         if change < settings.tolerance_m:
             break
-    whole = np.zeros_like(template)
+    mean_vertices = np.zeros_like(template)
     for t, head in zip(T, vertices, strict=True):
-        whole += transform_points(t, head.astype(np.float64)) / len(vertices)
-    return T, whole, round_
+        mean_vertices += transform_points(t, head.astype(np.float64)) / len(vertices)
+    return T, mean_vertices, iteration
 
 
-def _both_sides(
-    points: Float[np.ndarray, "P 3"], weights: Float[np.ndarray, "P"], twins: Int[np.ndarray, "P"] | None
+def _symmetric_mean(
+    points: Float[np.ndarray, "P 3"], weights: Float[np.ndarray, "P"], mirror_rows: Int[np.ndarray, "P"] | None
 ) -> tuple[Float[np.ndarray, "P 3"], Float[np.ndarray, "P"]]:
-    """The weighted mean of points and of their mirror images, and its weights; as they are without `twins`."""
-    if twins is None:
+    """The weighted mean of points and their mirror images, and its weights; unchanged without `mirror_rows`."""
+    if mirror_rows is None:
         return points, weights
-    both = weights + weights[twins]
-    mean = weights[:, None] * points + weights[twins, None] * points[twins] * (-1, 1, 1)
-    return mean / np.maximum(both, _NONE)[:, None], both
+    total = weights + weights[mirror_rows]
+    mean = weights[:, None] * points + weights[mirror_rows, None] * points[mirror_rows] * (-1, 1, 1)
+    return mean / np.maximum(total, _EPSILON)[:, None], total
 
 
-class Looks:
-    """What meshes of one kind are compared by: how far the skin that is seen lies from where it should."""
+class OutlierStatistics:
+    """Statistics of the observed skin's distance from a reference, by which meshes of one kind are compared."""
 
-    NAMES = ("lies {:.1f} mm (rms) from {}", "has a spot {:.1f} mm from {}", "is rough by {:.2f} mm (rms) against {}")
+    TITLES = ("lies {:.1f} mm (rms) from {}", "has a spot {:.1f} mm from {}", "is rough by {:.2f} mm (rms) against {}")
 
     def __init__(self, data: GNMData):
-        self._outside = regions.exterior(data)
-        self._laplacian: csr_matrix = normalised_laplacian(data.triangles, len(self._outside))
+        self._exterior = regions.exterior(data)
+        self._laplacian: csr_matrix = normalised_laplacian(data.triangles, len(self._exterior))
 
-    def figures(self, away: Float[np.ndarray, "V 3"], confidence: Float[np.ndarray, "V"]) -> Float[np.ndarray, "3"]:
-        """mm: rms of the distance, its 99.5th percentile, rms of its Laplacian; 0 where nothing is seen."""
-        seen = self._outside & (confidence > 0)
-        if not seen.any():
-            return np.zeros(len(self.NAMES))
-        distance = MM_PER_M * np.linalg.norm(away[seen], axis=1)
-        # At a border with what is not seen the Laplacian would tell of that.
-        inside = seen & (abs(self._laplacian) @ ~seen == 0)
-        bent = MM_PER_M * np.linalg.norm((self._laplacian @ away)[inside], axis=1)
-        return np.array([_rms(distance), np.percentile(distance, 99.5), _rms(bent)])
+    def __call__(
+        self, displacement: Float[np.ndarray, "V 3"], confidence: Float[np.ndarray, "V"]
+    ) -> Float[np.ndarray, "3"]:
+        """Return, in mm, rms and 99.5th percentile of the distance, and rms of the displacement's Laplacian.
+
+        Args:
+            displacement: from the reference, metres.
+            confidence: 0: not observed. Without any observed skin all statistics are 0.
+        """
+        observed = self._exterior & (confidence > 0)
+        if not observed.any():
+            return np.zeros(len(self.TITLES))
+        distance = MM_PER_M * np.linalg.norm(displacement[observed], axis=1)
+        # At the border of observed skin the Laplacian would contain unobserved neighbours.
+        inside = observed & (abs(self._laplacian) @ ~observed == 0)
+        roughness = MM_PER_M * np.linalg.norm((self._laplacian @ displacement)[inside], axis=1)
+        return np.array([_rms(distance), np.percentile(distance, 99.5), _rms(roughness)])
 
 
-def spoiled(figures: Float[np.ndarray, "N 3"], origin: str, settings: Alignment) -> tuple[int, str] | None:
-    """The mesh that stands out most from the median of a figure, by its logarithm's robust deviations, and why."""
-    if len(figures) < LEAST_TO_COMPARE:
+def find_outlier(
+    statistics: Float[np.ndarray, "N 3"], reference: str, settings: AlignmentSettings
+) -> tuple[int, str] | None:
+    """Return the index of the mesh that deviates most from the median of a statistic, and the reason.
+
+    Deviations are those of logarithms, in robust standard deviations (1.4826 MAD).
+
+    Args:
+        statistics: of N meshes, by `OutlierStatistics`.
+        reference: what distances are from, for the reason.
+        settings: limits.
+
+    Returns:
+        None if no mesh exceeds the limits, or among fewer than MIN_SAMPLES_FOR_OUTLIERS.
+    """
+    if len(statistics) < MIN_SAMPLES_FOR_OUTLIERS:
         return None
-    logs = np.log(np.maximum(figures, 1e-3))
-    middle = np.median(logs, axis=0)
-    spread = np.maximum(1.4826 * np.median(np.abs(logs - middle), axis=0), 1e-2)
-    out = (logs - middle) / spread
-    out[logs - middle <= np.log(settings.times)] = 0
-    number, which = np.unravel_index(out.argmax(), out.shape)
-    if out[number, which] <= settings.deviations:
+    logs = np.log(np.maximum(statistics, 1e-3))
+    median = np.median(logs, axis=0)
+    deviation = np.maximum(1.4826 * np.median(np.abs(logs - median), axis=0), 1e-2)
+    excess = (logs - median) / deviation
+    excess[logs - median <= np.log(settings.min_ratio)] = 0
+    mesh, kind = np.unravel_index(excess.argmax(), excess.shape)
+    if excess[mesh, kind] <= settings.max_deviations:
         return None
-    words = Looks.NAMES[which].format(figures[number, which], origin)
-    return int(number), f"{words}; the median is {np.exp(middle[which]):.2f} mm"
+    words = OutlierStatistics.TITLES[kind].format(statistics[mesh, kind], reference)
+    return int(mesh), f"{words}; the median is {np.exp(median[kind]):.2f} mm"
 
 
 def _rms(values: Float[np.ndarray, "_"]) -> float:

@@ -1,16 +1,16 @@
-"""Many registrations and the previous model -> the next model, with how it came about [GNM, GNM].
+"""Build the next head model from registrations and the previous model [GNM, GNM].
 
-    built = build(subjects, previous)
-    provenance.write(built.data, built.manifest, built.coefficients, path, previous_path)
+    model = build_model(subjects, previous, few_registrations())
+    provenance.write(model.data, model.manifest, model.coefficients, path, previous_path)
 
-Reads straight down: neutrals are checked, completed and aligned; the head's identity, its joints and the regional
-expressions are built from them; what no skin moves with, eyes' and teeth's own shapes, the tongue's motions and the
-pupils, is the previous model's; as are mesh, skinning, groups and the regions.
+Neutrals are validated, completed and aligned; identity basis, joints and regional expression bases are computed from
+them and from the stabilized expressions. Taken from the previous model are the mesh, skinning weights, vertex groups
+and the components that move no skin: shapes of eyes and teeth, motions of tongue and pupils.
 """
 
 from collections import Counter
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -18,70 +18,69 @@ from jaxtyping import Float
 
 from coregister import joints
 from coregister.next_model import expression, identity
-from coregister.next_model.alignment import Aligned, Alignment, Looks, Rejected, align_neutrals, spoiled
-from coregister.next_model.completion import Completion, Unseen
-from coregister.next_model.displacement_store import Spool
-from coregister.next_model.expression import Coefficients, Expressions, Region
-from coregister.next_model.identity import HeadIdentity, Identity
-from coregister.next_model.provenance import Origin, manifest
-from coregister.next_model.training_data import Subject, Survey, survey
+from coregister.next_model.alignment import (
+    AlignedNeutrals,
+    OutlierStatistics,
+    RejectedSubject,
+    align_neutrals,
+    find_outlier,
+)
+from coregister.next_model.completion import MissingDataCompletion
+from coregister.next_model.displacement_store import DisplacementStore
+from coregister.next_model.expression import CoefficientStatistics, RegionBasis
+from coregister.next_model.identity import IdentityBasis
+from coregister.next_model.provenance import BuildInputs, build_manifest
+from coregister.next_model.recipes import ModelRecipe, few_registrations
+from coregister.next_model.training_data import TrainingSet, TrainingSubject, check_rank, validate_training_set
 from registration.frames import transform_points
 from registration.geometry.rigid import align
 from registration.model.gnm_npz import GNMData
 from registration.stabilize.subject_meshes import SkullSkin
 
 
-@dataclass(frozen=True, kw_only=True)
-class Build:
-    """The resolved configuration of a build."""
-
-    alignment: Alignment = field(default_factory=Alignment)
-    unseen: Unseen = field(default_factory=Unseen)
-    identity: Identity = field(default_factory=Identity)
-    expressions: Expressions = field(default_factory=Expressions)
-    categories: Mapping[str, str] | None = None  # every label there may be -> its category; None: any label
-    memory_gb: float = 4.0  # for one covariance or what stands for it
-
-
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Built:
-    """A model and how it came about."""
+class BuiltModel:
+    """A model and its provenance."""
 
     data: GNMData
-    manifest: dict[str, Any]  # JSON values
-    coefficients: Coefficients | None  # of the expressions; None without any: then the expression basis is the old one
+    manifest: dict[str, Any]  # JSON values; docs/formats.md
+    coefficients: CoefficientStatistics | None  # of the expressions; None: no expressions, the basis is the previous
 
 
-def build(subjects: Iterable[Subject], previous: GNMData, settings: Build | None = None) -> Built:
-    """The next model. Deterministic.
+def build_model(
+    subjects: Iterable[TrainingSubject],
+    previous: GNMData,
+    recipe: ModelRecipe | None = None,
+    *,
+    categories: Mapping[str, str] | None = None,
+) -> BuiltModel:
+    """Build the next model. Deterministic.
 
-    `subjects` is read twice, one subject at a time: neutrals stay in memory, expressions on disk (`Spool`).
+    Args:
+        subjects: read twice, one subject at a time: neutrals are held in memory, expressions on disk.
+        previous: the model in whose topology the meshes are.
+        recipe: all settings; None: `recipes.few_registrations()`, as `gnmreg coregister` uses.
+        categories: every permitted label of an expression -> its category; None: any label.
 
     Raises:
-        InputError: as `survey`; fewer than two neutrals are left; a previous model without the official vertex groups.
+        InputError: as `validate_training_set`; more components requested than the samples span; a previous model
+            without the official vertex groups.
     """
-    settings = settings or Build()
-    of_head = len(previous.vertex_identity_basis) - len(identity.carried(previous))
-    found = survey(
-        subjects,
-        previous,
-        labels=None if settings.categories is None else {*settings.categories},
-        rank=settings.identity.most,
-        previous=of_head if settings.identity.previous != 0 else 0,
-        mirrored=settings.identity.mirrored,
-    )
-    aligned, filled = _aligned(found, previous, settings)
-    head = identity.head_identity(aligned.vertices, previous, settings.identity, settings.memory_gb)
+    recipe = recipe or few_registrations()
+    training = validate_training_set(subjects, previous, labels=None if categories is None else {*categories})
+    _check_rank(training, previous, recipe)
+    aligned, completed = _align(training, previous, recipe)
+    head = identity.build_identity_basis(aligned.vertices, previous, recipe.identity, recipe.memory_gb)
     data = _with_identity(previous, head)
-    with Spool(len(head.template)) as spool:
-        samples = _spooled(subjects, found, aligned, previous, spool, settings)
-        bases, coefficients = dict[str, Region](), None
+    with DisplacementStore(training.expression_count, len(head.template)) as store:
+        samples = _store_expressions(subjects, training, aligned, previous, store, recipe)
+        bases, coefficients = dict[str, RegionBasis](), None
         if samples.weights.any():
-            bases = expression.regional_bases(spool, samples.weights, data, settings.expressions, settings.memory_gb)
-            coefficients = expression.coefficients(spool, samples.weights, bases, data)
+            bases = expression.regional_bases(store, samples.weights, data, recipe.expressions, recipe.memory_gb)
+            coefficients = expression.coefficient_statistics(store, samples.weights, bases, data)
             data = _with_expressions(data, bases, coefficients)
-    origin = Origin(
-        found=found,
+    inputs = BuildInputs(
+        training=training,
         aligned=aligned,
         head=head,
         bases=bases,
@@ -89,97 +88,129 @@ def build(subjects: Iterable[Subject], previous: GNMData, settings: Build | None
         expression_labels=samples.labels,
         expression_weights=samples.weights,
         rejected=(*aligned.rejected, *samples.rejected),
-        filled={"neutrals": filled, "expressions": samples.filled},
+        completed={"neutrals": completed, "expressions": samples.completed},
+        categories=categories,
     )
-    told = manifest(origin, previous, data, settings, settings.categories)
-    return Built(data=data, manifest=told, coefficients=coefficients)
+    return BuiltModel(data=data, manifest=build_manifest(inputs, previous, data, recipe), coefficients=coefficients)
 
 
 @dataclass(frozen=True, kw_only=True)
-class _Samples:
-    """The expressions in the spool, in order."""
+class _TrainingSamples:
+    """The expressions in the store, in its order."""
 
     subjects: tuple[str, ...]
     labels: tuple[str, ...]
-    weights: Float[np.ndarray, "S"]  # one over the subject's count; 0 for those left out
-    rejected: tuple[Rejected, ...]
-    filled: int  # samples of which some skin was not seen
+    weights: Float[np.ndarray, "S"]  # 1 / number of the subject's expressions; 0: excluded
+    rejected: tuple[RejectedSubject, ...]
+    completed: int  # samples with missing data
 
 
-def _aligned(found: Survey, previous: GNMData, settings: Build) -> tuple[Aligned, int]:
-    """Neutrals with unseen skin filled, aligned; and how many there was something to fill of."""
+def _check_rank(training: TrainingSet, previous: GNMData, recipe: ModelRecipe) -> None:
+    head_components = len(previous.vertex_identity_basis) - len(identity.transfer_components(previous))
+    check_rank(
+        len(training.subjects),
+        recipe.identity.max_components,
+        previous=head_components if recipe.identity.shrinkage != 0 else 0,
+        mirrored=recipe.identity.mirrored,
+    )
+
+
+def _align(training: TrainingSet, previous: GNMData, recipe: ModelRecipe) -> tuple[AlignedNeutrals, int]:
+    """Completed and aligned neutrals, and the number of those with missing data."""
     stable, template = SkullSkin.of(previous).area, previous.template_vertex_positions.astype(np.float64)
-    T_model_head = align(found.neutrals, template, found.confidence * stable)
-    complete = Completion(previous, previous.vertex_identity_basis, settings.unseen)
-    heads, filled = np.empty_like(found.neutrals), 0
-    for number, (T, vertices, sure) in enumerate(zip(T_model_head, found.neutrals, found.confidence, strict=True)):
-        away = transform_points(T, vertices.astype(np.float64)) - template
-        heads[number] = template + complete(away, sure)
-        filled += complete.unseen(sure)
+    T_model_head = align(training.neutrals, template, training.confidence * stable)
+    complete = MissingDataCompletion(previous, previous.vertex_identity_basis, recipe.completion)
+    heads, completed = np.empty_like(training.neutrals), 0
+    rows = zip(T_model_head, training.neutrals, training.confidence, strict=True)
+    for index, (T, vertices, confidence) in enumerate(rows):
+        displacement = transform_points(T, vertices.astype(np.float64)) - template
+        heads[index] = template + complete(displacement, confidence)
+        completed += complete.has_missing(confidence)
     aligned = align_neutrals(
-        heads, found.confidence, found.subjects, previous, settings.alignment, mirrored=settings.identity.mirrored
+        heads,
+        training.confidence,
+        training.subjects,
+        previous,
+        recipe.alignment,
+        mirrored=recipe.identity.mirrored,
     )
     T_model_head = aligned.T_model_head @ T_model_head[aligned.kept]
-    return replace(aligned, T_model_head=T_model_head), filled
+    return replace(aligned, T_model_head=T_model_head), completed
 
 
-def _spooled(
-    subjects: Iterable[Subject], found: Survey, aligned: Aligned, previous: GNMData, spool: Spool, settings: Build
-) -> _Samples:
-    """Expressions of the neutrals that are kept, as displacements in the model's frame, unseen skin filled."""
-    turns = dict(zip((found.subjects[k] for k in aligned.kept), aligned.T_model_head[:, :3, :3], strict=True))
-    complete, looks = Completion(previous, previous.expression_basis, settings.unseen), Looks(previous)
-    names, of, labels, figures, filled = [], [], [], [], 0
+def _store_expressions(
+    subjects: Iterable[TrainingSubject],
+    training: TrainingSet,
+    aligned: AlignedNeutrals,
+    previous: GNMData,
+    store: DisplacementStore,
+    recipe: ModelRecipe,
+) -> _TrainingSamples:
+    """Writes completed expressions of all kept subjects into the store, as displacements in the model's frame."""
+    kept_names = (training.subjects[k] for k in aligned.kept)
+    rotations = dict(zip(kept_names, aligned.T_model_head[:, :3, :3], strict=True))
+    complete = MissingDataCompletion(previous, previous.expression_basis, recipe.completion)
+    statistics = OutlierStatistics(previous)
+    names, owners, labels, values, completed = [], [], [], [], 0
     for subject in subjects:
-        if subject.name not in turns or subject.neutral is None:
+        if subject.name not in rotations or subject.neutral is None:
             continue
         for mesh in subject.expressions:
-            sure = np.minimum(mesh.confidence, subject.neutral.confidence)
-            moved = (mesh.vertices.astype(np.float64) - subject.neutral.vertices) @ turns[subject.name].T
-            filled += complete.unseen(sure)
-            moved = complete(moved, sure)
-            spool.append(moved)
-            figures.append(looks.figures(moved, sure))
+            confidence = np.minimum(mesh.confidence, subject.neutral.confidence)
+            displacement = (mesh.vertices.astype(np.float64) - subject.neutral.vertices) @ rotations[subject.name].T
+            completed += complete.has_missing(confidence)
+            displacement = complete(displacement, confidence)
+            store.append(displacement)
+            values.append(statistics(displacement, confidence))
             names.append(f"{subject.name}, {mesh.name}")
-            of.append(subject.name)
+            owners.append(subject.name)
             labels.append(mesh.label)
-    kept, rejected = np.arange(len(names)), list[Rejected]()
-    while len(kept) and (out := spoiled(np.stack(figures)[kept], "the neutral", settings.alignment)):
-        rejected.append(Rejected(name=names[kept[out[0]]], reason=out[1]))
-        kept = np.delete(kept, out[0])
-    counts = Counter(of[k] for k in kept)
+    kept, rejected = np.arange(len(names)), list[RejectedSubject]()
+    while len(kept) and (outlier := find_outlier(np.stack(values)[kept], "the neutral", recipe.alignment)):
+        index, reason = outlier
+        rejected.append(RejectedSubject(name=names[kept[index]], reason=reason))
+        kept = np.delete(kept, index)
+    counts = Counter(owners[k] for k in kept)
     weights = np.zeros(len(names))
-    weights[kept] = [1 / counts[of[k]] for k in kept]
-    return _Samples(subjects=tuple(of), labels=tuple(labels), weights=weights, rejected=tuple(rejected), filled=filled)
+    weights[kept] = [1 / counts[owners[k]] for k in kept]
+    return _TrainingSamples(
+        subjects=tuple(owners),
+        labels=tuple(labels),
+        weights=weights,
+        rejected=tuple(rejected),
+        completed=completed,
+    )
 
 
-def _with_identity(previous: GNMData, head: HeadIdentity) -> GNMData:
-    """The previous model with another head: template, identity, joints; each field in its own type."""
-    kept = identity.carried(previous)
-    regressor = joints.rebuilt(previous)
+def _with_identity(previous: GNMData, head: IdentityBasis) -> GNMData:
+    """The previous model with another template, identity basis and joints."""
+    transferred = identity.transfer_components(previous)
+    regressor = joints.rebuild_regressor(previous)
     joint_basis = np.einsum("jv,kvc->kjc", regressor, head.basis, optimize=True)
-    names = [f"head_{k:03d}" for k in range(len(head.basis))] + previous.identity_names[kept].tolist()
-    return _replaced(
+    names = [f"head_{k:03d}" for k in range(len(head.basis))] + previous.identity_names[transferred].tolist()
+    return _replace_arrays(
         previous,
         template_vertex_positions=head.template,
         template_joint_positions=regressor @ head.template,
-        vertex_identity_basis=np.concatenate([head.basis, previous.vertex_identity_basis[kept]]),
-        joint_identity_basis=np.concatenate([joint_basis, previous.joint_identity_basis[kept]]),
+        vertex_identity_basis=np.concatenate([head.basis, previous.vertex_identity_basis[transferred]]),
+        joint_identity_basis=np.concatenate([joint_basis, previous.joint_identity_basis[transferred]]),
         identity_names=np.array(names),
         joint_regressor=regressor,
     )
 
 
-def _with_expressions(data: GNMData, bases: Mapping[str, Region], found: Coefficients) -> GNMData:
-    kept = expression.carried(data)
-    names = [*found.names, *data.expression_names[kept].tolist()]
-    basis = np.concatenate([*(region.basis for region in bases.values()), data.expression_basis[kept]])
-    return _replaced(data, expression_basis=basis, expression_names=np.array(names))
+def _with_expressions(data: GNMData, bases: Mapping[str, RegionBasis], coefficients: CoefficientStatistics) -> GNMData:
+    """The model with another expression basis."""
+    transferred = expression.transfer_components(data)
+    names = [*coefficients.names, *data.expression_names[transferred].tolist()]
+    basis = np.concatenate([*(region.basis for region in bases.values()), data.expression_basis[transferred]])
+    return _replace_arrays(data, expression_basis=basis, expression_names=np.array(names))
 
 
-def _replaced(data: GNMData, **arrays: np.ndarray) -> GNMData:
-    numbers: dict[str, Any] = {
+def _replace_arrays(data: GNMData, **arrays: np.ndarray) -> GNMData:
+    """The model with other arrays, each in the field's own numeric type."""
+    converted: dict[str, Any] = {
         name: array if array.dtype.kind == "U" else array.astype(getattr(data, name).dtype)
         for name, array in arrays.items()
     }
-    return replace(data, **numbers)
+    return replace(data, **converted)

@@ -1,42 +1,50 @@
-"""Meshes kept on disk between passes: as many as there are, in the memory of a few."""
+"""Displacements on disk between passes: any number of meshes in the memory of a few."""
 
 import tempfile
 from collections.abc import Iterator
+from pathlib import Path
 from types import TracebackType
 
 import numpy as np
 from jaxtyping import Float
 
-_BLOCK = 64  # meshes read at once
 
+class DisplacementStore:
+    """Displacements of one topology in a temporary NPY file, float32; appended, and read any number of times.
 
-class Spool:
-    """Displacements of one topology in a temporary file, float32; written once, read several times.
-
-    A context manager: the file is gone afterwards. It takes 12 bytes a vertex and mesh.
+    A context manager that deletes the file on exit. The file has 12 bytes a vertex and mesh.
     """
 
-    def __init__(self, vertices: int):
-        self._shape = (vertices, 3)
-        self._file = tempfile.TemporaryFile(prefix="gnmreg-")
+    def __init__(self, capacity: int, vertices: int):
+        """Reserve the file.
+
+        Args:
+            capacity: number of meshes, at most.
+            vertices: of every mesh.
+        """
+        self._folder = tempfile.TemporaryDirectory(prefix="gnmreg-")
+        file = Path(self._folder.name) / "displacements.npy"
+        shape = (max(capacity, 1), vertices, 3)  # an empty file cannot be mapped
+        self._array = np.lib.format.open_memmap(file, mode="w+", dtype=np.float32, shape=shape)
         self.count = 0
 
-    def __enter__(self) -> "Spool":
+    def __enter__(self) -> "DisplacementStore":
         return self
 
     def __exit__(self, kind: type | None, error: BaseException | None, trace: TracebackType | None) -> None:
-        self._file.close()
+        del self._array
+        self._folder.cleanup()
 
     def append(self, displacement: Float[np.ndarray, "V 3"]) -> None:
-        if displacement.shape != self._shape:
-            raise ValueError(f"{displacement.shape} in a spool of {self._shape}")
-        self._file.seek(0, 2)
-        self._file.write(np.ascontiguousarray(displacement, np.float32).tobytes())
+        """Add one mesh, metres.
+
+        Raises:
+            ValueError: another number of vertices, or more meshes than the capacity.
+        """
+        if displacement.shape != self._array.shape[1:] or self.count == len(self._array):
+            raise ValueError(f"{displacement.shape} as number {self.count} in a store of {self._array.shape}")
+        self._array[self.count] = displacement
         self.count += 1
 
     def __iter__(self) -> Iterator[Float[np.ndarray, "V 3"]]:
-        size = 4 * self._shape[0] * 3
-        for first in range(0, self.count, _BLOCK):
-            self._file.seek(first * size)
-            block = self._file.read(min(_BLOCK, self.count - first) * size)
-            yield from np.frombuffer(block, np.float32).reshape(-1, *self._shape)
+        yield from self._array[: self.count]

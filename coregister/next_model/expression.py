@@ -1,12 +1,13 @@
-"""Expression basis by region: uncentred principal components under soft masks [GNM, Head Expression]."""
+"""Expression basis by region: uncentred principal components under soft masks [GNM, Head Expression];
+docs/algorithms.md, "Expression basis"."""
 
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float, Int
 
-from coregister.next_model.shrinkage import Mixed
+from coregister.next_model.shrinkage import ShrunkCovariance
 from coregister.region_masks import FLIP, REGIONS, mirrored, regional_masks
 from registration.geometry import pca
 from registration.geometry.rigid import fit_twists, motion_fields
@@ -16,30 +17,38 @@ from registration.model.gnm_npz import GNMData
 
 
 @dataclass(frozen=True, kw_only=True)
-class Expressions:
-    """What the regional bases are made of."""
+class ExpressionSettings:
+    """Settings of the regional expression bases.
 
-    share: float = 0.99  # of each region's energy, kept
-    most: Mapping[str, int] | None = None  # components by region, of `REGIONS` but the right eye's
-    previous: float = 0.0  # of the energy, from the previous model
-    both_eyes: bool = True  # the right eye's samples, mirrored, are the left eye's too
-    by_area: bool = False  # vertices count by their area instead of alike
+    Attributes:
+        variance_ratio: fraction of each region's energy that its components must explain, at least.
+        max_components: by region, of `REGIONS` but the right eye's, which mirrors the left; None: as many as needed.
+        shrinkage: fraction of the energy from the previous model, 0 to 1.
+        both_eyes: the right eye's samples, mirrored, are samples of the left eye too.
+        by_area: weight vertices by area instead of equally.
+    """
+
+    variance_ratio: float = 0.99
+    max_components: Mapping[str, int] | None = None
+    shrinkage: float = 0.0
+    both_eyes: bool = True
+    by_area: bool = False
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Region:
+class RegionBasis:
     """K components of one region; metres, the model's frame."""
 
     basis: Float[np.ndarray, "K V 3"]
-    energy: Float[np.ndarray, "K"]  # of skin, in the lower face of lower teeth too, m^2 summed over coordinates
-    share: float  # of the region's energy, kept
-    previous: float  # share of it that is the previous model's
+    energy: Float[np.ndarray, "K"]  # of the skin, in the lower face of the lower teeth too; m^2 summed over coordinates
+    variance_ratio: float  # of the region's energy, that the components explain
+    shrinkage: float  # as used
     method: str  # of the principal components
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Coefficients:
-    """How coefficients of the regional components are spread over the samples, subjects balanced."""
+class CoefficientStatistics:
+    """Mean and covariance of the regional components' coefficients over the samples, subjects balanced."""
 
     names: tuple[str, ...]
     mean: Float[np.ndarray, "E"]
@@ -50,38 +59,52 @@ def regional_bases(
     displacements: Iterable[Float[np.ndarray, "V 3"]],
     weights: Float[np.ndarray, "S"],
     data: GNMData,
-    settings: Expressions | None = None,
+    settings: ExpressionSettings | None = None,
     memory_gb: float = 4.0,
-) -> dict[str, Region]:
-    """By name of `REGIONS`: X_r = X * S_r, uncentred; the right eye mirrors the left; the jaw takes the tongue along.
+) -> dict[str, RegionBasis]:
+    """Return the bases of all `REGIONS`: principal components of S_r x, uncentred, with the soft mask S_r.
 
-    `displacements` of expressions from their neutrals, in the frame of the model `data`, whose template is the new one
-    and whose expression basis the previous; read several times. Their skin counts, and in the lower face their lower
-    teeth ("the motion of the jaw together with the lower teeth", [GNM, Head Expression]). `weights` balance subjects.
+    The right eye's basis mirrors the left eye's. The lower face's samples contain the lower teeth ("the motion of the
+    jaw together with the lower teeth", [GNM, Head Expression]), and the other parts of the jaw follow them.
+
+    Args:
+        displacements: S expressions minus their neutrals, metres, in the frame of `data`; read several times.
+        weights: of the samples, which balance subjects.
+        data: a model with the new template and the previous expression basis.
+        settings: of the bases.
+        memory_gb: available for one covariance matrix, or for what replaces it.
     """
-    settings = settings or Expressions()
+    settings = settings or ExpressionSettings()
     masks, mirror = dict(zip(REGIONS, regional_masks(data), strict=True)), data.mirror_indices
     masks["lower_face_region"] = masks["lower_face_region"] + regions.lower_teeth(data)
-    found: dict[str, Region] = {}
+    bases: dict[str, RegionBasis] = {}
     for name, mask in masks.items():
         if name == "right_eye_region":
-            left = found["left_eye_region"]
-            found[name] = Region(**{**vars(left), "basis": mirrored(left.basis, mirror)})
-        else:
-            both = settings.both_eyes and name == "left_eye_region"
-            found[name] = _region(displacements, weights, data, mask, name, both, settings, memory_gb)
-    lower = found["lower_face_region"].basis
+            left = bases["left_eye_region"]
+            bases[name] = replace(left, basis=mirrored(left.basis, mirror))
+            continue
+        rows = np.flatnonzero(mask > 0)
+        vertex_scales = _vertex_scales(data, rows, settings.by_area)
+        both = settings.both_eyes and name == "left_eye_region"
+        samples = _MaskedSamples(
+            displacements, rows, mask[rows, None] * vertex_scales, data.mirror_indices if both else None
+        )
+        most = None if settings.max_components is None else settings.max_components.get(name)
+        sample_weights = np.repeat(weights, 2) if both else weights
+        bases[name] = _region_basis(samples, sample_weights, vertex_scales, data, settings, most, memory_gb)
+    lower = bases["lower_face_region"].basis
     parts = regions.jaw_parts(data)
-    lower[:, parts] = with_jaw(lower, data)[:, parts]
-    return {name: found[name] for name in REGIONS}
+    lower[:, parts] = jaw_motion(lower, data)[:, parts]
+    return {name: bases[name] for name in REGIONS}
 
 
-def with_jaw(basis: Float[np.ndarray, "K V 3"], data: GNMData) -> Float[np.ndarray, "K V 3"]:
-    """The motion w x p + t of the lower teeth in each component, everywhere: linear in the coefficient, as a full turn
-    would not be (docs/algorithms.md, "Placement of teeth and tongue").
+def jaw_motion(basis: Float[np.ndarray, "K V 3"], data: GNMData) -> Float[np.ndarray, "K V 3"]:
+    """Return the motion w x p + t of the lower teeth in each component, at every vertex; metres.
 
-    [GNM, Initial Placement of Teeth and Tongue] places teeth by the skin of chin and lower lip while their own motion
-    is unknown. That measures it badly: when MakeHuman's open jaw moves the lower teeth by 22 mm, the chin misses 4 mm.
+    Linear in the coefficient, which a finite rotation would not be (docs/algorithms.md, "Placement of teeth and
+    tongue"). [GNM, Initial Placement of Teeth and Tongue] places teeth by the skin of chin and lower lip while their
+    own motion is unknown; that is inaccurate: MakeHuman's open jaw moves the lower teeth by 22 mm, and the motion of
+    the chin differs by 4 mm.
     """
     points = data.template_vertex_positions.astype(np.float64)
     area = vertex_areas(points, data.triangles) * regions.lower_teeth(data)
@@ -89,59 +112,49 @@ def with_jaw(basis: Float[np.ndarray, "K V 3"], data: GNMData) -> Float[np.ndarr
     return np.tensordot(fit_twists(basis, points, area), motion_fields(points), 1)
 
 
-def carried(data: GNMData) -> Int[np.ndarray, "_"]:
-    """Expression components of the previous model in which no skin moves: of the tongue and the pupils."""
+def transfer_components(data: GNMData) -> Int[np.ndarray, "_"]:
+    """Return the previous model's expression components that move no skin: the tongue's and the pupils'."""
     skin = regions.skin(data)
     return np.flatnonzero(np.abs(data.expression_basis[:, skin]).max(axis=(1, 2), initial=0) == 0)
 
 
-def coefficients(
+def coefficient_statistics(
     displacements: Iterable[Float[np.ndarray, "V 3"]],
     weights: Float[np.ndarray, "S"],
-    bases: Mapping[str, Region],
+    bases: Mapping[str, RegionBasis],
     data: GNMData,
-) -> Coefficients:
-    """Of each sample by least squares over the skin, all regions at once: their bases are not orthogonal."""
+) -> CoefficientStatistics:
+    """Return mean and covariance of the samples' coefficients.
+
+    Coefficients are least-squares solutions over the skin for all regions at once, since bases are not orthogonal.
+
+    Args:
+        displacements: S expressions minus their neutrals, metres.
+        weights: of the samples.
+        bases: of `regional_bases`.
+        data: a model of their topology.
+    """
     skin = regions.skin(data)
     flat = np.concatenate([region.basis[:, skin].reshape(len(region.basis), -1) for region in bases.values()])
     inverse = np.linalg.pinv(flat @ flat.T, rcond=1e-12, hermitian=True)
     rows = np.stack([inverse @ (flat @ sample[skin].ravel()) for sample in displacements])
-    share = weights / weights.sum()
-    mean = share @ rows
-    away = (rows - mean) * np.sqrt(share)[:, None]
+    fractions = weights / weights.sum()
+    mean = fractions @ rows
+    deviations = (rows - mean) * np.sqrt(fractions)[:, None]
     names = tuple(f"{name}_{k:03d}" for name, region in bases.items() for k in range(len(region.basis)))
-    return Coefficients(names=names, mean=mean, covariance=away.T @ away)
+    return CoefficientStatistics(names=names, mean=mean, covariance=deviations.T @ deviations)
 
 
-def _region(
-    displacements: Iterable[Float[np.ndarray, "V 3"]],
-    weights: Float[np.ndarray, "S"],
-    data: GNMData,
-    mask: Float[np.ndarray, "V"],
-    name: str,
-    both: bool,
-    settings: Expressions,
-    memory_gb: float,
-) -> Region:
-    rows = np.flatnonzero(mask > 0)
-    root = np.ones(len(rows))
-    if settings.by_area:
-        area = vertex_areas(data.template_vertex_positions, data.triangles)[rows]
-        root = np.sqrt(np.maximum(area, 0.01 * area.mean()) / area.mean())
-    scale = (mask[rows] * root)[:, None]
-    samples = _Masked(displacements, rows, scale, data.mirror_indices if both else None)
-    own = np.repeat(weights, 2) if both else weights
-    previous = (data.expression_basis[:, rows].astype(np.float64) * scale).reshape(-1, scale.size * 3)
-    stream = Mixed(samples, own, float(own.sum()), previous, settings.previous)
-    most = None if settings.most is None else settings.most.get(name)
-    found = pca.principal_components(stream, centred=False, share=settings.share, most=most, memory_gb=memory_gb)
-    basis = np.zeros((len(found.variance), *data.template_vertex_positions.shape))
-    basis[:, rows] = found.components.reshape(len(basis), len(rows), 3) / root[:, None]
-    return Region(basis=basis, energy=found.variance, share=found.share, previous=stream.share, method=found.method)
+def _vertex_scales(data: GNMData, rows: Int[np.ndarray, "R"], by_area: bool) -> Float[np.ndarray, "R 1"]:
+    """Square roots of the vertices' weights in the components."""
+    if not by_area:
+        return np.ones((len(rows), 1))
+    area = vertex_areas(data.template_vertex_positions, data.triangles)[rows]
+    return np.sqrt(np.maximum(area, 0.01 * area.mean()) / area.mean())[:, None]
 
 
-class _Masked:
-    """One region's part of every sample, and with `mirror` of its mirror image after it."""
+class _MaskedSamples:
+    """One region's rows of every sample, scaled; with `mirror` each sample is followed by its mirror image."""
 
     def __init__(
         self,
@@ -150,11 +163,37 @@ class _Masked:
         scale: Float[np.ndarray, "R 1"],
         mirror: Int[np.ndarray, "V"] | None,
     ):
-        self._displacements, self._rows, self._scale = displacements, rows, scale
-        self._twins = None if mirror is None else mirror[rows]
+        self._displacements, self.rows, self.scale = displacements, rows, scale
+        self._mirror_rows = None if mirror is None else mirror[rows]
 
     def __iter__(self) -> Iterator[Float[np.ndarray, "D"]]:
         for displacement in self._displacements:
-            yield (displacement[self._rows] * self._scale).ravel()
-            if self._twins is not None:
-                yield (displacement[self._twins] * FLIP * self._scale).ravel()
+            yield (displacement[self.rows] * self.scale).ravel()
+            if self._mirror_rows is not None:
+                yield (displacement[self._mirror_rows] * FLIP * self.scale).ravel()
+
+
+def _region_basis(
+    samples: _MaskedSamples,
+    weights: Float[np.ndarray, "S"],
+    vertex_scales: Float[np.ndarray, "R 1"],
+    data: GNMData,
+    settings: ExpressionSettings,
+    max_components: int | None,
+    memory_gb: float,
+) -> RegionBasis:
+    rows, size = samples.rows, 3 * len(samples.rows)
+    previous = (data.expression_basis[:, rows].astype(np.float64) * samples.scale).reshape(-1, size)
+    covariance = ShrunkCovariance(samples, weights, float(weights.sum()), previous, settings.shrinkage)
+    principal = pca.principal_components(
+        covariance, centred=False, share=settings.variance_ratio, most=max_components, memory_gb=memory_gb
+    )
+    basis = np.zeros((len(principal.variance), *data.template_vertex_positions.shape))
+    basis[:, rows] = principal.components.reshape(len(basis), len(rows), 3) / vertex_scales
+    return RegionBasis(
+        basis=basis,
+        energy=principal.variance,
+        variance_ratio=principal.share,
+        shrinkage=covariance.shrinkage,
+        method=principal.method,
+    )

@@ -1,7 +1,5 @@
-"""How a model came about: its manifest, and the files beside the model file."""
+"""Provenance of a built model: its manifest, and the files beside the model file (docs/formats.md, "Built models")."""
 
-import json
-import os
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -11,145 +9,175 @@ from typing import Any
 import numpy as np
 
 from coregister.next_model import eyelids
-from coregister.next_model.alignment import Aligned, Rejected
-from coregister.next_model.expression import Coefficients, Region
-from coregister.next_model.identity import HeadIdentity
-from coregister.next_model.training_data import Survey
+from coregister.next_model.alignment import AlignedNeutrals, RejectedSubject
+from coregister.next_model.expression import CoefficientStatistics, RegionBasis
+from coregister.next_model.identity import IdentityBasis
+from coregister.next_model.recipes import ModelRecipe
+from coregister.next_model.training_data import TrainingSet
+from coregister.tag_groups import tag_group
 from registration.frames import MM_PER_M
 from registration.model import gnm_npz, landmarks
 from registration.model.gnm_npz import GNMData
 from registration.stabilize.subject_meshes import SkullSkin
 from registration.storage import hashing
+from registration.storage.files import atomic_file, write_json
 
 KIND = "gnm-model"
 SCHEMA = 1
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Origin:
-    """All that a manifest tells about. M expressions came in."""
+class BuildInputs:
+    """Data and intermediate results of a build that its manifest describes. M expressions."""
 
-    found: Survey
-    aligned: Aligned
-    head: HeadIdentity
-    bases: Mapping[str, Region]  # of expressions; empty: the previous model's are kept
+    training: TrainingSet
+    aligned: AlignedNeutrals
+    head: IdentityBasis
+    bases: Mapping[str, RegionBasis]  # of expressions; empty: the previous model's basis is kept
     expression_subjects: Sequence[str]  # M
     expression_labels: Sequence[str]  # M
-    expression_weights: np.ndarray  # M; 0: left out
-    rejected: Sequence[Rejected]
-    filled: Mapping[str, int]  # neutrals and expressions of which some skin was not seen
+    expression_weights: np.ndarray  # M; 0: excluded
+    rejected: Sequence[RejectedSubject]
+    completed: Mapping[str, int]  # "neutrals", "expressions" -> number with missing data
+    categories: Mapping[str, str] | None  # permitted label -> category; None: any label
 
 
-def manifest(
-    origin: Origin, previous: GNMData, data: GNMData, config: Any, categories: Mapping[str, str] | None
-) -> dict[str, Any]:
-    """JSON values; its entries are described in docs/formats.md."""
-    found, head, aligned = origin.found, origin.head, origin.aligned
-    inputs = {**found.digests, "previous": gnm_npz.content_hash(previous)}
-    settings = hashing.to_jsonable(config)
-    used = np.flatnonzero(origin.expression_weights > 0).tolist()
-    labels = [origin.expression_labels[k] for k in used]
-    counted = Counter(origin.expression_subjects[k] for k in used)
-    names = [found.subjects[k] for k in aligned.kept]
-    subjects = [
+def build_manifest(inputs: BuildInputs, previous: GNMData, data: GNMData, recipe: ModelRecipe) -> dict[str, Any]:
+    """Return the manifest of a built model as JSON values.
+
+    Args:
+        inputs: of the build.
+        previous: the model that it started from.
+        data: the built model.
+        recipe: the resolved settings.
+    """
+    digests = {**inputs.training.digests, "previous": gnm_npz.content_hash(previous)}
+    config = {**hashing.to_jsonable(recipe), "categories": inputs.categories}
+    manifest: dict[str, Any] = hashing.to_jsonable(
         {
-            "subject": name,
-            "tags": found.tags[k],
-            "expressions": counted[name],
-            "weight_of_each": 1 / counted[name] if counted[name] else 0.0,
-            "residual_mm": residual,
+            "kind": KIND,
+            "schema": SCHEMA,
+            "content_id": gnm_npz.content_hash(data),
+            "input_hash": hashing.input_hash(digests, config),
+            "inputs": digests,
+            "config": config,
+            "versions": hashing.versions(),
+            "subjects": _subjects(inputs),
+            "rejected": [vars(rejected) for rejected in inputs.rejected],
+            "filled": inputs.completed,
+            "alignment": {"rounds": inputs.aligned.iterations},
+            "identity": _identity(inputs.head, data),
+            "expression": {name: _components(region, region.energy) for name, region in inputs.bases.items()}
+            or "the previous model's: there are no expressions",
+            **_counts(inputs),
+            "figures": _metrics(inputs.head, previous, data),
         }
-        for name, k, residual in zip(names, aligned.kept, aligned.residual_mm, strict=True)
-    ]
-    expressions = {name: _told(region, region.energy) for name, region in origin.bases.items()}
-    told = {
-        "kind": KIND,
-        "schema": SCHEMA,
-        "content_id": gnm_npz.content_hash(data),
-        "input_hash": hashing.input_hash(inputs, settings),
-        "inputs": inputs,
-        "config": settings,
-        "versions": hashing.versions(),
-        "subjects": subjects,
-        "rejected": [vars(one) for one in origin.rejected],
-        "filled": origin.filled,
-        "alignment": {"rounds": aligned.rounds},
-        "identity": {
-            **_told(head, head.variance),
-            "samples": 2 * head.heads if head.mirrored else head.heads,
-            "weight_of_each": 0.5 if head.mirrored else 1.0,
-            "shares_tried_mm": {f"{share:.2f}": MM_PER_M * rms for share, rms in head.tried.items()},
-            "carried": data.identity_names[len(head.basis) :],
-        },
-        "expression": expressions or "the previous model's: there are no expressions",
-        "labels": dict(sorted(Counter(labels).items())),
-        "categories": dict(sorted(Counter((categories or {}).get(label, label) for label in labels).items())),
-        "demographics": _demographics([found.tags[k] for k in aligned.kept]),
-        "figures": _figures(head, previous, data),
-    }
-    plain: dict[str, Any] = hashing.to_jsonable(told)
-    return plain
+    )
+    return manifest
 
 
 def write(
     data: GNMData,
     manifest: Mapping[str, Any],
-    coefficients: Coefficients | None,
+    coefficients: CoefficientStatistics | None,
     path: Path,
     previous: Path,
 ) -> None:
-    """Writes the model file and, beside it, landmark schemes of the previous model, `NAME.manifest.json` and
-    `NAME.expressions.npz` (`names`, `mean`, `covariance` of the regional coefficients). The model file comes last.
+    """Write the model file and, beside it, the previous model's landmark schemes, `NAME.manifest.json` and
+    `NAME.expressions.npz`. The model file is written last.
 
-    Raises InputError for data that is no GNM model.
+    Args:
+        data: the model.
+        manifest: of `build_manifest`.
+        coefficients: of the regional expression components; None: no file.
+        path: of the model file, NAME.npz.
+        previous: the previous model's file.
+
+    Raises:
+        InputError: the data is no GNM model.
     """
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     for scheme in landmarks.schemes_beside(previous, len(data.template_vertex_positions)).values():
         landmarks.write_scheme(scheme, path)
     if coefficients is not None:
-        beside = path.with_name(f".{path.stem}.{os.getpid()}.npz")
         arrays = {"mean": coefficients.mean, "covariance": coefficients.covariance}
-        np.savez(beside, allow_pickle=False, names=np.array(coefficients.names), **arrays)
-        os.replace(beside, path.with_name(f"{path.stem}.expressions.npz"))
-    beside = path.with_name(f".{path.stem}.{os.getpid()}.json")
-    beside.write_text(json.dumps(manifest, indent=1, allow_nan=False) + "\n", encoding="utf-8")
-    os.replace(beside, path.with_name(f"{path.stem}.manifest.json"))
+        with atomic_file(path.with_name(f"{path.stem}.expressions.npz")) as temporary:
+            np.savez(temporary, allow_pickle=False, names=np.array(coefficients.names), **arrays)
+    write_json(path.with_name(f"{path.stem}.manifest.json"), manifest)
     gnm_npz.write(data, path)
 
 
 def drift_mm(previous: GNMData, data: GNMData) -> float:
-    """rms distance of the stable skin between two models' templates, as they lie."""
+    """Return the rms distance between two models' templates over the stable skin, mm, without alignment."""
     stable = SkullSkin.of(previous).area
-    away = data.template_vertex_positions.astype(np.float64) - previous.template_vertex_positions
-    return float(MM_PER_M * np.sqrt((away**2).sum(1) @ stable / stable.sum()))
+    difference = data.template_vertex_positions.astype(np.float64) - previous.template_vertex_positions
+    return float(MM_PER_M * np.sqrt((difference**2).sum(1) @ stable / stable.sum()))
 
 
-def _figures(head: HeadIdentity, previous: GNMData, data: GNMData) -> dict[str, Any]:
-    template = data.template_vertex_positions.astype(np.float64)
-    gap = eyelids.gap_change_mm(eyelids.sockets(data), template, data.vertex_identity_basis[: len(head.basis)])
+def _subjects(inputs: BuildInputs) -> list[dict[str, Any]]:
+    """One entry for every subject in the model."""
+    training, aligned = inputs.training, inputs.aligned
+    used = np.flatnonzero(inputs.expression_weights > 0).tolist()
+    counts = Counter(inputs.expression_subjects[k] for k in used)
+    return [
+        {
+            "subject": (name := training.subjects[k]),
+            "tags": training.tags[k],
+            "expressions": counts[name],
+            "weight_of_each": 1 / counts[name] if counts[name] else 0.0,
+            "residual_mm": residual,
+        }
+        for k, residual in zip(aligned.kept, aligned.residual_mm, strict=True)
+    ]
+
+
+def _identity(head: IdentityBasis, data: GNMData) -> dict[str, Any]:
     return {
-        "drift_mm": drift_mm(previous, data),
-        "lid_gap_change_mm": {"worst": gap.max(initial=0), "median": np.median(gap) if len(gap) else 0.0},
+        **_components(head, head.variance),
+        "samples": 2 * head.head_count if head.mirrored else head.head_count,
+        "weight_of_each": 0.5 if head.mirrored else 1.0,
+        "shares_tried_mm": {f"{p:.2f}": MM_PER_M * rms for p, rms in head.shrinkage_scores.items()},
+        "carried": data.identity_names[len(head.basis) :],
     }
 
 
-def _told(part: HeadIdentity | Region, variance: np.ndarray) -> dict[str, Any]:
+def _components(basis: IdentityBasis | RegionBasis, variance: np.ndarray) -> dict[str, Any]:
     return {
         "components": len(variance),
-        "share_kept": part.share,
-        "share_previous": part.previous,
-        "method": part.method,
+        "share_kept": basis.variance_ratio,
+        "share_previous": basis.shrinkage,
+        "method": basis.method,
         "variance_mm2": MM_PER_M**2 * variance,
     }
 
 
+def _counts(inputs: BuildInputs) -> dict[str, Any]:
+    """Expressions by label and by category, subjects by tag."""
+    used = np.flatnonzero(inputs.expression_weights > 0).tolist()
+    labels = [inputs.expression_labels[k] for k in used]
+    categories = inputs.categories or {}
+    return {
+        "labels": dict(sorted(Counter(labels).items())),
+        "categories": dict(sorted(Counter(categories.get(label, label) for label in labels).items())),
+        "demographics": _demographics([inputs.training.tags[k] for k in inputs.aligned.kept]),
+    }
+
+
 def _demographics(tags: Iterable[Mapping[str, Any]]) -> dict[str, dict[str, int]]:
-    """Tag -> value -> subjects; ages by decade."""
+    """Tag -> group -> number of subjects."""
     counts: dict[str, Counter[str]] = {}
-    for of in tags:
-        for name, value in of.items():
-            decade = isinstance(value, (int, float)) and not isinstance(value, bool)
-            told = f"{10 * int(value // 10)}-{10 * int(value // 10) + 9}" if decade else str(value)
-            counts.setdefault(name, Counter())[told] += 1
-    return {name: dict(sorted(count.items())) for name, count in sorted(counts.items())}
+    for subject_tags in tags:
+        for name, value in subject_tags.items():
+            counts.setdefault(name, Counter())[tag_group(value)] += 1
+    return {name: dict(sorted(groups.items())) for name, groups in sorted(counts.items())}
+
+
+def _metrics(head: IdentityBasis, previous: GNMData, data: GNMData) -> dict[str, Any]:
+    template = data.template_vertex_positions.astype(np.float64)
+    basis = data.vertex_identity_basis[: len(head.basis)]
+    change = eyelids.gap_change_mm(eyelids.eyelid_rims(data), template, basis)
+    return {
+        "drift_mm": drift_mm(previous, data),
+        "lid_gap_change_mm": {"worst": change.max(initial=0), "median": np.median(change) if len(change) else 0.0},
+    }

@@ -5,12 +5,15 @@ A recipe is a function that returns its stages; the resolved values are saved wi
 
 import importlib
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from registration.errors import InputError
+
+T = TypeVar("T")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -220,29 +223,51 @@ def named_recipe(name: str) -> str:
 
 
 def load_recipe(recipe: str | Recipe) -> Recipe:
-    """Return the recipe of a name or import path.
+    """Return the recipe of a name or import path (`load_named`).
 
     Args:
-        recipe: a key of `RECIPES`; `module:function`, the import path of a function without parameters that returns
-            a Recipe, looked up in the working directory too; or a Recipe, which is returned as it is.
+        recipe: a key of `RECIPES`, an import path, or a Recipe.
 
     Raises:
-        InputError: an unknown name, a module or function that cannot be imported or fails, or a result that is not a
-            Recipe.
+        InputError: as `load_named`.
     """
-    if isinstance(recipe, Recipe):
+    return load_named(recipe, RECIPES, Recipe, title="recipe")
+
+
+def load_named(recipe: str | T, table: Mapping[str, Callable[[], T]], type_: type[T], *, title: str) -> T:
+    """Return the settings of a name or import path.
+
+    Args:
+        recipe: a key of `table`; `module:function`, the import path of a function without parameters that returns
+            settings, looked up in the working directory too; or settings, which are returned as they are.
+        table: name -> function.
+        type_: of the settings.
+        title: what messages call them.
+
+    Raises:
+        InputError: an unknown name, a module or function that cannot be imported or fails, or a result of another type.
+    """
+    if isinstance(recipe, type_):
         return recipe
-    if recipe in RECIPES:
-        return RECIPES[recipe]()
-    module, _, function = recipe.partition(":")
+    name = str(recipe)
+    if name in table:
+        return table[name]()
+    invalid = partial(
+        InputError,
+        f"There is no such {title}",
+        where=title,
+        expected=f"{', '.join(table)}, or module:function of a function that returns a {type_.__name__}",
+        fix="choose one by name, or correct the import path",
+    )
+    module, _, function = name.partition(":")
     if not (module and function):
-        raise _recipe_error(recipe, got=f"the name {recipe}")
+        raise invalid(got=f"the name {name}")
     try:
         loaded = _import(module, function)()
     except Exception as error:  # the module is the user's: anything may go wrong
-        raise _recipe_error(recipe, got=f"{type(error).__name__}: {error}") from error
-    if not isinstance(loaded, Recipe):
-        raise _recipe_error(recipe, got=f"a function that returns {type(loaded).__name__}")
+        raise invalid(got=f"{type(error).__name__}: {error}") from error
+    if not isinstance(loaded, type_):
+        raise invalid(got=f"a function that returns {type(loaded).__name__}")
     return loaded
 
 
@@ -255,13 +280,3 @@ def _import(module: str, function: str) -> Callable[[], Any]:
     finally:
         sys.path.remove(folder)
     return result
-
-
-def _recipe_error(recipe: str, *, got: str) -> InputError:
-    return InputError(
-        "There is no such recipe",
-        where="recipe",
-        expected=f"{', '.join(RECIPES)}, or module:function of a function that returns a Recipe",
-        got=got,
-        fix="choose one by name, or correct the import path",
-    )

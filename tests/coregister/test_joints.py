@@ -20,7 +20,7 @@ def _model(name: str, request: pytest.FixtureRequest) -> gnm_npz.GNMData:
 @pytest.mark.parametrize("name", ["tiny", "first", pytest.param("reconstructed", marks=needs_shared)])
 def test_a_regressor_gives_the_joints_of_random_people(name: str, request: pytest.FixtureRequest):
     model = _model(name, request)
-    found = joints.rebuilt(model)
+    found = joints.rebuild_regressor(model)
     assert found.min() >= 0
     np.testing.assert_allclose(found.sum(1), 1, atol=1e-9)
     twins = {"neck": "neck", "head": "head", "left_eye": "right_eye", "right_eye": "left_eye"}

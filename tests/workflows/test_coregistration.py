@@ -15,6 +15,8 @@ import workflows.steps.evaluate
 import workflows.steps.register
 import workflows.steps.stabilize
 import workflows.steps.subject
+from coregister.next_model.build import build_model
+from coregister.next_model.recipes import DEFAULT_MODEL_RECIPE, load_model_recipe
 from coregister.stopping_rule import Rule
 from registration.errors import InputError
 from registration.model import gnm_npz
@@ -108,16 +110,36 @@ def test_two_rounds_without_those_who_are_held_out(dataset, finds, tmp_path):
     assert record["rounds"][0]["decide"]["registered"] == 6 and record["rounds"][0]["decide"]["failed"] == 0
 
 
+def test_python_builds_the_same_model_from_the_same_registrations(dataset, finds, tmp_path):
+    """`build_model` without a recipe, the step of `gnmreg coregister` without one, and each with the same one."""
+    data, found = gnm_npz.read(MODEL), read_dataset(dataset)
+    contents = {}
+    for name in (DEFAULT_MODEL_RECIPE, "true_meshes"):
+        out = tmp_path / name
+        record = go(dataset, out, rule=Rule(rounds=1), model_recipe=name)
+        run = out / "it00" / "registrations"
+        names = record["plan"]["split"]["training"]
+        tags = {subject: found.tags(subject) for subject in names}
+        subjects = Registered(run=run, names=names, model=data, steady=run / "stabilized", tags=tags)
+        recipe = None if name == DEFAULT_MODEL_RECIPE else load_model_recipe(name)
+        built = build_model(subjects, data, recipe, categories=found.categories)
+        manifest = json.loads((out / "it00/model/gnm_head.manifest.json").read_text())
+        assert built.manifest == manifest and manifest["content_id"] == record["rounds"][0]["build"]["content_id"]
+        assert manifest["config"]["name"] == name
+        contents[name] = manifest["content_id"]
+    assert contents[DEFAULT_MODEL_RECIPE] != contents["true_meshes"]
+
+
 @pytest.mark.parametrize("where", ["registering", "building", "evaluating"])
 def test_a_killed_loop_goes_on_without_computing_anything_twice(dataset, finds, tmp_path, monkeypatch, where):
     out, built = tmp_path / "out", []
     real, evaluated = workflows.steps.build.build_model, workflows.steps.evaluate.evaluate_models
 
-    def build(*arguments):
+    def build(*arguments, **options):
         built.append(1)
         if where == "building" and len(built) == 2:
             raise KeyboardInterrupt
-        return real(*arguments)
+        return real(*arguments, **options)
 
     def evaluate(*arguments, **options):
         if where == "evaluating" and len(built) == 2 and not stopped:

@@ -17,6 +17,9 @@ class RoundOptions:
         iterations: Maximum number of rounds. Fewer are computed if another one is not expected to improve the
             model.
         all_iterations: Compute all rounds, unless too many captures fail.
+        model_recipe: Settings of model building. few_registrations: vertices weighted by area, covariance shrinkage
+            towards the previous model chosen by cross-validation. true_meshes: for meshes in exact correspondence.
+            Or the import path of a function that returns a ModelRecipe, as in my_module:my_recipe.
         held_out: Subjects to evaluate models on: a fraction of them such as 0.2, or a file with one subject
             folder's name on each line.
         components: Numbers of identity components to evaluate models with; the largest is compared between rounds.
@@ -24,6 +27,7 @@ class RoundOptions:
 
     iterations: Annotated[int, arg(metavar="K")] = 3
     all_iterations: bool = False
+    model_recipe: Annotated[str, arg(metavar="NAME|MODULE:FUNCTION")] = "few_registrations"
     held_out: Annotated[
         str | None,
         arg(metavar="FRACTION|FILE", help_behavior_hint="(default: neutrals tagged held_out, otherwise 0.2)"),
@@ -69,6 +73,7 @@ def coregister(
         model_path=model,
         out=out,
         recipe=fit.recipe,
+        model_recipe=rounds.model_recipe,
         held_out=_fraction_or_file(rounds.held_out),
         seed=fit.seed,
         views=fit.views,

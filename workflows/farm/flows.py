@@ -84,6 +84,7 @@ async def coregister(scope: "FlowScope", *, plan: str, variant: str = "llvm") ->
             dataset=told["dataset"],
             previous=model,
             out=f"{out}/{name}/model",
+            recipe=told["model_recipe"],
         )
         model = built["model"]
         models[f"model {number + 1}"] = model

@@ -5,13 +5,13 @@ from functools import partial
 from pathlib import Path
 
 from coregister.evaluate.linear_fit import identity_part
+from coregister.next_model.recipes import DEFAULT_MODEL_RECIPE, load_model_recipe
 from coregister.stopping_rule import Rule
 from registration.errors import InputError
 from registration.fit.recipes import named_recipe
 from registration.model import gnm_npz
 from workflows.records.coregistration import Plan, check_out
 from workflows.records.dataset import read_dataset, split
-from workflows.steps.build import builder
 
 COMPONENTS = (5, 10, 20, 40)  # that models are measured with, unless others are asked for
 
@@ -22,6 +22,7 @@ def make_plan(
     model_path: Path,
     out: Path,
     recipe: str = "draft",
+    model_recipe: str = DEFAULT_MODEL_RECIPE,
     held_out: float | Path | None = None,
     seed: int = 0,
     views: int | None = None,
@@ -34,6 +35,7 @@ def make_plan(
     Args:
         dataset: a folder of subject folders, each of capture folders.
         model_path: the first model, with its landmark schemes beside it.
+        model_recipe: name or import path of the settings of model building (`load_model_recipe`).
         held_out: as for `dataset.split`.
         components: numbers that models are measured with, the largest decides; None: COMPONENTS, as far as models go.
         samples: random heads of each model, for specificity; 0: none.
@@ -49,6 +51,7 @@ def make_plan(
         model=Path(model_path),
         out=Path(out),
         recipe=recipe,
+        model_recipe=load_model_recipe(model_recipe),
         views=views,
         seed=seed,
         components=tuple(components or COMPONENTS),
@@ -72,7 +75,7 @@ def _check(plan: Plan, asked: bool) -> None:
             "The numbers of components are out of order", where="components", expected=expected, got=plan.components
         )
     have = len(identity_part(gnm_npz.read(plan.model)).basis)
-    kept = have if builder().identity.previous != 0 else 0
+    kept = have if plan.model_recipe.identity.shrinkage != 0 else 0
     most = min(have, len(plan.split.training) - 1 + kept)
     if asked and plan.components[-1] > most:
         raise InputError(

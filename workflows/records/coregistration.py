@@ -6,6 +6,7 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
+from coregister.next_model.recipes import ModelRecipe
 from coregister.stopping_rule import Rule
 from registration.errors import InputError
 from registration.model import gnm_npz
@@ -28,6 +29,7 @@ class Plan:
     model: Path
     out: Path
     recipe: str
+    model_recipe: ModelRecipe
     views: int | None
     seed: int
     components: tuple[int, ...]

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float
 
 from coregister.evaluate.evaluation import HeldOut
-from coregister.next_model.training_data import NEUTRAL, Mesh, Subject, onto_unposed, unposed
+from coregister.next_model.training_data import NEUTRAL, TrainingMesh, TrainingSubject, transfer_to_unposed, unpose
 from registration.capture.scan import read_truth
 from registration.model.gnm import GNM
 from registration.model.gnm_npz import GNMData
@@ -51,30 +51,30 @@ class Registered:
         }
         return ids | ({"stabilized": stabilized.read_manifest(self.steady)["content_id"]} if self.steady else {})
 
-    def __iter__(self) -> Iterator[Subject]:
+    def __iter__(self) -> Iterator[TrainingSubject]:
         model, weights = GNM(self.model), SkullSkin.of(self.model).area
         places = _places(self.steady)
         for name, one in self.usable.items():
             neutral = load_registration(self.run / name / one.neutral)
-            bare = unposed(neutral, model)
+            bare = unpose(neutral, model)
             expressions = []
             if self.steady is not None and one.subject in places:
                 found = stabilized.read_subject(self.steady, places[one.subject])
                 sure = weights * neutral.confidence
                 for folder, label, vertices in zip(found.names, found.labels, found.vertices, strict=True):
                     expressions.append(
-                        Mesh(
+                        TrainingMesh(
                             name=folder,
                             label=label,
-                            vertices=onto_unposed(vertices, neutral.vertices, bare, sure),
+                            vertices=transfer_to_unposed(vertices, neutral.vertices, bare, sure),
                             confidence=load_registration(self.run / name / folder).confidence,
                             triangles=neutral.triangles,
                             digest=self.inputs[f"{name}/{folder}"],
                         )
                     )
-            yield Subject(
+            yield TrainingSubject(
                 name=name,
-                neutral=Mesh(
+                neutral=TrainingMesh(
                     name=one.neutral,
                     label=NEUTRAL,
                     vertices=bare,

@@ -2,11 +2,11 @@
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 from coregister.next_model import provenance
-from coregister.next_model.build import Build
-from coregister.next_model.build import build as build_model
-from coregister.next_model.identity import Identity
+from coregister.next_model.build import build_model
+from coregister.next_model.recipes import ModelRecipe
 from registration.errors import InputError
 from registration.model import gnm_npz
 from registration.progress import Progress, Silent
@@ -20,11 +20,6 @@ from workflows.steps.products import STEP, JsonRecord, find_product, json_text
 MODEL, PAGE = "gnm_head.npz", "index.html"
 
 
-def builder(categories: Mapping[str, str] | None = None) -> Build:
-    """The builder's settings: here, and nowhere else. What they are worth: docs/model_building.md."""
-    return Build(identity=Identity(previous=None, by_area=True, share=0.999), categories=categories)
-
-
 def build_next_model(
     *,
     run: str,
@@ -33,24 +28,30 @@ def build_next_model(
     dataset: str,
     previous: str,
     out: str,
+    recipe: Mapping[str, Any],
     progress: Progress | None = None,
 ) -> JsonRecord:
-    """Registrations, stabilized expressions (`steady`) and the previous model -> the folder of the next model.
+    """Build the next model from registrations, stabilized expressions (`steady`) and the previous model.
 
-    Raises InputError as `coregister.next_model.build.build`.
+    `recipe` is that of `ModelRecipe.to_json`.
+
+    Raises:
+        InputError: as `build_model`.
     """
     found, data = read_dataset(Path(dataset)), gnm_npz.read(Path(previous))
     tags = {name: found.tags(name) for name in names}
     place = None if steady is None else Path(steady)
     subjects = Registered(run=Path(run), names=names, model=data, steady=place, tags=tags)
-    settings = builder(found.categories)
+    settings = ModelRecipe.from_json(recipe, where="the job's recipe")
     inputs = {**subjects.inputs, "previous": gnm_npz.content_hash(data)}
-    wanted = hashing.input_hash(inputs, {"settings": hashing.to_jsonable(settings), "tags": tags})
+    wanted = hashing.input_hash(
+        inputs, {"recipe": hashing.to_jsonable(settings), "categories": found.categories, "tags": tags}
+    )
     known = find_product(Path(out), wanted)
     if known is not None and _is_model(Path(out) / MODEL, known["content_id"]):
         return {**known, "model": str(Path(out) / MODEL)}
     (progress or Silent()).note(f"building a model from {len(subjects.usable)} subjects")
-    built = build_model(subjects, data, settings)
+    built = build_model(subjects, data, settings, categories=found.categories)
     told = {
         "input_hash": wanted,
         "model": str(Path(out) / MODEL),

@@ -6,6 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from coregister.next_model.recipes import ModelRecipe
 from coregister.stopping_rule import Round, Rule, decide
 from registration.progress import Progress
 from workflows.pages.coregistration import write_coregistration_page
@@ -90,6 +91,7 @@ def _plan(told: Mapping[str, Any]) -> Plan:
         model=Path(told["model"]),
         out=Path(told["out"]),
         recipe=told["recipe"],
+        model_recipe=ModelRecipe.from_json(told["model_recipe"], where="the plan's model_recipe"),
         views=told["views"],
         seed=told["seed"],
         components=tuple(told["components"]),

@@ -5,7 +5,7 @@ from scipy.spatial.transform import Rotation
 
 from bench.support import performances
 from coregister.first_model.assembly import Anatomy
-from coregister.next_model.training_data import Mesh, Subject
+from coregister.next_model.training_data import TrainingMesh, TrainingSubject
 from registration.model import regions
 from registration.model.gnm_npz import GNMData
 
@@ -33,13 +33,13 @@ def moved(vertices: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     return np.einsum("ncd,nvd->nvc", turns, vertices) + rng.normal(0, 0.03, (len(vertices), 1, 3))
 
 
-def mesh(name: str, vertices: np.ndarray, model: GNMData, confidence: np.ndarray | None = None) -> Mesh:
+def mesh(name: str, vertices: np.ndarray, model: GNMData, confidence: np.ndarray | None = None) -> TrainingMesh:
     sure = np.ones(len(vertices), np.float32) if confidence is None else confidence.astype(np.float32)
     shape = vertices.astype(np.float32)
-    return Mesh(name=name, label=name, vertices=shape, confidence=sure, triangles=model.triangles)
+    return TrainingMesh(name=name, label=name, vertices=shape, confidence=sure, triangles=model.triangles)
 
 
-def people(anatomy: Anatomy, model: GNMData, seeds: range, acts: tuple[str, ...]) -> list[Subject]:
+def people(anatomy: Anatomy, model: GNMData, seeds: range, acts: tuple[str, ...]) -> list[TrainingSubject]:
     """Subjects beyond the first model's span, with expressions of their own strength."""
     found = []
     for seed in seeds:
@@ -47,5 +47,5 @@ def people(anatomy: Anatomy, model: GNMData, seeds: range, acts: tuple[str, ...]
         expressions = tuple(mesh(name, v, model) for name, v in zip(truth.labels, truth.vertices, strict=True))
         tags = {"age": 20 + seed % 50, "gender": ("female", "male")[seed % 2]}
         neutral = mesh("neutral", truth.neutral, model)
-        found.append(Subject(name=truth.name, neutral=neutral, expressions=expressions, tags=tags))
+        found.append(TrainingSubject(name=truth.name, neutral=neutral, expressions=expressions, tags=tags))
     return found

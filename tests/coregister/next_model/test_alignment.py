@@ -29,7 +29,7 @@ def _sure(heads: np.ndarray) -> np.ndarray:
 
 def test_heads_lie_on_their_mean_and_it_on_the_template(model, scattered):
     found = align_neutrals(scattered, _sure(scattered), _names(), model)
-    assert found.rejected == () and 2 <= found.rounds < 20
+    assert found.rejected == () and 2 <= found.iterations < 20
     stable = SkullSkin.of(model).area
     for T, head, source in zip(found.T_model_head, found.vertices, scattered, strict=True):
         np.testing.assert_allclose(T[:3, :3] @ T[:3, :3].T, np.eye(3), atol=1e-12)

@@ -10,9 +10,9 @@ import torch
 
 from coregister.next_model import provenance
 from coregister.next_model.alignment import align_neutrals
-from coregister.next_model.build import Build, Built, build
-from coregister.next_model.identity import Identity
-from coregister.next_model.training_data import Subject, unposed
+from coregister.next_model.build import BuiltModel, build_model
+from coregister.next_model.recipes import ModelRecipe, few_registrations, load_model_recipe, true_meshes
+from coregister.next_model.training_data import TrainingSubject, unpose
 from registration.errors import InputError
 from registration.frames import axis_angle_to_matrix
 from registration.model import gnm_npz, landmarks, regions
@@ -26,24 +26,33 @@ ACTS = ("smile", "jaw_open", "wink_left", "brows_up")
 CATEGORIES = {"smile": "flexing", "jaw_open": "jaw", "wink_left": "eyes", "brows_up": "eyebrows"}
 
 
+def with_identity(**settings) -> ModelRecipe:
+    recipe = few_registrations()
+    return replace(recipe, name="own", identity=replace(recipe.identity, **settings))
+
+
+def own_recipe() -> ModelRecipe:
+    return with_identity(max_components=7)
+
+
 @pytest.fixture(scope="module")
-def subjects(anatomy, model) -> list[Subject]:
+def subjects(anatomy, model) -> list[TrainingSubject]:
     return known.people(anatomy, model, range(500, 508), ACTS)
 
 
 @pytest.fixture(scope="module")
-def built(subjects, model) -> Built:
-    return build(subjects, model, Build(categories=CATEGORIES))
+def built(subjects, model) -> BuiltModel:
+    return build_model(subjects, model, true_meshes(), categories=CATEGORIES)
 
 
 @pytest.fixture(scope="module")
-def files(built: Built, model_file: Path, tmp_path_factory) -> Path:
+def files(built: BuiltModel, model_file: Path, tmp_path_factory) -> Path:
     path = tmp_path_factory.mktemp("built") / "next.npz"
     provenance.write(built.data, built.manifest, built.coefficients, path, model_file)
     return path
 
 
-def test_all_23_fields_come_back_from_the_file(built: Built, files: Path, model):
+def test_all_23_fields_come_back_from_the_file(built: BuiltModel, files: Path, model):
     again = gnm_npz.read(files)
     assert len(AXES) == 23
     for name in AXES:
@@ -56,7 +65,7 @@ def test_all_23_fields_come_back_from_the_file(built: Built, files: Path, model)
     assert sizes == [len(again.vertex_identity_basis), len(again.expression_basis)]
 
 
-def test_what_is_not_built_is_the_previous_models(built: Built, model):
+def test_what_is_not_built_is_the_previous_models(built: BuiltModel, model):
     rebuilt = ("template", "identity", "expression", "joint_regressor")
     for field in fields(GNMData):
         if not any(word in field.name for word in rebuilt) and field.name != "extra":
@@ -69,7 +78,7 @@ def test_what_is_not_built_is_the_previous_models(built: Built, model):
     assert np.array_equal(built.data.vertex_identity_basis[-3:], model.vertex_identity_basis[-3:])
 
 
-def test_the_built_model_is_symmetric_mirrors_its_eyes_and_tells_its_joints(built: Built):
+def test_the_built_model_is_symmetric_mirrors_its_eyes_and_tells_its_joints(built: BuiltModel):
     data = built.data
     for symmetric in (data.template_vertex_positions, data.template_joint_positions):
         twins = symmetric[[0, 1, 3, 2] if len(symmetric) == 4 else data.mirror_indices] * (-1, 1, 1)
@@ -98,7 +107,7 @@ def _off_mm(data: GNMData, basis: np.ndarray, targets: list[np.ndarray]) -> floa
     return float(1e3 * np.sqrt(3 * np.mean(left**2)))
 
 
-def test_the_built_model_holds_what_it_was_built_from(built: Built, subjects, model):
+def test_the_built_model_holds_what_it_was_built_from(built: BuiltModel, subjects, model):
     """Neutrals, aligned as for the build, against the previous model with as many components; 99 % of expressions."""
     heads = np.stack([subject.neutral.vertices for subject in subjects])
     aligned = align_neutrals(heads, np.ones(heads.shape[:2], np.float32), [s.name for s in subjects], model)
@@ -115,7 +124,7 @@ def test_the_built_model_holds_what_it_was_built_from(built: Built, subjects, mo
     assert off["next"][1] ** 2 < 0.012 * energy
 
 
-def test_the_manifest_tells_how_it_came_about(built: Built, files: Path, subjects, model):
+def test_the_manifest_tells_how_it_came_about(built: BuiltModel, files: Path, subjects, model):
     told = json.loads(files.with_name("next.manifest.json").read_text())
     assert told == built.manifest
     assert [s["subject"] for s in told["subjects"]] == [s.name for s in subjects] and told["rejected"] == []
@@ -128,10 +137,10 @@ def test_the_manifest_tells_how_it_came_about(built: Built, files: Path, subject
     assert told["categories"] == dict.fromkeys(sorted(CATEGORIES.values()), 8)
     assert sum(told["demographics"]["age"].values()) == 8 and told["demographics"]["gender"] == {"female": 4, "male": 4}
     assert told["figures"]["lid_gap_change_mm"]["worst"] < 0.2 and 0 < told["figures"]["drift_mm"] < 10
-    assert told["versions"]["numpy"] == np.__version__ and told["config"]["identity"]["previous"] == 0.2
+    assert told["versions"]["numpy"] == np.__version__ and told["config"]["identity"]["shrinkage"] == 0.2
 
 
-def test_coefficients_and_landmarks_lie_beside_the_file(built: Built, files: Path):
+def test_coefficients_and_landmarks_lie_beside_the_file(built: BuiltModel, files: Path):
     with np.load(files.with_name("next.expressions.npz")) as beside:
         names, mean, covariance = beside["names"], beside["mean"], beside["covariance"]
     assert names.tolist() == built.data.expression_names[: len(names)].tolist()
@@ -140,23 +149,23 @@ def test_coefficients_and_landmarks_lie_beside_the_file(built: Built, files: Pat
     assert sorted(landmarks.schemes_beside(files, len(built.data.template_vertex_positions))) == ["68", "dense", "oral"]
 
 
-def test_building_twice_gives_the_same(built: Built, subjects, model):
-    again = build(iter_again(subjects), model, Build(categories=CATEGORIES))
+def test_building_twice_gives_the_same(built: BuiltModel, subjects, model):
+    again = build_model(iter_again(subjects), model, true_meshes(), categories=CATEGORIES)
     assert again.manifest == built.manifest
 
 
 class iter_again:
     """Subjects as a loop reads them from disk: anew each time."""
 
-    def __init__(self, subjects: list[Subject]):
+    def __init__(self, subjects: list[TrainingSubject]):
         self._subjects = subjects
 
     def __iter__(self):
         return iter(list(self._subjects))
 
 
-def test_a_built_model_is_built_upon(built: Built, subjects):
-    again = build(subjects[:5], built.data)
+def test_a_built_model_is_built_upon(built: BuiltModel, subjects):
+    again = build_model(subjects[:5], built.data)
     for names in (again.data.identity_names.tolist(), again.data.expression_names.tolist()):
         assert len(set(names)) == len(names)
     assert again.data.identity_names.tolist()[-3:] == ["eye_000", "eye_001", "eye_002"]
@@ -170,14 +179,14 @@ def test_a_built_model_is_built_upon(built: Built, subjects):
 
 def test_the_previous_models_share_is_chosen_and_told(subjects, model):
     neutrals = [replace(subject, expressions=()) for subject in subjects]
-    told = build(neutrals, model, Build(identity=Identity(previous=None, most=10))).manifest["identity"]
+    told = build_model(neutrals, model, with_identity(max_components=10)).manifest["identity"]
     tried = {float(share): rms for share, rms in told["shares_tried_mm"].items()}
     assert len(tried) == 20 and told["share_previous"] == min(tried, key=tried.__getitem__)
     assert told["components"] == 10 and 0 < tried[told["share_previous"]] < tried[0.0] < 10
 
 
 def test_without_expressions_the_previous_basis_stays(subjects, model):
-    built = build([replace(subject, expressions=()) for subject in subjects], model)
+    built = build_model([replace(subject, expressions=()) for subject in subjects], model)
     assert np.array_equal(built.data.expression_basis, model.expression_basis)
     assert built.coefficients is None and "previous" in built.manifest["expression"]
 
@@ -189,7 +198,7 @@ def test_spoiled_meshes_are_left_out_and_named(subjects, model):
     spoiled[2] = replace(subjects[2], neutral=known.mesh("neutral", subjects[2].neutral.vertices + noise, model))
     bad = known.mesh("smile", subjects[5].expressions[0].vertices + noise, model)
     spoiled[5] = replace(subjects[5], expressions=(bad, *subjects[5].expressions[1:]))
-    built = build(spoiled, model)
+    built = build_model(spoiled, model)
     names = [one["name"] for one in built.manifest["rejected"]]
     assert names == [subjects[2].name, f"{subjects[5].name}, smile"]
     told = {one["subject"]: one for one in built.manifest["subjects"]}
@@ -203,8 +212,8 @@ def test_skin_that_no_camera_saw_follows_the_previous_model(subjects, model):
     for subject in subjects:
         vertices = subject.neutral.vertices + np.float32(0.05) * behind[:, None]
         broken.append(replace(subject, neutral=known.mesh("neutral", vertices, model, ~behind), expressions=()))
-    built = build(broken, model)
-    clean = build([replace(subject, expressions=()) for subject in subjects], model)
+    built = build_model(broken, model)
+    clean = build_model([replace(subject, expressions=()) for subject in subjects], model)
     away = np.linalg.norm(built.data.template_vertex_positions - clean.data.template_vertex_positions, axis=1)
     skin = regions.exterior(model)
     print(f"unseen {1e3 * away[skin & behind].mean():.2f} mm, seen {1e3 * away[skin & ~behind].mean():.2f} mm off")
@@ -212,28 +221,41 @@ def test_skin_that_no_camera_saw_follows_the_previous_model(subjects, model):
     assert built.manifest["filled"] == {"neutrals": 8, "expressions": 0}
 
 
-def _nan(subject: Subject) -> Subject:
+def test_recipes_load_by_name_by_import_path_and_from_json():
+    assert load_model_recipe("few_registrations") == few_registrations() == load_model_recipe(few_registrations())
+    assert load_model_recipe(f"{__name__}:own_recipe").identity.max_components == 7
+    for recipe in (few_registrations(), true_meshes(), own_recipe()):
+        assert ModelRecipe.from_json(json.loads(json.dumps(recipe.to_json())), where="here") == recipe
+    with pytest.raises(InputError, match="model recipe") as caught:
+        load_model_recipe("many")
+    assert "few_registrations" in caught.value.expected
+    with pytest.raises(InputError) as caught:
+        ModelRecipe.from_json({**few_registrations().to_json(), "shrinkage": 0.5}, where="here")
+    assert "shrinkage" in caught.value.where
+
+
+def _nan(subject: TrainingSubject) -> TrainingSubject:
     vertices = subject.neutral.vertices.copy()
     vertices[7, 1] = np.nan
     return replace(subject, neutral=replace(subject.neutral, vertices=vertices))
 
 
-def _foreign(subject: Subject) -> Subject:
+def _foreign(subject: TrainingSubject) -> TrainingSubject:
     triangles = subject.neutral.triangles[:, [1, 0, 2]]
     return replace(subject, neutral=replace(subject.neutral, triangles=triangles))
 
 
-def _fewer(subject: Subject) -> Subject:
+def _fewer(subject: TrainingSubject) -> TrainingSubject:
     act = subject.expressions[1]
     act = replace(act, vertices=act.vertices[:-1], confidence=act.confidence[:-1])
     return replace(subject, expressions=(subject.expressions[0], act))
 
 
-def _unsure(subject: Subject) -> Subject:
+def _unsure(subject: TrainingSubject) -> TrainingSubject:
     return replace(subject, neutral=replace(subject.neutral, confidence=2 * subject.neutral.confidence))
 
 
-def _unknown(subject: Subject) -> Subject:
+def _unknown(subject: TrainingSubject) -> TrainingSubject:
     return replace(subject, expressions=(replace(subject.expressions[0], label="sneeze"),))
 
 
@@ -250,24 +272,24 @@ def _unknown(subject: Subject) -> Subject:
 )
 def test_bad_subjects_are_refused_by_name(subjects, model, spoil, what, got):
     with pytest.raises(InputError) as caught:
-        build([*subjects[:3], spoil(subjects[3])], model, Build(categories=CATEGORIES))
+        build_model([*subjects[:3], spoil(subjects[3])], model, categories=CATEGORIES)
     assert what in caught.value.what and subjects[3].name in caught.value.where and got in caught.value.got
     assert caught.value.expected and caught.value.fix
 
 
 def test_too_few_samples_are_refused(subjects, model):
     with pytest.raises(InputError, match="too few neutrals"):
-        build(subjects[:1], model)
+        build_model(subjects[:1], model)
     with pytest.raises(InputError, match="no samples|too few neutrals"):
-        build([], model)
+        build_model([], model)
     with pytest.raises(InputError, match="rank") as caught:
-        build(subjects[:4], model, Build(identity=Identity(most=4, previous=0.0, mirrored=False)))
+        build_model(subjects[:4], model, with_identity(max_components=4, shrinkage=0.0, mirrored=False))
     assert caught.value.got == "4" and "4 neutrals about" in caught.value.expected
     with pytest.raises(InputError, match="rank") as caught:
-        build(subjects[:4], model, Build(identity=Identity(most=8, previous=0.0)))
+        build_model(subjects[:4], model, with_identity(max_components=8, shrinkage=0.0))
     assert caught.value.got == "8" and "4 neutrals and their mirror images" in caught.value.expected
     with pytest.raises(InputError, match="twice"):
-        build([subjects[0], subjects[0]], model)
+        build_model([subjects[0], subjects[0]], model)
 
 
 def test_a_registration_without_its_pose(model):
@@ -283,7 +305,7 @@ def test_a_registration_without_its_pose(model):
     offsets = torch.as_tensor(rng.normal(0, 1e-3, model.template_vertex_positions.shape).astype(np.float32))
     still = replace(parameters, rotations=pose.rotations, translation=pose.translation)
     registration = _registration(parameters, offsets, function)
-    found = unposed(registration, function)
+    found = unpose(registration, function)
     np.testing.assert_allclose(found, function(still, offsets).numpy(), atol=1e-7)
     # Posing it again gives the registration.
     joints = parameters.scale * function.joints(parameters.identity)
@@ -315,8 +337,10 @@ def test_the_official_schema_of_another_model_is_kept(tmp_path: Path):
     model = gnm_npz.read(SHARED / "data" / "gnm" / "gnm_head_reconstructed.npz")
     rng = np.random.default_rng(0)
     heads = known.heads(model, rng.normal(size=(6, len(known.head_components(model)))))
-    subjects = [Subject(name=str(k), neutral=known.mesh("neutral", head, model)) for k, head in enumerate(heads)]
-    built = build(subjects, model)
+    subjects = [
+        TrainingSubject(name=str(k), neutral=known.mesh("neutral", head, model)) for k, head in enumerate(heads)
+    ]
+    built = build_model(subjects, model)
     gnm_npz.write(built.data, tmp_path / "next.npz")
     again = gnm_npz.read(tmp_path / "next.npz")
     assert gnm_npz.content_hash(again) == built.manifest["content_id"]

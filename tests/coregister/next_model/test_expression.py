@@ -6,7 +6,7 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from coregister.next_model import expression
-from coregister.next_model.expression import Expressions, regional_bases
+from coregister.next_model.expression import ExpressionSettings, regional_bases
 from coregister.region_masks import REGIONS, regional_masks
 from registration.geometry.topology import vertex_areas
 from registration.model import regions
@@ -28,7 +28,7 @@ def weights(displacements) -> np.ndarray:
 
 @pytest.fixture(scope="module")
 def bases(displacements, weights, model):
-    return regional_bases(displacements, weights, model, Expressions(share=0.999))
+    return regional_bases(displacements, weights, model, ExpressionSettings(variance_ratio=0.999))
 
 
 def test_masks_sum_to_one_on_the_skin_and_mirror(model):
@@ -86,22 +86,24 @@ def test_nothing_but_skin_and_what_the_jaw_takes_along_moves(bases, model):
 
 
 def test_both_eyes_can_be_kept_apart(displacements, weights, bases, model):
-    alone = regional_bases(displacements, weights, model, Expressions(share=0.999, both_eyes=False))
+    alone = regional_bases(displacements, weights, model, ExpressionSettings(variance_ratio=0.999, both_eyes=False))
     assert alone["left_eye_region"].energy[0] != pytest.approx(bases["left_eye_region"].energy[0], rel=1e-3)
     assert np.array_equal(alone["lower_face_region"].basis, bases["lower_face_region"].basis)
 
 
 def test_the_previous_model_can_have_a_share(displacements, weights, bases, model):
-    mixed = regional_bases(displacements, weights, model, Expressions(share=0.999, previous=0.3))
+    mixed = regional_bases(displacements, weights, model, ExpressionSettings(variance_ratio=0.999, shrinkage=0.3))
     for name in REGIONS:
-        assert mixed[name].previous == 0.3 and bases[name].previous == 0
-        total = mixed[name].energy.sum() / mixed[name].share
-        assert total == pytest.approx(bases[name].energy.sum() / bases[name].share, rel=1e-4)
+        assert mixed[name].shrinkage == 0.3 and bases[name].shrinkage == 0
+        total = mixed[name].energy.sum() / mixed[name].variance_ratio
+        assert total == pytest.approx(bases[name].energy.sum() / bases[name].variance_ratio, rel=1e-4)
         assert len(mixed[name].energy) > len(bases[name].energy)
 
 
 def test_components_by_area_are_orthogonal_there(displacements, weights, model):
-    found = regional_bases(displacements, weights, model, Expressions(share=0.999, by_area=True))["left_eye_region"]
+    found = regional_bases(displacements, weights, model, ExpressionSettings(variance_ratio=0.999, by_area=True))[
+        "left_eye_region"
+    ]
     rows = regional_masks(model)[0] > 0
     area = vertex_areas(model.template_vertex_positions, model.triangles)[rows]
     weight = np.repeat(np.maximum(area, 0.01 * area.mean()) / area.mean(), 3)
@@ -116,9 +118,11 @@ def test_the_jaw_moves_rigidly_to_first_order(model):
     turned = Rotation.from_rotvec([angle, 0, 0]).apply(points - axis) + axis - points
     basis = (turned * regions.lower_teeth(model)[:, None])[None]
     parts = regions.jaw_parts(model)
-    assert np.abs(expression.with_jaw(basis, model)[0][parts] - turned[parts]).max() < 1e-3 * np.abs(turned).max()
+    assert np.abs(expression.jaw_motion(basis, model)[0][parts] - turned[parts]).max() < 1e-3 * np.abs(turned).max()
     # Linear: twice the component moves the teeth twice as far.
-    np.testing.assert_allclose(expression.with_jaw(7 * basis, model), 7 * expression.with_jaw(basis, model), atol=1e-15)
+    np.testing.assert_allclose(
+        expression.jaw_motion(7 * basis, model), 7 * expression.jaw_motion(basis, model), atol=1e-15
+    )
 
 
 def test_an_opened_jaw_takes_the_lower_teeth_along(displacements, bases, anatomy, model):
@@ -136,7 +140,7 @@ def test_an_opened_jaw_takes_the_lower_teeth_along(displacements, bases, anatomy
 
 
 def test_coefficients_are_those_of_least_squares(displacements, weights, bases, model):
-    found = expression.coefficients(displacements, weights, bases, model)
+    found = expression.coefficient_statistics(displacements, weights, bases, model)
     skin = regions.skin(model)
     flat = np.concatenate([r.basis[:, skin].reshape(len(r.basis), -1) for r in bases.values()])
     rows = np.linalg.lstsq(flat.T, np.stack([d[skin].ravel() for d in displacements]).T.astype(float), rcond=None)[0].T

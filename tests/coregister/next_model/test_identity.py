@@ -8,7 +8,7 @@ from scipy.linalg import subspace_angles
 
 from coregister.next_model import eyelids
 from coregister.next_model.alignment import align_neutrals
-from coregister.next_model.identity import HeadIdentity, Identity, head_identity
+from coregister.next_model.identity import IdentityBasis, IdentitySettings, build_identity_basis
 from coregister.region_masks import FLIP, mirrored
 from registration.geometry.rigid import fit_twists, motion_fields
 from registration.geometry.topology import vertex_areas
@@ -17,7 +17,7 @@ from registration.model.gnm_npz import GNMData
 from registration.stabilize.subject_meshes import SkullSkin
 from tests.coregister.next_model import known
 
-RAW = Identity(share=1.0, previous=0.0, mirrored=False, lids_rest=False)
+RAW = IdentitySettings(variance_ratio=1.0, shrinkage=0.0, by_area=False, mirrored=False, eyelids_follow=False)
 
 
 def _aligned(model: GNMData, shapes: np.ndarray, rng: np.random.Generator) -> np.ndarray:
@@ -48,7 +48,7 @@ def test_whitened_samples_give_the_model_back(model):
     basis = _still(model)
     size = len(basis)
     shapes = model.template_vertex_positions + np.tensordot(known.whitened(rng, 150, size), basis, 1)
-    found = head_identity(_aligned(model, shapes, rng), model, replace(RAW, most=size))
+    found = build_identity_basis(_aligned(model, shapes, rng), model, replace(RAW, max_components=size))
     mine, truth = _skin(found.basis, model), _skin(basis, model)
     values = np.linalg.svd(truth, compute_uv=False) ** 2
     angles = np.degrees(subspace_angles(mine.T, truth.T))
@@ -60,7 +60,7 @@ def test_whitened_samples_give_the_model_back(model):
 def test_raw_draws_equal_a_dense_svd(model):
     rng = np.random.default_rng(1)
     heads = _aligned(model, _drawn(model, rng, 40), rng)
-    found = head_identity(heads, model, RAW)
+    found = build_identity_basis(heads, model, RAW)
     flat = heads[:, regions.skin(model)].astype(np.float64).reshape(len(heads), -1)
     mean = flat.mean(0)
     _, s, vt = np.linalg.svd(flat - mean, full_matrices=False)
@@ -73,14 +73,14 @@ def test_raw_draws_equal_a_dense_svd(model):
     away = np.abs(mine - aligned * np.sqrt(expected)[:, None]).max()
     print(f"components {away:.2e} m, variances {np.abs(found.variance / expected - 1).max():.2e}")
     assert away < 1e-4 * np.abs(mine).max()
-    assert found.share == pytest.approx(1, abs=1e-6)
+    assert found.variance_ratio == pytest.approx(1, abs=1e-6)
 
 
 def test_components_by_area_are_those_of_the_surface(model):
     """Orthogonal where every square millimetre counts alike, and with the variance that it has there."""
     rng = np.random.default_rng(7)
     heads = _aligned(model, _drawn(model, rng, 15), rng)
-    found = head_identity(heads, model, replace(RAW, by_area=True))
+    found = build_identity_basis(heads, model, replace(RAW, by_area=True))
     skin = regions.skin(model)
     area = vertex_areas(model.template_vertex_positions, model.triangles)[skin]
     weight = np.repeat(np.maximum(area, 0.01 * area.mean()) / area.mean(), 3)
@@ -95,19 +95,19 @@ def test_components_by_area_are_those_of_the_surface(model):
 def test_a_share_or_a_number_truncates(model):
     rng = np.random.default_rng(2)
     heads = _aligned(model, _drawn(model, rng, 20), rng)
-    for share in (0.9, 0.99):
-        found = head_identity(heads, model, replace(RAW, share=share))
-        fewer = found.variance[:-1].sum() / found.variance.sum() * found.share
-        assert fewer < share <= found.share
-    assert len(head_identity(heads, model, replace(RAW, most=5)).basis) == 5
+    for ratio in (0.9, 0.99):
+        found = build_identity_basis(heads, model, replace(RAW, variance_ratio=ratio))
+        fewer = found.variance[:-1].sum() / found.variance.sum() * found.variance_ratio
+        assert fewer < ratio <= found.variance_ratio
+    assert len(build_identity_basis(heads, model, replace(RAW, max_components=5)).basis) == 5
 
 
 def test_the_previous_model_has_the_share_that_is_stated(model):
     rng = np.random.default_rng(3)
     heads = _aligned(model, _drawn(model, rng, 8), rng)
-    alone = head_identity(heads, model, RAW)
-    mixed = head_identity(heads, model, replace(RAW, previous=0.2))
-    assert (alone.previous, mixed.previous) == (0, 0.2)
+    alone = build_identity_basis(heads, model, RAW)
+    mixed = build_identity_basis(heads, model, replace(RAW, shrinkage=0.2))
+    assert (alone.shrinkage, mixed.shrinkage) == (0, 0.2)
     assert mixed.variance.sum() == pytest.approx(alone.variance.sum(), rel=1e-5)
     assert len(alone.basis) == 7 and len(mixed.basis) >= len(known.head_components(model))
     # In directions that the heads do not reach there is exactly what the previous model brings along.
@@ -124,7 +124,7 @@ def test_parts_in_the_mouth_move_as_they_do_in_the_heads(model):
     """Of another head of the same people, its skin alone tells where teeth and tongue are."""
     rng = np.random.default_rng(4)
     heads = _aligned(model, _drawn(model, rng, 120), rng)
-    found = head_identity(heads[:-10], model, RAW)
+    found = build_identity_basis(heads[:-10], model, RAW)
     mouth = (regions.group(model, "upper_teeth_and_gums") > 0.5) | regions.jaw_parts(model)
     away = heads[-10:] - found.template
     coefficients = np.linalg.lstsq(_skin(found.basis, model).T, _skin(away, model).T, rcond=None)[0].T
@@ -136,20 +136,22 @@ def test_parts_in_the_mouth_move_as_they_do_in_the_heads(model):
 
 
 @pytest.fixture(scope="module")
-def of_people(anatomy, model) -> tuple[GNMData, HeadIdentity, HeadIdentity]:
+def of_people(anatomy, model) -> tuple[GNMData, IdentityBasis, IdentityBasis]:
     """The model with the template of people that it does not span, their basis, and the same with lids left alone."""
     subjects = known.people(anatomy, model, range(300, 324), ("smile",))
     heads = np.stack([subject.neutral.vertices for subject in subjects])
     aligned = align_neutrals(heads, np.ones(heads.shape[:2], np.float32), [s.name for s in subjects], model)
-    settings = Identity(previous=0.2)
-    left, found = (head_identity(aligned.vertices, model, replace(settings, lids_rest=r)) for r in (False, True))
+    settings = IdentitySettings(variance_ratio=0.99, shrinkage=0.2, by_area=False)
+    left, found = (
+        build_identity_basis(aligned.vertices, model, replace(settings, eyelids_follow=r)) for r in (False, True)
+    )
     return replace(model, template_vertex_positions=found.template.astype(np.float32)), found, left
 
 
 def test_lids_stay_on_the_eyeballs(of_people, model):
     new, found, left = of_people
-    both = eyelids.sockets(new)
-    for before, after in zip(eyelids.sockets(model), both, strict=True):
+    both = eyelids.eyelid_rims(new)
+    for before, after in zip(eyelids.eyelid_rims(model), both, strict=True):
         gap, _ = after.gaps(found.template[before.rim], np.zeros(3))
         print(f"template: gap change {1e3 * np.abs(gap - before.gap).mean():.3f} mm (mean over the rim)")
         assert np.abs(gap - before.gap).mean() < 0.2e-3
@@ -164,7 +166,7 @@ def test_lids_stay_on_the_eyeballs(of_people, model):
 
 def test_an_eyeball_without_lids_has_no_gap_that_changes(of_people):
     new, found, _ = of_people
-    bare = tuple(replace(socket, rim=np.zeros(0, int), gap=np.zeros(0)) for socket in eyelids.sockets(new))
+    bare = tuple(replace(rims, rim=np.zeros(0, int), gap=np.zeros(0)) for rims in eyelids.eyelid_rims(new))
     assert not eyelids.gap_change_mm(bare, found.template, found.basis[:2]).any()
 
 
@@ -202,9 +204,9 @@ def test_mirrored_heads_make_a_symmetric_model(model):
         model,
         mirrored=True,
     ).vertices
-    for settings in (MIRRORED, Identity(share=1.0, by_area=True)):
-        found = head_identity(heads, model, settings)
-        assert (found.heads, found.mirrored) == (12, True)
+    for settings in (MIRRORED, IdentitySettings(variance_ratio=1.0, shrinkage=0.2)):
+        found = build_identity_basis(heads, model, settings)
+        assert (found.head_count, found.mirrored) == (12, True)
         template = found.template[model.mirror_indices] * FLIP
         twins = mirrored(found.basis, model.mirror_indices)
         flat, other = (basis.reshape(len(basis), -1) for basis in (found.basis, twins))
@@ -214,7 +216,7 @@ def test_mirrored_heads_make_a_symmetric_model(model):
         same, opposite = (np.abs(twins - sign * found.basis).max((1, 2)) < 1e-7 for sign in (1, -1))
         assert (same ^ opposite).all() and opposite.sum() >= 1
     # By its nature no component of the heads alone is that.
-    alone = head_identity(heads, model, RAW)
+    alone = build_identity_basis(heads, model, RAW)
     twins = mirrored(alone.basis, model.mirror_indices)
     assert min(np.abs(twins - sign * alone.basis).max((1, 2)).min() for sign in (1, -1)) > 1e-5
 
@@ -224,7 +226,7 @@ def test_mirrored_variance_keeps_its_meaning(model):
     rng = np.random.default_rng(9)
     heads, bump = _lopsided(model, rng, 9)
     heads = heads.astype(np.float32)
-    found = head_identity(heads, model, MIRRORED)
+    found = build_identity_basis(heads, model, MIRRORED)
     skin = regions.skin(model)
     twins = mirrored(heads, model.mirror_indices)
     even, odd = (((heads + sign * twins) / 2)[:, skin].reshape(9, -1).astype(np.float64) for sign in (1, -1))
@@ -245,7 +247,7 @@ def test_mirror_images_of_a_symmetric_models_heads_change_nothing(model):
     rng = np.random.default_rng(10)
     basis = _still(model)[:12]
     shapes = model.template_vertex_positions + np.tensordot(known.whitened(rng, 40, 12), basis, 1)
-    found = head_identity(shapes.astype(np.float32), model, replace(MIRRORED, most=12))
+    found = build_identity_basis(shapes.astype(np.float32), model, replace(MIRRORED, max_components=12))
     mine, truth = _skin(found.basis, model), _skin(basis, model)
     assert np.degrees(subspace_angles(mine.T, truth.T)).max() < 0.1
     np.testing.assert_allclose(found.variance, np.linalg.svd(truth, compute_uv=False) ** 2, rtol=0.01)

@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 
-from coregister.next_model.shrinkage import Mixed
-from coregister.next_model.shrinkage_weight import FOLDS, SHARES, left_out_rms
+from coregister.next_model.shrinkage import FOLDS, SHRINKAGE_GRID, ShrunkCovariance, cross_validated_shrinkage
 from registration.geometry.pca import principal_components
 
 SIZE = 60
@@ -12,8 +11,8 @@ SIZE = 60
 
 def _chosen(samples: np.ndarray, previous: np.ndarray, components: int) -> float:
     rows = np.concatenate([samples, previous])
-    rms = left_out_rms(rows @ rows.T, [np.arange(len(samples))], [True], components)
-    return SHARES[int(rms.argmin())]
+    rms = cross_validated_shrinkage(rows @ rows.T, [np.arange(len(samples))], [True], components)
+    return SHRINKAGE_GRID[int(rms.argmin())]
 
 
 @pytest.mark.parametrize("share", (0.0, 0.35, 0.95))
@@ -21,13 +20,13 @@ def test_products_tell_what_building_anew_without_each_group_tells(share):
     rng = np.random.default_rng(0)
     samples, previous = rng.normal(size=(13, SIZE)) + 5, rng.normal(size=(7, SIZE))
     rows = np.concatenate([samples, previous])
-    found = left_out_rms(rows @ rows.T, [np.arange(13)], [True], 6, (share,))
+    found = cross_validated_shrinkage(rows @ rows.T, [np.arange(13)], [True], 6, (share,))
     squares = 0.0
     for fold in range(FOLDS):
         out = np.arange(13) % FOLDS == fold
         mean = samples[~out].mean(0)
         kept = samples[~out] - mean
-        stream = Mixed(kept, np.ones(len(kept)), len(kept) - 1, previous, share)
+        stream = ShrunkCovariance(kept, np.ones(len(kept)), len(kept) - 1, previous, share)
         basis = principal_components(stream, centred=False, most=6).components
         for test in samples[out] - mean:
             squares += ((test - np.linalg.lstsq(basis.T, test, rcond=None)[0] @ basis) ** 2).sum()
@@ -40,7 +39,7 @@ def test_parts_about_zero_are_left_out_together_with_those_about_a_mean():
     even[:, :30], odd[:, 30:] = rng.normal(size=(11, 30)) + 2, rng.normal(size=(11, 30))
     previous[:, :30] = rng.normal(size=(4, 30))
     rows = np.concatenate([even, odd, previous])
-    both = left_out_rms(rows @ rows.T, [np.arange(11), np.arange(11, 22)], [True, False], 100, (0.2,))
+    both = cross_validated_shrinkage(rows @ rows.T, [np.arange(11), np.arange(11, 22)], [True, False], 100, (0.2,))
     # All components there are: the remainders of both parts add up, for nothing of one part is in the other's span.
     squares = 0.0
     for fold in range(FOLDS):

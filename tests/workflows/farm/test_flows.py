@@ -93,6 +93,7 @@ def plan(tmp_path: Path) -> Path:
         "model": "/m0",
         "out": "/o",
         "recipe": "draft",
+        "model_recipe": {"name": "few_registrations"},
         "views": None,
         "seed": 0,
         "components": [2],

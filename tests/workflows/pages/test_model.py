@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from coregister.next_model.build import build
-from coregister.next_model.training_data import Mesh, Subject
+from coregister.next_model.build import build_model
+from coregister.next_model.training_data import TrainingMesh, TrainingSubject
 from registration.model import gnm_npz
 from tests.workflows.rounds import MODEL, head
 from workflows.pages import model
@@ -12,10 +12,10 @@ from workflows.pages import model
 def test_components_tables_and_what_was_left_out(monkeypatch):
     data = gnm_npz.read(MODEL)
 
-    def mesh(name: str, vertices: np.ndarray) -> Mesh:
+    def mesh(name: str, vertices: np.ndarray) -> TrainingMesh:
         sure = np.ones(len(vertices), np.float32)
         shape = vertices.astype(np.float32)
-        return Mesh(name=name, label=name, vertices=shape, confidence=sure, triangles=data.triangles)
+        return TrainingMesh(name=name, label=name, vertices=shape, confidence=sure, triangles=data.triangles)
 
     subjects = []
     for seed in range(7):
@@ -23,8 +23,10 @@ def test_components_tables_and_what_was_left_out(monkeypatch):
         neutral = neutral + (np.random.default_rng(0).normal(0, 8e-3, neutral.shape) if seed == 3 else 0)
         smile = mesh("smile", neutral + data.expression_basis[3])
         tags = {"age": 20 + 10 * seed, "gender": "female"}
-        subjects.append(Subject(name=f"p<{seed}>", neutral=mesh("neutral", neutral), expressions=(smile,), tags=tags))
-    built = build(subjects, data)
+        subjects.append(
+            TrainingSubject(name=f"p<{seed}>", neutral=mesh("neutral", neutral), expressions=(smile,), tags=tags)
+        )
+    built = build_model(subjects, data)
     for name, value in {"IDENTITY": 2, "EXPRESSION": 1, "SIZE": (48, 52)}.items():
         monkeypatch.setattr(model, name, value)
     page = model.write_model_page(built.data, built.manifest)
