@@ -20,7 +20,7 @@ from rich.table import Table
 from torch import Tensor
 
 from bench.support import crossed_parts
-from registration.losses.self_intersection import SelfIntersection
+from registration.losses.self_intersection import SelfIntersectionPenalty
 from registration.model import gnm_npz, regions
 from registration.model.gnm_npz import GNMData
 
@@ -36,7 +36,7 @@ def cost(data: GNMData) -> Table:
     """Medians of wall-clock milliseconds, on the template and on a head with crossed lips."""
     table = Table("head", "construct", "refresh", "call", "call and backward", "a step, refreshed every 10")
     begun = time.perf_counter()
-    penalty = SelfIntersection(data, torch.device("cpu"))
+    penalty = SelfIntersectionPenalty(data, torch.device("cpu"))
     built = 1e3 * (time.perf_counter() - begun)
     template = torch.as_tensor(data.template_vertex_positions)
     for name, vertices in {"template": template, "crossed lips": crossed_parts.raised_lower_lip(data, 2.0)}.items():
@@ -45,7 +45,7 @@ def cost(data: GNMData) -> Table:
         def backward(vertices: Tensor = vertices) -> None:
             torch.stack(list(penalty(vertices).values())).sum().backward()
 
-        refresh = median_ms(lambda vertices=vertices: penalty.refresh(vertices))
+        refresh = median_ms(lambda vertices=vertices: penalty.update_candidates(vertices))
         call, both = median_ms(lambda vertices=vertices: penalty(vertices)), median_ms(backward)
         table.add_row(name, *(f"{ms:.1f}" for ms in (built, refresh, call, both, both + refresh / 10)))
     return table
@@ -60,14 +60,14 @@ def median_ms(work: Callable[[], object]) -> float:
     return 1e3 * statistics.median(seconds)
 
 
-def pushed_tongue(data: GNMData, penalty: SelfIntersection) -> Table:
+def pushed_tongue(data: GNMData, penalty: SelfIntersectionPenalty) -> Table:
     """The tongue's vertices pushed into the teeth."""
     table = Table("tongue pushed", "by, mm", "vertices inside", "deepest, mm", "largest error, mm")
     tongue, teeth = regions.tongue(data), crossed_parts.teeth_of(data)
     for name, direction in DIRECTIONS.items():
         for push in PUSHES_MM:
             vertices = crossed_parts.moved(data, tongue, tuple(push * axis for axis in direction))
-            penalty.refresh(vertices)
+            penalty.update_candidates(vertices)
             found = penalty.excess_mm(vertices)["tongue-teeth"].numpy()[tongue]
             points = vertices.numpy().astype(np.float64)
             truth = crossed_parts.tooth_depths_mm(points[tongue], points, teeth)
@@ -113,12 +113,12 @@ def faces(data: GNMData, samples: Path | None) -> Iterator[tuple[str, Tensor]]:
             yield name, torch.as_tensor(template + move, dtype=torch.float32)
 
 
-def own_overlap(data: GNMData, penalty: SelfIntersection, samples: Path | None) -> Table:
+def own_overlap(data: GNMData, penalty: SelfIntersectionPenalty, samples: Path | None) -> Table:
     """What the model's own faces overlap beyond the template: vertices, and the deepest; medians of random ones."""
     table = Table("face", *penalty.pairs, title="vertices / deepest, mm; for random faces the median / the worst")
     found: dict[str, list[dict[str, tuple[int, float]]]] = {}
     for name, vertices in faces(data, samples):
-        penalty.refresh(vertices)
+        penalty.update_candidates(vertices)
         excess = penalty.excess_mm(vertices)
         figures = {pair: (int((mm > 0).sum()), float(mm.max())) for pair, mm in excess.items()}
         found.setdefault(name, []).append(figures)
@@ -139,7 +139,7 @@ def main() -> None:
     arguments = parser.parse_args()
     data, console = gnm_npz.read(arguments.model), Console()
     console.print(cost(data))
-    penalty = SelfIntersection(data, torch.device("cpu"))
+    penalty = SelfIntersectionPenalty(data, torch.device("cpu"))
     for table in (pushed_tongue(data, penalty), recovered(data), own_overlap(data, penalty, arguments.samples)):
         console.print(table)
 

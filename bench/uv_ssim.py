@@ -161,7 +161,7 @@ def captured(data: GNMData, neutral: Path, expression: Path, head_px: int, size_
         triangles=data.triangles,
         corner_uvs=corner_uvs,
         texture=torch.where(density[..., None] > 1e-3, total / density.clamp_min(1e-3)[..., None], 0.3),
-        trust=sliding.trusted(data, often / (often + 1)),
+        weights=sliding.confident_texels(data, often / (often + 1)),
         truth=truth,
         start=sliding.slid(truth, data.triangles, outside, slide_mm),
         moves=outside,

@@ -12,8 +12,8 @@ from registration.capture.doctor import validate
 from registration.capture.native import read
 from registration.capture.triangulation import triangulate
 from registration.errors import InputError
-from registration.fit.initialization import LEAST_LANDMARKS, spread_views
-from registration.fit.recipes import Recipe, expression_of, load_recipe
+from registration.fit.initialization import MIN_LANDMARKS, select_spread_views
+from registration.fit.recipes import Recipe, expression_recipe, load_recipe
 from registration.fit.variables import pivot
 from registration.geometry.topology import edges
 from registration.model import gnm_npz
@@ -84,7 +84,7 @@ def read_inputs(
         data=data,
         schemes=schemes,
         landmarks=landmarks,
-        recipe=recipe if start is None else expression_of(recipe),
+        recipe=recipe if start is None else expression_recipe(recipe),
         neutral=start,
         digests=digests,
         config=config,
@@ -139,7 +139,7 @@ def _deciding(
     digests |= {f"landmarks {name}": hashing.hash_fields(scheme) for name, scheme in schemes.items()}
     if neutral is not None:
         digests["neutral"] = hashing.hash_fields(neutral)
-        recipe = expression_of(recipe)
+        recipe = expression_recipe(recipe)
     chosen = replace(options, recipe=recipe)
     config = {name: hashing.to_jsonable(value) for name, value in hashing.hashed_fields(chosen, NOT_HASHED).items()}
     return digests, {**config, "views": [view.name for view in selected.views]}
@@ -151,7 +151,7 @@ def _select_views(capture: Capture, count: int | None) -> Capture:
         return capture
     if count < 2:
         raise InputError("Too few views", where="views", expected="at least 2", got=count, fix="use at least two views")
-    selected = spread_views([view.camera for view in capture.views], count)
+    selected = select_spread_views([view.camera for view in capture.views], count)
     return replace(capture, views=tuple(capture.views[i] for i in selected))
 
 
@@ -183,13 +183,13 @@ def _check_model(data: gnm_npz.GNMData) -> None:
 def _check_head_can_be_found(capture: Capture, landmarks: Mapping[str, Float[np.ndarray, "L 3"]]) -> None:
     counts = {name: int(np.isfinite(points).all(1).sum()) for name, points in landmarks.items()}
     labelled = BACKGROUND in capture.classes and any(view.segmentation for view in capture.views)
-    if max(counts.values(), default=0) < LEAST_LANDMARKS and not labelled and not any(v.mask for v in capture.views):
-        found = [f"{count} triangulated of scheme {name}" for name, count in counts.items()]
+    if max(counts.values(), default=0) < MIN_LANDMARKS and not labelled and not any(v.mask for v in capture.views):
+        triangulated = [f"{count} triangulated of scheme {name}" for name, count in counts.items()]
         raise InputError(
-            "Nothing tells where the head is",
+            "The head cannot be located",
             where=capture.root,
-            expected=f"{LEAST_LANDMARKS} landmarks of a scheme that the model knows, or masks",
-            got=", ".join([*(found or ["no landmarks that the model knows"]), "no masks"]),
+            expected=f"{MIN_LANDMARKS} landmarks of a scheme that the model has, or masks",
+            got=", ".join([*(triangulated or ["no landmarks of a scheme that the model has"]), "no masks"]),
             fix="add masks (or label maps with a background), landmarks, or the model's landmarks with --landmarks",
         )
 

@@ -1,8 +1,9 @@
 """The public entry: one capture in, one registration out."""
 
 import time
-from collections.abc import Collection, Mapping
-from dataclasses import replace
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -10,10 +11,17 @@ import torch
 
 from registration.evaluate.audit import audit
 from registration.evaluate.evaluation import Evaluation, evaluate
-from registration.fit.initialization import LEAST_LANDMARKS, LEAST_OVERLAP, from_landmarks, from_masks, spread_views
-from registration.fit.problem import Fit, Outcome
+from registration.fit.context import FitContext
+from registration.fit.initialization import (
+    MIN_LANDMARKS,
+    MIN_OVERLAP,
+    from_landmarks,
+    from_masks,
+    select_spread_views,
+)
+from registration.fit.problem import FitProblem, FitTrace, assess, refine
 from registration.fit.recipes import Stage
-from registration.fit.variables import Start, start_of
+from registration.fit.variables import InitialGuess, initial_guess_from
 from registration.fit.view_weights import ViewErrors
 from registration.inputs import RegistrationInputs, read_inputs
 from registration.model.atlas import texture_atlas
@@ -31,9 +39,9 @@ from registration.targets.classes import class_map
 from registration.targets.pyramid import build_pyramid
 from registration.types import Parameters, Registration, Status
 
-SETTLED_MM = 0.05  # 95th percentile of vertex motion over the last tenth of the last stage
-LANDMARK_PX = 3.0  # median residual at 512 px of head height
-_MANY = 2  # times LANDMARK_PX: views this far off are named
+CONVERGED_MM = 0.05  # 95th percentile of vertex motion over the last tenth of the last stage
+MAX_LANDMARK_PX = 3.0  # median residual at 512 px of head height
+_NAMED_VIEW_RATIO = 2  # times MAX_LANDMARK_PX: views with a larger error are named
 _REPORT_VIEWS = 8
 _STAGE_VIEWS = 3
 
@@ -77,86 +85,119 @@ def register(
         return same
     device = backend.activate(options.variant, deterministic=options.deterministic)
     torch.manual_seed(options.seed)
-    fit, start, outcome = _fit(inputs, options.seed, device, pictures, progress)
-    registration = _collect(inputs, fit, start, outcome)
-    registration, page = _judge(inputs, fit, registration, progress)
+    fitted = _fit(inputs, options.seed, device, pictures, progress)
+    registration, page = _evaluate(inputs, fitted.problem, _collect(inputs, fitted), progress)
     save_registration(registration, out, page)
     return registration
 
 
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Fitted:
+    """A fit after its last stage."""
+
+    problem: FitProblem
+    initial: InitialGuess
+    trace: FitTrace
+    seconds: Mapping[str, float]  # part of the work -> duration, in order
+
+
 def _fit(
     inputs: RegistrationInputs, seed: int, device: torch.device, pictures: Path | None, progress: Progress
-) -> tuple[Fit, Start, Outcome]:
-    """Read the targets, find the start, run the stages."""
-    begun = time.perf_counter()
-    mapping = class_map(inputs.capture.classes)
-    recipe, count = inputs.recipe, len(inputs.capture.views)
-
-    def reading(done: int) -> None:
-        progress.at(done, count, "reading views")
-
-    pyramid = build_pyramid(
-        inputs.capture, mapping, finest_head_px=recipe.finest_head_px, levels=recipe.levels, progress=reading
-    )
-    outcome = Outcome()
-    outcome.seconds["targets"] = time.perf_counter() - begun
-    begun = time.perf_counter()
-    corner_uvs = texture_atlas(inputs.data)
-    model = GNM(inputs.data, device=device)
-    fit = Fit(inputs.data, model, pyramid, mapping, inputs.schemes, corner_uvs, recipe, seed)
-    start = _start(inputs, fit, progress)
-    for note in start.notes:
+) -> _Fitted:
+    """Read the targets, estimate the initial guess, run the stages."""
+    start_time = time.perf_counter()
+    context = _context(inputs, seed, device, progress)
+    targets_time = time.perf_counter()
+    initial = _initial_guess(inputs, context, progress)
+    for note in initial.notes:
         progress.note(note)
-    fit.begin(start, inputs.neutral)
-    outcome.seconds["start"] = time.perf_counter() - begun
-    total, done = sum(stage.steps for stage in recipe.stages), 0
-
-    shown = spread_views([v.camera for v in inputs.capture.views], _STAGE_VIEWS)
-    drawn = ["start"]
-
-    def draw(at: str) -> None:
-        """What the fit looks like when `at` begins, under the name of what was before."""
-        if pictures is not None and at != drawn[-1]:
-            views, vertices = report_views(*fit.picture(shown)), fit.vertices().cpu().numpy()
-            write_stage(pictures, f"{len(drawn) - 1:02d}_{drawn[-1]}", views, vertices, inputs.data.triangles)
-            drawn.append(at)
+    problem = FitProblem(context, initial)
+    initial_time = time.perf_counter()
+    seconds = {"targets": targets_time - start_time, "start": initial_time - targets_time}
+    snapshots = None if pictures is None else _Snapshots(problem, pictures)
+    steps = _StepProgress(inputs.recipe.stages, progress)
 
     def on_step(stage: Stage, step: int) -> None:
-        nonlocal done
-        draw(stage.name)
-        done += 1
-        progress.at(done, total, stage.name)
+        if snapshots is not None:
+            snapshots.stage_begins(stage.name)
+        steps.advance(stage.name)
 
-    fit.run(recipe.stages, outcome, on_step)
-    draw("end")
-    return fit, start, outcome
+    trace = problem.run(inputs.recipe.stages, on_step)
+    if snapshots is not None:
+        snapshots.stage_begins("end")
+    return _Fitted(problem=problem, initial=initial, trace=trace, seconds={**seconds, **trace.seconds})
 
 
-def _start(inputs: RegistrationInputs, fit: Fit, progress: Progress) -> Start:
-    """From landmarks if the model knows a scheme of the capture's, from the neutral's pose, or from the masks."""
+def _context(inputs: RegistrationInputs, seed: int, device: torch.device, progress: Progress) -> FitContext:
+    """Decode the views; everything else of a fit is made from the inputs when it is needed."""
+    classes, recipe, count = class_map(inputs.capture.classes), inputs.recipe, len(inputs.capture.views)
+    pyramid = build_pyramid(
+        inputs.capture,
+        classes,
+        finest_head_px=recipe.finest_head_px,
+        levels=recipe.levels,
+        progress=lambda done: progress.at(done, count, "reading views"),
+    )
+    return FitContext(
+        data=inputs.data,
+        model=GNM(inputs.data, device=device),
+        pyramid=pyramid,
+        classes=classes,
+        schemes=inputs.schemes,
+        corner_uvs=texture_atlas(inputs.data),
+        recipe=recipe,
+        seed=seed,
+        neutral=inputs.neutral,
+    )
+
+
+class _StepProgress:
+    """Reports the steps of all stages."""
+
+    def __init__(self, stages: Sequence[Stage], progress: Progress):
+        self._total, self._done, self._progress = sum(stage.steps for stage in stages), 0, progress
+
+    def advance(self, stage: str) -> None:
+        self._done += 1
+        self._progress.at(self._done, self._total, stage)
+
+
+class _Snapshots:
+    """Writes an image and the mesh of the fit after its initial guess and after each stage."""
+
+    def __init__(self, problem: FitProblem, folder: Path):
+        self._problem, self._folder = problem, folder
+        self._views = select_spread_views(problem.context.pyramid[0].pixels.cameras, _STAGE_VIEWS)
+        self._states = ["start"]  # what the mesh is the result of, in order
+
+    def stage_begins(self, name: str) -> None:
+        """Write the state before stage `name`, once."""
+        if name == self._states[-1]:
+            return
+        views, vertices = report_views(*self._problem.render_views(self._views)), self._problem.vertices()
+        label = f"{len(self._states) - 1:02d}_{self._states[-1]}"
+        write_stage(self._folder, label, views, vertices.cpu().numpy(), self._problem.context.data.triangles)
+        self._states.append(name)
+
+
+def _initial_guess(inputs: RegistrationInputs, context: FitContext, progress: Progress) -> InitialGuess:
+    """From landmarks if model and capture share a scheme, else from the neutral's pose or from the masks."""
     neutral = None
     if inputs.neutral is not None:
-        neutral = start_of(_parameters(inputs.neutral), inputs.neutral.offsets, fit.model, inputs.data)
-    skipped = {name for view in inputs.capture.views for name in view.landmarks} - set(inputs.schemes)
-    if skipped:
-        progress.note(f"landmark schemes that the model does not know, skipped: {', '.join(sorted(skipped))}")
-    seen = {name: int(np.isfinite(points).all(1).sum()) for name, points in inputs.landmarks.items()}
-    best = max(seen, key=lambda name: seen[name], default=None)
-    if best is not None and seen[best] >= LEAST_LANDMARKS:
-        start = from_landmarks(
-            inputs.data,
-            inputs.schemes[best],
-            inputs.landmarks[best],
-            free_scale=inputs.recipe.scale,
-            neutral=neutral,
-        )
-        assert start.landmarks_used is not None
-        fit.landmark_use[best] = start.landmarks_used
-        return start
-    if neutral is not None and fit.assess(neutral).overlap >= LEAST_OVERLAP:
+        parameters = _parameters(inputs.neutral)
+        neutral = initial_guess_from(parameters, inputs.neutral.offsets, context.model, inputs.data)
+    unknown = {name for view in inputs.capture.views for name in view.landmarks} - set(inputs.schemes)
+    if unknown:
+        progress.note(f"landmark schemes that the model does not have, ignored: {', '.join(sorted(unknown))}")
+    counts = {name: int(np.isfinite(points).all(1).sum()) for name, points in inputs.landmarks.items()}
+    best = max(counts, key=lambda name: counts[name], default=None)
+    if best is not None and counts[best] >= MIN_LANDMARKS:
+        scheme, points, free_scale = inputs.schemes[best], inputs.landmarks[best], inputs.recipe.scale
+        return from_landmarks(inputs.data, scheme, points, free_scale=free_scale, neutral=neutral)
+    if neutral is not None and assess(context, neutral).overlap >= MIN_OVERLAP:
         return replace(neutral, notes=("no landmarks: starting from the neutral's pose",))
-    progress.note("no landmarks that the model knows: searching the head's pose in the masks")
-    return from_masks(inputs.data, fit.pyramid[-1], fit.assess, fit.refine)
+    progress.note("no landmarks of a scheme that the model has: estimating the head's pose from the masks")
+    return from_masks(inputs.data, context.pyramid[-1], partial(assess, context), partial(refine, context))
 
 
 def _parameters(registration: Registration) -> Parameters:
@@ -164,15 +205,15 @@ def _parameters(registration: Registration) -> Parameters:
     return Parameters(**{name: torch.as_tensor(np.asarray(getattr(registration, name))) for name in names})
 
 
-def _collect(inputs: RegistrationInputs, fit: Fit, start: Start, outcome: Outcome) -> Registration:
+def _collect(inputs: RegistrationInputs, fitted: _Fitted) -> Registration:
     """The result as arrays, with its status."""
-    parameters, offsets = fit.unknowns.parameters()
-    positions = fit.vertices()
-    vertices, errors = positions.cpu().numpy(), fit.view_errors()
-    landmark_px = fit.landmark_misfits(inputs.landmarks)
+    problem, trace = fitted.problem, fitted.trace
+    parameters, offsets = problem.variables.parameters()
+    vertices, errors = problem.vertices().cpu().numpy(), problem.view_errors()
+    landmark_px = problem.landmark_residuals_px(inputs.landmarks)
     skin = exterior(inputs.data)
     inside = [name for name, scheme in inputs.schemes.items() if not skin[scheme.indices].any()]
-    status, reason = _status(outcome, landmark_px, inside, errors)
+    status, reason = _status(trace, landmark_px, inside, errors)
 
     def array(value: torch.Tensor) -> np.ndarray:
         return value.detach().cpu().numpy().astype(np.float32)
@@ -188,18 +229,18 @@ def _collect(inputs: RegistrationInputs, fit: Fit, start: Start, outcome: Outcom
         offsets=array(offsets),
         vertices=vertices,
         triangles=inputs.data.triangles,
-        confidence=fit.confidence() if np.isfinite(vertices).all() else np.zeros(len(vertices), np.float32),
-        texture=array(fit.appearance.texture),
-        corner_uvs=fit.corner_uvs,
+        confidence=problem.confidence() if np.isfinite(vertices).all() else np.zeros(len(vertices), np.float32),
+        texture=array(problem.appearance.texture),
+        corner_uvs=problem.context.corner_uvs,
         landmarks={name: scheme.points(vertices) for name, scheme in inputs.schemes.items()},
-        seconds=outcome.seconds,
-        history=outcome.history,
+        seconds=fitted.seconds,
+        history=trace.history,
         figures={
-            "motion_mm": outcome.motion_mm,
+            "motion_mm": trace.motion_mm,
             "landmark_residual_px": landmark_px,
-            "camera_gains": fit.appearance.gains.cpu().numpy().round(4).tolist(),
-            "views_not_trusted": dict(fit.trust.notes),
-            "notes": list(start.notes),
+            "camera_gains": problem.appearance.gains.cpu().numpy().round(4).tolist(),
+            "views_not_trusted": dict(problem.view_weights.notes),
+            "notes": list(fitted.initial.notes),
         },
         config=inputs.config,
         inputs=inputs.digests,
@@ -207,46 +248,50 @@ def _collect(inputs: RegistrationInputs, fit: Fit, start: Start, outcome: Outcom
 
 
 def _status(
-    outcome: Outcome, landmark_px: Mapping[str, float], inside: Collection[str], errors: ViewErrors
+    trace: FitTrace, landmark_px: Mapping[str, float], inside: Collection[str], errors: ViewErrors
 ) -> tuple[Status, str]:
-    """Landmarks `inside`, on teeth and tongue, are told but fail nothing: there are no offsets, and of teeth that the
-    neutral did not show no expression can mend the place."""
-    if outcome.failure:
-        return "failed", outcome.failure
+    """Status and reason of a fit.
+
+    Landmarks `inside`, on teeth and tongue, are reported but cause no failure: there are no offsets, and an expression
+    cannot correct teeth that the neutral did not show.
+    """
+    if trace.failure:
+        return "failed", trace.failure
     off = {
-        name: f"landmarks of scheme {name} are {px:.1f} px off in the median (limit {LANDMARK_PX})"
+        name: f"landmarks of scheme {name} are {px:.1f} px off in the median (limit {MAX_LANDMARK_PX})"
         for name, px in sorted(landmark_px.items(), key=lambda item: -item[1])
-        if px >= LANDMARK_PX
+        if px >= MAX_LANDMARK_PX
     }
     status: Status
     if off.keys() - inside:
-        status, reasons = "failed", [told for name, told in off.items() if name not in inside]
-    elif outcome.motion_mm >= SETTLED_MM:
-        moved = f"vertices still moved by {outcome.motion_mm:.3f} mm at the end (limit {SETTLED_MM})"
-        status, reasons = "stopped", [moved]
+        status, reasons = "failed", [reason for name, reason in off.items() if name not in inside]
+    elif trace.motion_mm >= CONVERGED_MM:
+        motion = f"vertices still moved by {trace.motion_mm:.3f} mm at the end (limit {CONVERGED_MM})"
+        status, reasons = "stopped", [motion]
     else:
-        moved = f"vertices moved by {outcome.motion_mm:.3f} mm over the last tenth of the last stage"
-        return "converged", "; ".join([moved, *off.values()])
-    views = errors.disagreement(LANDMARK_PX * _MANY)
+        motion = f"vertices moved by {trace.motion_mm:.3f} mm over the last tenth of the last stage"
+        return "converged", "; ".join([motion, *off.values()])
+    views = errors.disagreement(MAX_LANDMARK_PX * _NAMED_VIEW_RATIO)
     return status, "; ".join([*reasons, views] if views else reasons)
 
 
-def _judge(
-    inputs: RegistrationInputs, fit: Fit, registration: Registration, progress: Progress
+def _evaluate(
+    inputs: RegistrationInputs, problem: FitProblem, registration: Registration, progress: Progress
 ) -> tuple[Registration, str]:
-    """Figures against the scan, if there is one, and the report."""
+    """The registration with its metrics, against the scan too if there is one, and the report's page."""
     evaluation: Evaluation | None = None
     finite = np.isfinite(registration.vertices).all()
     if finite:
         progress.note("auditing parts that may run through one another")
-        found = audit(registration.vertices, inputs.data, scale=float(registration.scale)).figures
-        registration = replace(registration, figures={**registration.figures, "intersections": found})
+        intersections = audit(registration.vertices, inputs.data, scale=float(registration.scale)).figures
+        registration = replace(registration, figures={**registration.figures, "intersections": intersections})
     if inputs.capture.scan is not None and finite:
         progress.note("measuring against the scan")
         evaluation = evaluate(registration, inputs.capture)
         registration = replace(registration, figures={**registration.figures, **evaluation.figures})
-    progress.note("drawing the report")
-    batch, rendered = fit.picture(spread_views([v.camera for v in inputs.capture.views], _REPORT_VIEWS))
+    progress.note("writing the report")
+    cameras = [view.camera for view in inputs.capture.views]
+    batch, rendered = problem.render_views(select_spread_views(cameras, _REPORT_VIEWS))
     page = write_report(
         ReportInputs(
             registration=registration,

@@ -1,4 +1,4 @@
-"""Heads whose parts run into one another, what is left after the penalty was minimised, and a measure of its own.
+"""Heads whose parts run into one another, what is left after the penalty was minimized, and a measure of its own.
 
 That measure shares nothing with the penalty: winding numbers by solid angles tell what is inside, the exact closest
 point how deep.
@@ -13,14 +13,14 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 from torch import Tensor
 
-from registration.fit.optimizer import AdamUniformBlock, minimise
+from registration.fit.optimizer import AdamUniformBlock, minimize
 from registration.fit.recipes import Rate
-from registration.fit.variables import skin_topology, skin_vertices
+from registration.fit.variables import skin_triangles, skin_vertices
 from registration.frames import MM_PER_M
 from registration.geometry.closest_point import closest_points
 from registration.geometry.large_steps import LargeSteps
-from registration.geometry.topology import vertex_normals
-from registration.losses.self_intersection import SelfIntersection
+from registration.geometry.topology import edges, vertex_normals
+from registration.losses.self_intersection import SelfIntersectionPenalty
 from registration.model import regions
 from registration.model.gnm_npz import GNMData
 
@@ -82,7 +82,7 @@ def recover(data: GNMData, before: Float[Tensor, "V 3"], *, steps: int, rate: fl
     """Minimise the penalty over large-steps offsets of the skin, which a weak pull keeps where they began."""
     skin = skin_vertices(data)
     index, large = torch.as_tensor(skin), _steps(data, skin, _SMOOTHING_M)
-    penalty = SelfIntersection(data, torch.device("cpu"))
+    penalty = SelfIntersectionPenalty(data, torch.device("cpu"))
     latent = torch.zeros(len(skin), 3, requires_grad=True)
 
     def vertices() -> Tensor:
@@ -91,11 +91,11 @@ def recover(data: GNMData, before: Float[Tensor, "V 3"], *, steps: int, rate: fl
     def objective(step: int) -> dict[str, Tensor]:
         posed = vertices()
         if step % _REFRESH_EVERY == 0:
-            penalty.refresh(posed)
+            penalty.update_candidates(posed)
         crossing = torch.stack(list(penalty(posed).values())).sum()
         return {"crossing": crossing, "l2": _L2 * MM_PER_M**2 * (posed - before).square().sum()}
 
-    history, failure = minimise([AdamUniformBlock(latent, Rate(start=rate, end=rate / 10))], objective, steps)
+    history, failure = minimize([AdamUniformBlock(latent, Rate(start=rate, end=rate / 10))], objective, steps)
     assert failure is None, failure
     return Recovered(before=before, after=vertices().detach(), history=history["crossing"])
 
@@ -190,6 +190,7 @@ def _skin(data: GNMData) -> Int[np.ndarray, "F 3"]:
 
 def _steps(data: GNMData, skin: Int[np.ndarray, "S"], smoothing_m: float) -> LargeSteps:
     points = data.template_vertex_positions[skin]
-    triangles, ends = skin_topology(data.triangles, skin, len(data.template_vertex_positions))
+    triangles = skin_triangles(data.triangles, skin, len(data.template_vertex_positions))
+    ends = edges(triangles).vertices
     edge = float(np.median(np.linalg.norm(points[ends[:, 0]] - points[ends[:, 1]], axis=1)))
     return LargeSteps(triangles, len(skin), edge_length_m=edge, smoothing_m=smoothing_m, device=torch.device("cpu"))

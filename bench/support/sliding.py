@@ -12,7 +12,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from registration.fit.optimizer import AdamUniformBlock, minimise
+from registration.fit.optimizer import AdamUniformBlock, minimize
 from registration.fit.recipes import Rate
 from registration.frames import MM_PER_M
 from registration.geometry.closest_point import barycentric_points, closest_points
@@ -20,7 +20,7 @@ from registration.geometry.large_steps import LargeSteps
 from registration.geometry.rasterizer import visible
 from registration.geometry.texels import texels
 from registration.geometry.topology import edges, vertex_normals
-from registration.losses.uv_ssim import SurfaceTexture, trusted
+from registration.losses.uv_ssim import SurfaceTexture, confident_texels
 from registration.model.atlas import texture_atlas
 from registration.model.gnm import GNM
 from registration.model.gnm_npz import GNMData
@@ -44,7 +44,7 @@ class Problem:
     triangles: Int[np.ndarray, "F 3"]
     corner_uvs: Float[np.ndarray, "F 3 2"]
     texture: Float[Tensor, "R R 3"]  # the neutral's
-    trust: Float[np.ndarray, "V"]
+    weights: Float[np.ndarray, "V"]
     truth: Float[np.ndarray, "V 3"]
     start: Float[np.ndarray, "V 3"]
     moves: Bool[np.ndarray, "V"]  # the skin; the rest stays where it is
@@ -58,7 +58,7 @@ class Problem:
         return MM_PER_M * np.linalg.norm(away - (away * normals).sum(1, keepdims=True) * normals, axis=1)[self.judged]
 
     def loss(self, size_px: int, dtype: torch.dtype = torch.float32) -> SurfaceTexture:
-        return SurfaceTexture(self.triangles, self.corner_uvs, self.texture.to(dtype), self.trust, size_px)
+        return SurfaceTexture(self.triangles, self.corner_uvs, self.texture.to(dtype), self.weights, size_px)
 
     def disturbed(self, gain: float, blush: float) -> Targets:
         """The images with a gain, and with a smooth reddish brightening of the cheek."""
@@ -211,7 +211,7 @@ def head(
         triangles=triangles,
         corner_uvs=corner_uvs,
         texture=texture,
-        trust=trusted(data, np.ones(len(truth))),
+        weights=confident_texels(data, np.ones(len(truth))),
         truth=truth,
         start=slid(truth, triangles, outside, slide_mm),
         moves=outside,
@@ -271,7 +271,7 @@ def fit(
             vertices = base.index_add(0, index, large.displacement(latent))
             return {name: term(vertices) for name, term in terms.items()}
 
-        _, failure = minimise([AdamUniformBlock(latent, Rate(start=first, end=last))], objective, steps)
+        _, failure = minimize([AdamUniformBlock(latent, Rate(start=first, end=last))], objective, steps)
         assert failure is None, failure
         offsets = large.displacement(latent).detach()
     return base.index_add(0, index, offsets).double().numpy()

@@ -5,54 +5,69 @@ from dataclasses import replace
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from registration.render.renderer import Renderer
 from registration.types import Rendered, Targets
 
-_GREY = 0.25  # linear; what a texel shows before any view has been unwrapped to it
-_STEP = 0.5  # share of a texel's error that one update takes away
-_LEAST_DENSITY = 1e-3
+_GREY = 0.25  # linear; of a texel that no view shows
+_STEP = 0.5  # fraction of a texel's error that one update removes
+_MIN_DENSITY = 1e-3  # of weighted samples on a texel, for its colour to be estimated
 # Priors of a camera's gain and bias, against pixel noise over 100 independent patches (docs/algorithms.md).
 _GAIN_SIGMA, _BIAS_SIGMA, _NOISE = 0.1, 0.02, 0.05 / np.sqrt(100)
 
 
 class Appearance:
-    """A texture of `size_px`, and a gain and a bias per view and channel; all linear light."""
+    """The subject's texture, and a gain and a bias per view and channel; all in linear light.
+
+    Args:
+        renderer: of the mesh; maps pixels to texels.
+        size_px: width and height of the texture.
+        views: how many.
+        device: of the tensors.
+    """
 
     def __init__(self, renderer: Renderer, size_px: int, views: int, device: torch.device):
         self._renderer = renderer
         self.texture: Float[Tensor, "R R 3"] = torch.full((size_px, size_px, 3), _GREY, device=device)
-        self.known = False  # whether any view has been seen in the texture
+        self.known = False  # whether the texture was estimated or set
         self._exposures = torch.zeros(views, 3, 2, device=device)  # log gain and bias
 
     @property
     def gains(self) -> Float[Tensor, "N 3"]:
+        """The factor of each view's linear colours."""
         return self._exposures[..., 0].exp()
 
-    def begin(self, texture: Float[np.ndarray, "R R 3"]) -> None:
-        """Set a texture that is known."""
+    def set_texture(self, texture: Float[np.ndarray, "R R 3"]) -> None:
+        """Set a texture that was estimated before (linear)."""
         self.texture, self.known = torch.as_tensor(texture, device=self.texture.device), True
 
-    def expose(self, rendered: Rendered, batch: Targets, views: Sequence[int]) -> Rendered:
-        """The rendered colours as each camera would record them."""
+    def apply_exposure(self, rendered: Rendered, batch: Targets, views: Sequence[int]) -> Rendered:
+        """Return the rendering with colours as each camera records them: gain times colour plus bias."""
         gain, bias = self._exposure(batch, views)
         return replace(rendered, rgb=rendered.rgb * gain + bias)
 
     def corrected(self, batch: Targets, views: Sequence[int]) -> Float[Tensor, "P 3"]:
-        """The seen colours as a camera of gain one would record them."""
+        """Return the targets' colours as a camera of gain 1 and bias 0 would record them."""
         gain, bias = self._exposure(batch, views)
         return (batch.rgb - bias) / gain
 
     def _exposure(self, batch: Targets, views: Sequence[int]) -> tuple[Float[Tensor, "P 3"], Float[Tensor, "P 3"]]:
-        """Gain and bias of every pixel's camera."""
+        """Gain and bias of the camera of every pixel."""
         exposures = self._exposures[list(views)].index_select(0, batch.pixels.view.long())
         return exposures[..., 0].exp(), exposures[..., 1]
 
     @torch.no_grad()
-    def fit_exposures(self, rendered: Rendered, batch: Targets, agree: Tensor, views: Sequence[int]) -> None:
-        """Per view and channel the gain and bias that map rendered to seen colours best."""
+    def fit_exposures(self, rendered: Rendered, batch: Targets, agree: Bool[Tensor, "P"], views: Sequence[int]) -> None:
+        """Estimate gains and biases in closed form: weighted least squares with Gaussian priors, per view and channel.
+
+        Args:
+            rendered: the mesh with the texture, without exposure.
+            batch: the targets of some views.
+            agree: pixels where both show the same kind of surface.
+            views: the indices of these views.
+        """
         weight = (batch.rgb_weight * agree)[:, None]
         view = batch.pixels.view.long()
 
@@ -68,30 +83,48 @@ class Appearance:
         gain = (covariance + shrink * r * t + gain_prior) / (variance + shrink * r.square() + gain_prior)
         bias = (t - gain * r) / (1 + bias_prior)
         self._exposures[list(views)] = torch.stack([gain.clamp(0.3, 3.0).log(), bias], -1)
-        # One common gain belongs to the texture.
+        # A gain that all views share is part of the texture.
         self._exposures[..., 0] -= self._exposures[..., 0].mean(0)
 
     @torch.no_grad()
-    def improve(
-        self, vertices: Float[Tensor, "V 3"], rendered: Rendered, batch: Targets, agree: Tensor, views: Sequence[int]
+    def update_texture(
+        self,
+        vertices: Float[Tensor, "V 3"],
+        rendered: Rendered,
+        batch: Targets,
+        agree: Bool[Tensor, "P"],
+        views: Sequence[int],
     ) -> None:
-        """Move every texel half way to what the views of this step saw of it."""
+        """Move every texel half way to the mean colour that the views of this step show of it.
+
+        Args:
+            vertices: world, metres.
+            rendered: the mesh with the texture, without exposure.
+            batch: the targets of some views.
+            agree: pixels where both show the same kind of surface.
+            views: the indices of these views.
+        """
         weight = batch.rgb_weight.square() * agree
         change = self.corrected(batch, views) - rendered.rgb
         total, density = self._renderer.unwrap(vertices, change, weight, batch.pixels, len(self.texture))
-        step = torch.where(density > _LEAST_DENSITY, _STEP / density.clamp_min(_LEAST_DENSITY), 0.0)
+        step = torch.where(density > _MIN_DENSITY, _STEP / density.clamp_min(_MIN_DENSITY), 0.0)
         self.texture = (self.texture + step[..., None] * total).clamp(0, 1)
 
     @torch.no_grad()
-    def unwrap(self, vertices: Float[Tensor, "V 3"], batches: Sequence[tuple[Targets, Tensor]]) -> None:
-        """A first texture: the weighted mean of all views, given as batches and where they agree with the mesh."""
+    def unwrap_views(self, vertices: Float[Tensor, "V 3"], batches: Sequence[tuple[Targets, Tensor]]) -> None:
+        """Set the texture to the weighted mean of the views' colours; texels that no view shows get the mean colour.
+
+        Args:
+            vertices: world, metres.
+            batches: targets of some views, and the pixels where they agree with the mesh.
+        """
         size = len(self.texture)
         total, density = torch.zeros_like(self.texture), torch.zeros_like(self.texture[..., 0])
         for batch, agree in batches:
             weight = batch.rgb_weight.square() * agree
-            t, d = self._renderer.unwrap(vertices, batch.rgb, weight, batch.pixels, size)
-            total, density = total + t, density + d
-        seen = density > _LEAST_DENSITY
-        mean = total / density.clamp_min(_LEAST_DENSITY)[..., None]
-        fill = mean[seen].mean(0) if seen.any() else torch.full_like(mean[0, 0], _GREY)
-        self.texture, self.known = torch.where(seen[..., None], mean, fill), True
+            batch_total, batch_density = self._renderer.unwrap(vertices, batch.rgb, weight, batch.pixels, size)
+            total, density = total + batch_total, density + batch_density
+        visible = density > _MIN_DENSITY
+        mean = total / density.clamp_min(_MIN_DENSITY)[..., None]
+        fill = mean[visible].mean(0) if visible.any() else torch.full_like(mean[0, 0], _GREY)
+        self.texture, self.known = torch.where(visible[..., None], mean, fill), True

@@ -1,4 +1,4 @@
-"""Where a fit begins: from landmarks in closed form, or without them from masks and several turns of the head."""
+"""The initial guess of a fit: from landmarks in closed form, or without them from masks and many head poses."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -9,20 +9,20 @@ from jaxtyping import Bool, Float
 from scipy.spatial.transform import Rotation
 
 from registration.errors import InputError
-from registration.fit.variables import Start, pivot
+from registration.fit.variables import InitialGuess, pivot
 from registration.model.gnm_npz import GNMData
 from registration.model.landmarks import LandmarkScheme
 from registration.types import Camera, Rendered, Targets
 
+MIN_LANDMARKS = 6  # of a scheme, triangulated, for an initial guess
+MIN_OVERLAP = 0.7  # intersection over union of rendered and target masks, for an initial guess
 _LANDMARK_SIGMA_M = 1.5e-3  # of a triangulated landmark against the same point of the model
-_EXPRESSION_SHARE = 0.5  # standard deviation granted to expressions against identity, at the start
+_EXPRESSION_SIGMA = 0.5  # standard deviation of expression coefficients; that of identity coefficients is 1
 _OUTLIER_M = 8e-3
-_ROUNDS = 15
-_TRIMMING_ROUNDS = (2, 5, 8)  # after which outliers are found anew
-LEAST_LANDMARKS = 6
-LEAST_OVERLAP = 0.7
+_MAX_ITERATIONS = 15
+_OUTLIER_ITERATIONS = (2, 5, 8)  # after which outliers are determined again
 _YAWS, _PITCHES = np.radians(np.arange(0, 360, 45)), np.radians([-25.0, 0.0, 25.0])
-_REFINED = 5  # of the starts that are refined
+_REFINED_POSES = 5  # the best ones of each roll
 
 
 def from_landmarks(
@@ -31,18 +31,27 @@ def from_landmarks(
     points: Float[np.ndarray, "L 3"],
     *,
     free_scale: bool,
-    neutral: Start | None = None,
-) -> Start:
-    """A similarity and first coefficients from triangulated landmarks (world, metres; NaN = unseen).
+    neutral: InitialGuess | None = None,
+) -> InitialGuess:
+    """Return the similarity transform and coefficients that fit triangulated landmarks best.
 
-    Alternates the rigid motion (Umeyama 1991) with the coefficients' ridge solution. Landmarks that disagree with the
-    model by more than 8 mm after the first rounds are left out and named: schemes differ along the jaw.
-    From a `neutral`, its identity, offsets and scale are kept and only pose and expression are sought.
-    At least LEAST_LANDMARKS must be seen.
+    Alternates the similarity transform [Umeyama 1991] with ridge regression for the coefficients. Landmarks farther
+    than 8 mm and than three times the median from the model are outliers, re-determined after some iterations: schemes
+    differ along the jaw.
+
+    Args:
+        data: the model.
+        scheme: of the model; names the same points.
+        points: world, metres; NaN where not triangulated. At least `MIN_LANDMARKS` must be finite.
+        free_scale: estimate the size of the head too; else it is the model's.
+        neutral: of the same subject: its identity, offsets and scale are kept, pose and expression are estimated.
+
+    Returns:
+        The guess; its notes name the outliers.
     """
     template = scheme.points(data.template_vertex_positions.astype(np.float64))
     identity_basis = scheme.points(data.vertex_identity_basis.astype(np.float64))
-    basis = scheme.points(data.expression_basis.astype(np.float64)) * _EXPRESSION_SHARE
+    basis = scheme.points(data.expression_basis.astype(np.float64)) * _EXPRESSION_SIGMA
     if neutral is None:
         basis = np.concatenate([identity_basis, basis])
     else:
@@ -50,41 +59,52 @@ def from_landmarks(
         template = template + np.tensordot(neutral.identity.astype(np.float64), identity_basis, 1)
         template = neutral.scale * (template + scheme.points(neutral.offsets.astype(np.float64)))
         basis = neutral.scale * basis
-    used = np.isfinite(points).all(1)
-    seen = used.copy()
+    valid = np.isfinite(points).all(1)
+    used = valid.copy()
     coefficients = np.zeros(len(basis))
-    for round_ in range(_ROUNDS):
+    for iteration in range(_MAX_ITERATIONS):
         model = template + np.tensordot(coefficients, basis, 1)
-        scale, rotation, shift = similarity(model[used], points[used], free_scale=free_scale and neutral is None)
-        wanted = (points - shift) @ rotation / scale - template
+        scale, rotation, shift = similarity_transform(
+            model[used], points[used], free_scale=free_scale and neutral is None
+        )
+        target = (points - shift) @ rotation / scale - template
         matrix = basis[:, used].reshape(len(basis), -1).T / _LANDMARK_SIGMA_M
-        right = wanted[used].ravel() / _LANDMARK_SIGMA_M
+        right = target[used].ravel() / _LANDMARK_SIGMA_M
         coefficients = matrix.T @ np.linalg.solve(matrix @ matrix.T + np.eye(len(right)), right)
-        if round_ in _TRIMMING_ROUNDS:
+        if iteration in _OUTLIER_ITERATIONS:
             fitted = scale * (template + np.tensordot(coefficients, basis, 1)) @ rotation.T + shift
             distance = np.linalg.norm(fitted - points, axis=1)
-            keep = seen & (distance < max(_OUTLIER_M, 3 * np.median(distance[seen])))
-            used = keep if keep.sum() >= LEAST_LANDMARKS else used
-    split = len(basis) - len(data.expression_basis)
-    dropped = np.flatnonzero(seen & ~used)
-    note = f"landmarks {_ranges(dropped)} of scheme {scheme.name} lie elsewhere than the model's: left out"
-    total = scale if neutral is None else neutral.scale
-    return Start(
+            inliers = valid & (distance < max(_OUTLIER_M, 3 * np.median(distance[valid])))
+            used = inliers if inliers.sum() >= MIN_LANDMARKS else used
+    identity_count = len(basis) - len(data.expression_basis)
+    outliers = np.flatnonzero(valid & ~used)
+    note = f"landmarks {_ranges(outliers)} of scheme {scheme.name} do not fit the model's: excluded"
+    total_scale = scale if neutral is None else neutral.scale
+    return InitialGuess(
         rotation=rotation,
-        position=total * rotation @ pivot(data) + shift,
-        scale=total,
-        identity=coefficients[:split] if neutral is None else neutral.identity,
-        expression=coefficients[split:] * _EXPRESSION_SHARE,
+        position=total_scale * rotation @ pivot(data) + shift,
+        scale=total_scale,
+        identity=coefficients[:identity_count] if neutral is None else neutral.identity,
+        expression=coefficients[identity_count:] * _EXPRESSION_SIGMA,
         offsets=None if neutral is None else neutral.offsets,
-        landmarks_used=used,
-        notes=(note,) if len(dropped) else (),
+        landmarks_used={scheme.name: used},
+        notes=(note,) if len(outliers) else (),
     )
 
 
-def similarity(
+def similarity_transform(
     source: Float[np.ndarray, "P 3"], target: Float[np.ndarray, "P 3"], *, free_scale: bool
 ) -> tuple[float, Float[np.ndarray, "3 3"], Float[np.ndarray, "3"]]:
-    """Scale, rotation, shift with target = scale * rotation @ source + shift in the least squares sense (Umeyama)."""
+    """Return the similarity transform of least squares between two point sets [Umeyama 1991].
+
+    Args:
+        source: points.
+        target: the corresponding points, in the same unit.
+        free_scale: estimate the scale; else it is 1.
+
+    Returns:
+        Scale s, rotation R and translation t with target = s R source + t.
+    """
     a, b = source.mean(0), target.mean(0)
     u, s, vt = np.linalg.svd((target - b).T @ (source - a))
     flip = np.diag([1, 1, np.sign(np.linalg.det(u @ vt))])
@@ -100,45 +120,53 @@ def _ranges(indices: np.ndarray) -> str:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Candidate:
-    """One turn of the head that was tried, and how well its silhouette covered the masks (intersection over union)."""
+class PoseCandidate:
+    """An initial guess that was tried, and how well its rendering covers the targets."""
 
-    start: Start
-    overlap: float
+    initial: InitialGuess
+    overlap: float  # intersection over union of the masks
     score: float  # overlap plus agreement of normals and classes
 
 
 def from_masks(
     data: GNMData,
     targets: Targets,
-    assess: Callable[[Start], Candidate],
-    refine: Callable[[Start], Start],
-) -> Start:
-    """A start without landmarks: 24 turns of the head at the masks' common centre, the best refined as rigid bodies.
+    assess: Callable[[InitialGuess], PoseCandidate],
+    refine: Callable[[InitialGuess], InitialGuess],
+) -> InitialGuess:
+    """Return an initial guess without landmarks: the best of 24 head poses at the masks' common centre.
 
-    The rig's cameras are taken to stand upright and in front of the subject, give or take; failing that, they are
-    taken to be rolled by quarter turns.
+    The best five of the poses are refined as rigid bodies. Cameras are assumed to stand upright and around the front of
+    the subject; if no pose covers the masks, they are assumed to be rolled by quarter turns.
+
+    Args:
+        data: the model.
+        targets: of all views, at a coarse level.
+        assess: renders a guess and rates it.
+        refine: improves a guess's pose.
 
     Raises:
-        InputError: no turn covers the masks by 0.7.
+        InputError: no pose reaches `MIN_OVERLAP`.
     """
     centre = _masks_centre(targets)
-    best: Candidate | None = None
+    best: PoseCandidate | None = None
     for roll in np.radians([0.0, 90.0, -90.0, 180.0]):
         upright = _upright(targets, centre) @ Rotation.from_euler("z", roll).as_matrix()
-        turns = [upright @ Rotation.from_euler("YX", (yaw, pitch)).as_matrix() for yaw in _YAWS for pitch in _PITCHES]
-        tried = [assess(Start(rotation=turn, position=centre)) for turn in turns]
-        tried.sort(key=lambda c: -c.score)
-        refined = [assess(refine(c.start)) for c in tried[:_REFINED]]
-        best = max([*refined, *([best] if best else [])], key=lambda c: c.score)
-        if best.overlap >= LEAST_OVERLAP:
-            note = f"no landmarks: best of {len(turns)} turns of the head, mask overlap {best.overlap:.2f}"
-            return replace(best.start, notes=(note,))
+        rotations = [
+            upright @ Rotation.from_euler("YX", (yaw, pitch)).as_matrix() for yaw in _YAWS for pitch in _PITCHES
+        ]
+        candidates = [assess(InitialGuess(rotation=rotation, position=centre)) for rotation in rotations]
+        candidates.sort(key=lambda candidate: -candidate.score)
+        refined = [assess(refine(candidate.initial)) for candidate in candidates[:_REFINED_POSES]]
+        best = max([*refined, *([best] if best else [])], key=lambda candidate: candidate.score)
+        if best.overlap >= MIN_OVERLAP:
+            note = f"no landmarks: best of {len(rotations)} head poses, mask overlap {best.overlap:.2f}"
+            return replace(best.initial, notes=(note,))
     assert best is not None
     raise InputError(
-        "The head was not found",
+        "The pose of the head cannot be estimated",
         where="masks of the capture; there are no landmarks in a scheme that the model knows",
-        expected=f"a turn of the head that covers the masks by at least {LEAST_OVERLAP}",
+        expected=f"a head pose that covers the masks by at least {MIN_OVERLAP}",
         got=f"{best.overlap:.2f} at best",
         fix="give landmarks of a scheme that the model has (head_sparse_<scheme>.txt beside it, or --landmarks), or "
         "check the masks and that cameras and model are in metres",
@@ -146,10 +174,10 @@ def from_masks(
 
 
 def _masks_centre(targets: Targets) -> Float[np.ndarray, "3"]:
-    """The point nearest to the rays through the centres of the heads' boxes."""
+    """The point closest to the rays through the centres of the heads' bounding boxes; world, metres."""
     matrix, right = np.zeros((3, 3)), np.zeros(3)
     for i, camera in enumerate(targets.pixels.cameras):
-        head = _head(targets, i)
+        head = _head_mask(targets, i)
         if not head.any():
             continue
         rows, columns = np.flatnonzero(head.any(1)), np.flatnonzero(head.any(0))
@@ -162,13 +190,13 @@ def _masks_centre(targets: Targets) -> Float[np.ndarray, "3"]:
     return np.linalg.solve(matrix, right)
 
 
-def _head(targets: Targets, view: int) -> Bool[np.ndarray, "H W"]:
+def _head_mask(targets: Targets, view: int) -> Bool[np.ndarray, "H W"]:
     head = (targets.mask > 0.5) & (targets.mask_weight > 0) & (targets.pixels.view == view)
     return targets.pixels.image(head[:, None].float())[view, ..., 0].numpy() > 0.5
 
 
 def _upright(targets: Targets, centre: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:
-    """World from model for a head that faces the middle of the rig, upright as the images are."""
+    """World from model for a head that faces the centre of the cameras, upright as the images."""
     up = -np.mean([camera.T_cam_world[1, :3] for camera in targets.pixels.cameras], 0)
     front = np.mean([camera.centre for camera in targets.pixels.cameras], 0) - centre
     front -= up * (front @ up) / (up @ up)
@@ -176,26 +204,41 @@ def _upright(targets: Targets, centre: Float[np.ndarray, "3"]) -> Float[np.ndarr
     return np.stack([np.cross(y, z), y, z], 1)
 
 
-def assess(start: Start, rendered: Rendered, targets: Targets) -> Candidate:
-    """How well a rendered start covers the masks, and agrees with normals and classes where it does."""
-    known = targets.mask_weight > 0
-    drawn, seen = (rendered.mask > 0.5) & known, (targets.mask > 0.5) & known
-    overlap = ((drawn & seen).sum() / (drawn | seen).sum().clamp_min(1)).item()
-    both = drawn & seen
+def rate_candidate(initial: InitialGuess, rendered: Rendered, targets: Targets) -> PoseCandidate:
+    """Return how well a rendered initial guess covers the masks, and agrees with normals and classes where it does.
+
+    Args:
+        initial: the guess.
+        rendered: its rendering at the pixels of the targets.
+        targets: of the same views.
+    """
+    compared = targets.mask_weight > 0
+    rendered_mask, target_mask = (rendered.mask > 0.5) & compared, (targets.mask > 0.5) & compared
+    both = rendered_mask & target_mask
+    overlap = (both.sum() / (rendered_mask | target_mask).sum().clamp_min(1)).item()
     normal_weight, class_weight = targets.normal_weight * both, targets.class_weight * both
     cosine = (rendered.normals * targets.normals).sum(-1)
     agree = (cosine * normal_weight).sum() / normal_weight.sum().clamp_min(1e-6)
-    # Skin is nearly everywhere: what tells one turn from another is the share of everything else.
+    # Most pixels are skin in every pose; the other classes distinguish poses.
     other = (targets.classes[..., 1:] * class_weight[..., None]).sum()
-    met = (torch.minimum(rendered.classes, targets.classes)[..., 1:] * class_weight[..., None]).sum()
-    return Candidate(start=start, overlap=overlap, score=overlap + agree.item() + (met / other.clamp_min(1)).item())
+    matched = (torch.minimum(rendered.classes, targets.classes)[..., 1:] * class_weight[..., None]).sum()
+    score = overlap + agree.item() + (matched / other.clamp_min(1)).item()
+    return PoseCandidate(initial=initial, overlap=overlap, score=score)
 
 
-def spread_views(cameras: Sequence[Camera], count: int) -> list[int]:
-    """`count` views that look from as different places as possible, the first one included; in order."""
+def select_spread_views(cameras: Sequence[Camera], count: int) -> list[int]:
+    """Return `count` views whose cameras are as far apart as possible (farthest point sampling from the first).
+
+    Args:
+        cameras: of all views.
+        count: at most so many.
+
+    Returns:
+        Indices into `cameras`, sorted; the first camera is among them.
+    """
     centres = np.stack([camera.centre for camera in cameras])
-    chosen = [0]
-    while len(chosen) < min(count, len(centres)):
-        distance = np.linalg.norm(centres[:, None] - centres[chosen][None], axis=-1).min(1)
-        chosen.append(int(distance.argmax()))
-    return sorted(chosen)
+    selected = [0]
+    while len(selected) < min(count, len(centres)):
+        distance = np.linalg.norm(centres[:, None] - centres[selected][None], axis=-1).min(1)
+        selected.append(int(distance.argmax()))
+    return sorted(selected)

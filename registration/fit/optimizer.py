@@ -1,5 +1,6 @@
-"""The one optimisation loop. It is handed blocks of unknowns and an objective, and knows none by name."""
+"""The optimization loop. It gets blocks of parameters and an objective, and knows none of them by name."""
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import Protocol, runtime_checkable
 
@@ -13,16 +14,18 @@ History = dict[str, list[float]]
 
 
 @runtime_checkable
-class Block(Protocol):
-    """Unknowns that are updated by one rule. Their gradients are cleared and filled by the loop."""
+class ParameterBlock(Protocol):
+    """Tensors that are updated by one rule. Their gradients are cleared and filled by the loop."""
 
     tensors: Sequence[Tensor]
 
-    def step(self, progress: float) -> None: ...
+    def step(self, progress: float) -> None:
+        """Update the tensors from their gradients when a fraction `progress` of the steps is done."""
+        ...
 
 
 class AdamBlock:
-    """Adam, for unknowns of comparable scale."""
+    """Adam [Kingma 2015], for parameters of comparable scale."""
 
     def __init__(self, tensors: Sequence[Tensor], rate: Rate, betas: tuple[float, float] = (0.8, 0.95)):
         self.tensors = tensors
@@ -31,16 +34,22 @@ class AdamBlock:
 
     def step(self, progress: float) -> None:
         for group in self._optimizer.param_groups:
-            group["lr"] = self._rate.at(progress)
+            group["lr"] = self._rate.value(progress)
         self._optimizer.step()
 
 
 class AdamUniformBlock:
-    """Adam with one step size for all vertices (Nicolet 2021), so that a field's direction is kept.
+    """Adam with one step size for all vertices [Nicolet 2021], so that the direction of a field is kept.
 
-    [Nicolet 2021] divides by the largest second moment; here by a high quantile, since one wild vertex would rule it.
-    Vertices may be told apart in `groups`, each with a step size of its own times its `pace`: where images pull
-    weakly everywhere, vertices would else hardly move.
+    The paper divides by the largest second moment; here it is a high quantile, which single outliers do not change.
+
+    Args:
+        latent: the field.
+        rate: the learning rate.
+        betas: decay of the first and second moments.
+        groups: a group per vertex, each with its own second moment; without them, vertices of a region where all
+            gradients are weak would hardly move. None: one group.
+        rate_scale: factor of the rate, per group.
     """
 
     QUANTILE = 0.998
@@ -51,16 +60,16 @@ class AdamUniformBlock:
         rate: Rate,
         betas: tuple[float, float] = (0.9, 0.99),
         groups: Int[Tensor, "V"] | None = None,
-        pace: Sequence[float] = (1.0,),
+        rate_scale: Sequence[float] = (1.0,),
     ):
         self.tensors: Sequence[Tensor] = (latent,)
         self._rate = rate
         self._betas = betas
         self._first = torch.zeros_like(latent)
         self._group = torch.zeros(len(latent), dtype=torch.long, device=latent.device) if groups is None else groups
-        self._members = [(self._group == number).nonzero()[:, 0] for number in range(len(pace))]
-        self._pace = latent.new_tensor(pace)
-        self._second = torch.zeros_like(self._pace)
+        self._members = [(self._group == number).nonzero()[:, 0] for number in range(len(rate_scale))]
+        self._rate_scale = latent.new_tensor(rate_scale)
+        self._second = torch.zeros_like(self._rate_scale)
         self._steps = 0
 
     @torch.no_grad()
@@ -71,36 +80,45 @@ class AdamUniformBlock:
         b1, b2 = self._betas
         self._first.lerp_(latent.grad, 1 - b1)
         squared = latent.grad.square().sum(-1)
-        largest = [squared[own].quantile(self.QUANTILE) if len(own) else squared.new_zeros(()) for own in self._members]
+        largest = [
+            squared[rows].quantile(self.QUANTILE) if len(rows) else squared.new_zeros(()) for rows in self._members
+        ]
         self._second.lerp_(torch.stack(largest), 1 - b2)
-        scale = (self._second / (1 - b2**self._steps)).sqrt() + 1e-12
-        pace = (self._pace / scale).index_select(0, self._group)
-        latent -= self._rate.at(progress) / (1 - b1**self._steps) * pace[:, None] * self._first
+        root = (self._second / (1 - b2**self._steps)).sqrt() + 1e-12
+        scale = (self._rate_scale / root).index_select(0, self._group)
+        latent -= self._rate.value(progress) / (1 - b1**self._steps) * scale[:, None] * self._first
 
 
-def minimise(
-    blocks: Sequence[Block],
+def minimize(
+    blocks: Sequence[ParameterBlock],
     objective: Callable[[int], Mapping[str, Tensor]],
     steps: int,
     after_step: Callable[[int], None] = lambda step: None,
 ) -> tuple[History, str | None]:
-    """Take `steps` steps on the sum of the objective's weighted terms.
+    """Take `steps` steps on the sum of the objective's weighted losses.
 
-    Returns the value of every term at every step, and None or why it had to stop: a term or a gradient that is not
-    finite. The unknowns are then those before that step.
+    Args:
+        blocks: what is optimized.
+        objective: step -> weighted losses by name.
+        steps: how many.
+        after_step: called with the number of every step that was taken.
+
+    Returns:
+        The value of every loss at every step; and None, or why it stopped: a loss or a gradient that is not finite. The
+        parameters are then those before that step.
     """
     history: History = {}
     for step in range(steps):
-        terms = objective(step)
-        for name, value in terms.items():
+        losses = objective(step)
+        for name, value in losses.items():
             history.setdefault(name, []).append(value.item())
-        broken = [name for name, values in history.items() if not torch.isfinite(torch.tensor(values[-1]))]
-        if broken:
-            return history, f"{', '.join(broken)} not finite at step {step}"
+        invalid = [name for name, values in history.items() if not math.isfinite(values[-1])]
+        if invalid:
+            return history, f"{', '.join(invalid)} not finite at step {step}"
         for block in blocks:
             for tensor in block.tensors:
                 tensor.grad = None
-        torch.stack(list(terms.values())).sum().backward()
+        torch.stack(list(losses.values())).sum().backward()
         gradients = [tensor.grad for block in blocks for tensor in block.tensors if tensor.grad is not None]
         if not all(gradient.isfinite().all() for gradient in gradients):
             return history, f"gradient not finite at step {step}"

@@ -1,6 +1,6 @@
-"""Stages and recipes: which unknowns are free, what is compared, at which resolution, for how long.
+"""Stages and recipes: which variables are free, what is compared, at which resolution, for how long.
 
-A recipe is a function that returns its stages; the resolved values are saved with every result.
+A recipe is the result of a function without parameters; its values are saved with every registration.
 """
 
 import importlib
@@ -18,91 +18,96 @@ T = TypeVar("T")
 
 @dataclass(frozen=True, kw_only=True)
 class Rate:
-    """A learning rate: `start`, held for a share of the steps, then falling geometrically to `end`."""
+    """A learning rate: `start`, held for a fraction of the steps, then decaying geometrically to `end`."""
 
     start: float
     end: float
-    hold: float = 0.0
+    hold: float = 0.0  # fraction of the steps
 
-    def at(self, progress: float) -> float:
-        """The rate when a share `progress` of the steps is done."""
+    def value(self, progress: float) -> float:
+        """Return the rate when a fraction `progress` of the steps is done."""
         fall = max(0.0, progress - self.hold) / max(1e-9, 1.0 - self.hold)
         return self.start * (self.end / self.start) ** fall
 
 
 @dataclass(frozen=True, kw_only=True)
 class Weights:
-    """How much each term counts; 0 leaves it out. Image terms are means over the subject's pixels."""
+    """Factor of each loss; 0 leaves it out. Image losses are means over the subject's pixels."""
 
     normals: float = 1.0
-    normal_truncation: float = 2.0  # length of a normal's error beyond which it is an outlier
+    normal_truncation: float = 2.0  # length of the difference of unit normals beyond which it is an outlier
     rgb: float = 0.0
     ssim: float = 0.0
     mask: float = 0.5
     classes: float = 0.2
-    eye_classes: float = 4.0  # times `classes`, for eyes: small, but lids depend on them
+    eye_classes: float = 4.0  # times `classes`, of the eyes: small, but the eyelids depend on them
     landmarks: float = 0.02
     landmark_sigma_px: float = 3.0  # at 512 px of head height
     identity: float = 2e-3
     expression: float = 2e-3
     rotations: float = 0.1  # joints other than the root, per rad^2
-    eyes: float = 1.0  # eyeballs moved out of the model's place, per m^2
+    eyes: float = 1.0  # translation of the eyeballs relative to the model, per m^2
     eye_scale: float = 2e-3
-    offsets: float = 2e4  # per m^2: how hard images are taken to pull, which the lengths below are balanced against
-    contacts: float = 0.0  # per mm^2, summed over the vertices that lie too deep in another part
-    tongue: float = 1e-5  # the same of the tongue, which is mostly unseen: little more than its prior's pull
-    slide: float = 0.0  # dissimilarity of the neutral's texture and the images unwrapped; expressions only
+    offsets: float = 2e4  # per m^2: the assumed strength of the image losses, against which `Lengths` are balanced
+    contacts: float = 0.0  # per mm^2 of excess depth, summed over the vertices inside another part
+    tongue: float = 1e-5  # the same of the tongue, which is mostly occluded: about as strong as its prior
+    slide: float = 0.0  # dissimilarity of the neutral's texture and the unwrapped images; expressions only
 
 
 @dataclass(frozen=True, kw_only=True)
 class Lengths:
-    """How free offsets are, in mm (losses/regularization.py and geometry/large_steps.py say what each does)."""
+    """How smooth free offsets are, in mm (see losses/regularization.py and geometry/large_steps.py)."""
 
-    smoothing_mm: float  # one step moves a patch of about this size: the way there, not where it ends
-    half_gain_mm: float  # of waves of this length the images keep one half, of shorter ones less
-    decay_mm: float = 25.0  # so far an offset reaches into what no image shows
+    smoothing_mm: float  # size of the patch that a step moves: affects the path of the optimization, not its minimum
+    half_gain_mm: float  # wavelength of a deformation that regularization halves; shorter ones are reduced more
+    decay_mm: float = 25.0  # over which an offset decays where there is no data
 
 
 @dataclass(frozen=True, kw_only=True)
-class Region:
+class OffsetRegion:
     """A part of the skin where offsets have lengths and a step size of their own."""
 
     name: str  # a key of regions.offset_regions
-    length: float = 1.0  # times a stage's lengths, the decay's excepted
-    pace: float = 1.0  # times a stage's rate, against the largest gradients in the region itself
+    length: float = 1.0  # factor of a stage's smoothing and half-gain lengths
+    rate_scale: float = 1.0  # factor of a stage's rate, relative to the largest gradients in the region itself
 
 
 @dataclass(frozen=True, kw_only=True)
 class Stage:
-    """A run of steps with one set of free unknowns."""
+    """Steps with one set of free variables and weights."""
 
     name: str
     steps: int
     level: int  # of the pyramid: 0 is the finest, each next one half
     views_per_step: int = 8
     weights: Weights = Weights()
-    free: tuple[tuple[str, Rate], ...] = ()  # unknowns and their rates; all but `offsets` are updated by Adam
+    free: tuple[tuple[str, Rate], ...] = ()  # variables and their rates; all but `offsets` are updated by Adam
     lengths: Lengths | None = None  # needed while `offsets` is free
-    texture: bool = False  # estimate texture and camera gains along the way
+    texture: bool = False  # estimate texture and camera gains
 
     def frees(self, name: str) -> bool:
-        return any(name == unknown for unknown, _ in self.free)
+        """Return whether a variable is free in this stage."""
+        return any(name == variable for variable, _ in self.free)
 
 
 @dataclass(frozen=True, kw_only=True)
 class Recipe:
+    """The schedule of a fit."""
+
     name: str
     stages: tuple[Stage, ...]
     finest_head_px: int = 512  # resolution of level 0, as the head's height
     levels: int = 3
     texture_px: int = 1024
-    slide_px: int = 512  # of the textures compared for sliding
-    edge_samples: float = 1.0  # a pixel of silhouette; 0: silhouettes move nothing, as in renderers without edges
-    scale: bool = True  # free the overall size: a basis rebuilt from scale-free data holds none
-    regions: tuple[Region, ...] = (
-        Region(name="lips", length=0.6),
-        Region(name="lids", length=0.4),
-        Region(name="nostrils", length=0.5, pace=10.0),
+    slide_px: int = 512  # of the textures that the `slide` loss compares
+    edge_samples: float = (
+        1.0  # per pixel of silhouette, for its gradient; 0: none, as in renderers without edge sampling
+    )
+    scale: bool = True  # free the overall size, which a basis built from scale-free data does not contain
+    regions: tuple[OffsetRegion, ...] = (
+        OffsetRegion(name="lips", length=0.6),
+        OffsetRegion(name="lids", length=0.4),
+        OffsetRegion(name="nostrils", length=0.5, rate_scale=10.0),
     )
 
 
@@ -125,7 +130,7 @@ def _model(steps: int) -> Stage:
 def _offsets(
     smoothing_mm: float, half_gain_mm: float, steps: int, level: int, start: float, end: float, ssim: float = 0.06
 ) -> Stage:
-    # Pose and expression stand still: offsets would make up for what they drift, and teeth would be left behind.
+    # Pose and expression are fixed: offsets would compensate their drift, which teeth, without offsets, would follow.
     return Stage(
         name=f"offsets {smoothing_mm:g} mm",
         steps=steps,
@@ -138,7 +143,7 @@ def _offsets(
 
 
 def draft(*, scale: bool = True) -> Recipe:
-    """A minute on a laptop: model, then offsets up to a head of about 512 px."""
+    """Minutes: the model's parameters, then offsets, up to a head of about 512 px."""
     stages = (
         _model(100),
         _offsets(20, 12, 30, level=2, start=4e-3, end=2e-3),
@@ -150,7 +155,7 @@ def draft(*, scale: bool = True) -> Recipe:
 
 
 def studio(*, scale: bool = True) -> Recipe:
-    """The full quality: more views at every step, longer, up to the images' own resolution."""
+    """Full quality: more views per step and more steps, up to a head of about 1024 px."""
     stages = (
         _model(150),
         _offsets(20, 12, 50, level=2, start=4e-3, end=2e-3),
@@ -163,7 +168,7 @@ def studio(*, scale: bool = True) -> Recipe:
 
 
 def preview(*, scale: bool = True) -> Recipe:
-    """Seconds, for small images: half of draft's levels and steps, and nothing looks after parts that touch."""
+    """Seconds, for small images: about half of draft's steps, two levels, no self-intersection penalty."""
     stages = (
         _model(70),
         _offsets(20, 12, 20, level=1, start=4e-3, end=2e-3),
@@ -178,24 +183,24 @@ def preview(*, scale: bool = True) -> Recipe:
 
 
 def in_model(*, scale: bool = True) -> Recipe:
-    """No offsets: the model's own parameters alone, as for testing how much a model can say."""
+    """No offsets: the model's parameters alone, to test how much of a head a model can represent."""
     fine = replace(_model(60), name="model, finer", level=1)
     slow = tuple((name, replace(rate, start=rate.start / 3, end=rate.end / 3)) for name, rate in fine.free)
     return Recipe(name="in_model", stages=(_model(100), replace(fine, free=slow, texture=True)), scale=scale)
 
 
-def rigid(level: int) -> Stage:
-    """Pose and size alone, to judge a start."""
+def rigid_stage(level: int) -> Stage:
+    """Return a stage for pose and size alone, to compare initial guesses."""
     rates = (("root", 2e-2), ("position", 3e-3), ("scale", 1e-2))
     free = tuple((name, Rate(start=rate, end=rate * 0.2)) for name, rate in rates)
     return Stage(name="rigid", steps=30, level=level, free=free, weights=Weights(mask=1.0, landmarks=0.0, tongue=0.0))
 
 
-def expression_of(recipe: Recipe) -> Recipe:
-    """The same recipe for an expression that starts from its subject's neutral: identity and size stay."""
-    kept = ("identity", "scale")
+def expression_recipe(recipe: Recipe) -> Recipe:
+    """Return the recipe for an expression that starts from its subject's neutral: identity and size are fixed."""
+    fixed = ("identity", "scale")
     stages = tuple(
-        replace(stage, free=tuple((name, rate) for name, rate in stage.free if name not in kept))
+        replace(stage, free=tuple((name, rate) for name, rate in stage.free if name not in fixed))
         for stage in recipe.stages
     )
     return replace(recipe, stages=stages)

@@ -1,7 +1,7 @@
-"""What a fit solves for, and the mesh that follows from it."""
+"""The variables of a fit, and the mesh they describe."""
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -11,7 +11,6 @@ from torch import Tensor
 
 from registration.frames import axis_angle_to_matrix, matrix_to_axis_angle
 from registration.geometry.large_steps import LargeSteps
-from registration.geometry.topology import edges
 from registration.model.gnm import GNM
 from registration.model.gnm_npz import GNMData
 from registration.model.regions import exterior, group, neck_other
@@ -19,29 +18,51 @@ from registration.types import Parameters
 
 
 @dataclass(frozen=True, kw_only=True)
-class Start:
-    """Where a fit begins. The pose puts the model's pivot (its exterior's centre) at `position`, turned and scaled."""
+class InitialGuess:
+    """Values of the variables before the first step.
+
+    The pose places the model's pivot (the centre of its exterior) at `position`, rotated and scaled about it.
+    """
 
     rotation: Float[np.ndarray, "3 3"]  # of the whole head, world from model
     position: Float[np.ndarray, "3"]  # world, metres
     scale: float = 1.0
     identity: Float[np.ndarray, "I"] | None = None
     expression: Float[np.ndarray, "E"] | None = None
-    joints: Float[np.ndarray, "C 3"] | None = None  # rotations of all joints but the root
-    offsets: Float[np.ndarray, "V 3"] | None = None
-    landmarks_used: Bool[np.ndarray, "L"] | None = None  # of the scheme it was found with
-    notes: tuple[str, ...] = ()  # what the person should know about how it was found
+    joints: Float[np.ndarray, "C 3"] | None = None  # rotations of all joints but the root, axis-angle
+    offsets: Float[np.ndarray, "V 3"] | None = None  # bind pose, metres
+    landmarks_used: Mapping[str, Bool[np.ndarray, "L"]] = field(default_factory=dict)  # scheme -> without outliers
+    notes: tuple[str, ...] = ()  # for the user: how the guess was estimated
 
 
-class Unknowns:
-    """Tensors by name. A stage frees some of them; `vertices` is differentiable in the free ones.
+class Latent:
+    """Offsets in the coordinates of large steps (Nicolet 2021): u = M d, so that steps on u change d smoothly.
 
-    The root's rotation is kept as a small turn of a constant one, and the position is where the pivot lies: in these
-    terms turning and moving are independent, and no rotation is near the axis-angle's seam. Free offsets live on the
-    skin; each eyeball may leave the model's place by a move and a scale about its centre, and keeps its shape.
+    It exists while a stage optimizes the offsets d.
     """
 
-    def __init__(self, model: GNM, data: GNMData, start: Start):
+    def __init__(self, steps: LargeSteps, offsets: Float[Tensor, "S 3"]):
+        self._steps = steps
+        self.tensor: Float[Tensor, "S 3"] = steps.latent(offsets).requires_grad_(True)
+
+    def offsets(self) -> Float[Tensor, "S 3"]:
+        """Return d = M^-1 u, bind pose, metres; differentiable."""
+        return self._steps.displacement(self.tensor)
+
+
+class Variables:
+    """Tensors by name, and the free offsets of the skin. A stage frees some; the mesh is differentiable in those.
+
+    The names: identity (I) and expression (E) coefficients; root (3), joints (C 3), axis-angle rotations; position (3),
+    of the pivot in the world, metres; scale, its logarithm; eyes (2 4), of each eyeball a translation in the bind pose,
+    metres, and the logarithm of a scale about its centre.
+
+    The root rotates by a small rotation times a constant one, and the position is that of the pivot: in these
+    coordinates rotation and translation are independent, and no rotation is near the singularity of the axis-angle
+    representation. Eyeballs keep their shape.
+    """
+
+    def __init__(self, model: GNM, data: GNMData, initial: InitialGuess):
         device, count = model.template.device, len(data.template_vertex_positions)
 
         def tensor(value: Any, *shape: int) -> Tensor:
@@ -50,112 +71,95 @@ class Unknowns:
 
         self.model = model
         self.pivot = tensor(pivot(data), 3)
-        self.base_rotation = tensor(start.rotation, 3, 3)
+        self.base_rotation = tensor(initial.rotation, 3, 3)
         self.skin = skin_vertices(data)
         self._skin = torch.as_tensor(self.skin, device=device)
         eyes = [np.flatnonzero(group(data, name) > 0.5) for name in ("left_eye", "right_eye")]
         self._eyes = [torch.as_tensor(index, device=device) for index in eyes]
-        self.fixed_offsets = tensor(None, count, 3)  # of all that is neither skin nor free
         self.tensors = {
-            "identity": tensor(start.identity, len(model.identity_basis)),
-            "expression": tensor(start.expression, len(model.expression_basis)),
+            "identity": tensor(initial.identity, len(model.identity_basis)),
+            "expression": tensor(initial.expression, len(model.expression_basis)),
             "root": tensor(None, 3),
-            "joints": tensor(start.joints, len(model.parents) - 1, 3),
-            "position": tensor(start.position, 3),
-            "scale": tensor(np.log(start.scale)),
+            "joints": tensor(initial.joints, len(model.parents) - 1, 3),
+            "position": tensor(initial.position, 3),
+            "scale": tensor(np.log(initial.scale)),
             "eyes": tensor(None, 2, 4),
-            "offsets": tensor(start.offsets, count, 3)[self._skin],
         }
-        if start.offsets is not None:
-            self.fixed_offsets = tensor(start.offsets, count, 3)
-            self.fixed_offsets[self._skin] = 0
+        self.fixed_offsets = tensor(initial.offsets, count, 3)  # of all vertices but the skin's
+        self._offsets = self.fixed_offsets[self._skin]  # of the skin, unless there is a latent
+        self.fixed_offsets[self._skin] = 0
+        self.reference_offsets = self._offsets.clone()  # where the penalties of the offsets are zero
         outside = torch.as_tensor(np.flatnonzero(exterior(data)), device=device)
-        shown = model.expression_basis.unflatten(-1, (-1, 3)).index_select(1, outside)
-        self._inner = (shown == 0).all(-1).all(-1)  # expression components that move nothing of the outer skin
-        self.reference_offsets = self.tensors["offsets"].clone()  # what the offsets' penalties are measured from
-        self._steps: LargeSteps | None = None
-        self._bind: tuple[Tensor, Tensor] | None = None
+        visible = model.expression_basis.unflatten(-1, (-1, 3)).index_select(1, outside)
+        self._inner = (visible == 0).all(-1).all(-1)  # expression components that do not move the outer skin
+        self.latent: Latent | None = None
+        self._fixed_bind_pose: tuple[Tensor, Tensor] | None = None  # while identity and expression are fixed
 
     def __getitem__(self, name: str) -> Tensor:
         return self.tensors[name]
 
-    def free(self, names: Sequence[str], steps: LargeSteps | None) -> None:
-        """Make exactly these require gradients. While `offsets` is free, its tensor holds the large steps' latent."""
+    def set_free(self, names: Collection[str], steps: LargeSteps | None = None) -> None:
+        """Start a stage: let exactly these variables require gradients.
+
+        Args:
+            names: of `tensors`, and "offsets".
+            steps: the preconditioner of the offsets if they are among the names: `latent` then replaces them until
+                `commit_latent`.
+        """
         for tensor in self.tensors.values():
             tensor.requires_grad_(False)
-        self.settle()
+        self.commit_latent()
         if "offsets" in names:
             assert steps is not None
-            self._steps = steps
-            self.tensors["offsets"] = steps.latent(self.tensors["offsets"])
+            self.latent = Latent(steps, self._offsets)
         if not {"identity", "expression"} & set(names):
             with torch.no_grad():
-                self._bind = self._bind_pose(self.tensors)
+                self._fixed_bind_pose = self._bind_pose(self.tensors)
         for name in names:
-            self.tensors[name].requires_grad_(True)
-
-    def settle(self) -> None:
-        """Leave the stage: offsets are offsets again, nothing is cached."""
-        with torch.no_grad():
-            self.tensors["offsets"] = self.skin_offsets().detach()
-        self._steps = self._bind = None
-
-    def skin_offsets(self) -> Float[Tensor, "S 3"]:
-        """Free offsets of the skin's vertices, bind space, metres."""
-        latent = self.tensors["offsets"]
-        return latent if self._steps is None else self._steps.displacement(latent)
-
-    def _bind_pose(self, tensors: Mapping[str, Tensor]) -> tuple[Tensor, Tensor]:
-        identity = tensors["identity"]
-        return self.model.bind(identity, tensors["expression"]), self.model.joints(identity)
-
-    def _offsets(self, skin_offsets: Tensor, bind: Tensor, eyes: Tensor) -> Float[Tensor, "V 3"]:
-        """All offsets in bind space: the skin's, and the eyeballs' moves."""
-        offsets = self.fixed_offsets.index_add(0, self._skin, skin_offsets)
-        for move, index in zip(eyes, self._eyes, strict=True):
-            own = bind[index]
-            offsets = offsets.index_add(0, index, move[:3] + torch.expm1(move[3]) * (own - own.mean(0).detach()))
-        return offsets
-
-    def rotation(self) -> Float[Tensor, "3 3"]:
-        return axis_angle_to_matrix(self.tensors["root"]) @ self.base_rotation
-
-    def vertices(self, skin_offsets: Tensor) -> Float[Tensor, "V 3"]:
-        """The mesh in the capture's world, metres."""
-        return self._posed(skin_offsets, self.tensors)
-
-    def yielding(self, skin_offsets: Tensor) -> Float[Tensor, "V 3"]:
-        """The same mesh, with a gradient for what yields where parts touch: offsets, and the tongue.
-
-        A face does not become another one for its parts to fit, nor do the eyeballs move, which images place.
-        """
-        held = {name: tensor.detach() for name, tensor in self.tensors.items()}
-        held["expression"] = torch.where(self._inner, self.tensors["expression"], held["expression"])
-        return self._posed(skin_offsets, held)
+            if name != "offsets":
+                self.tensors[name].requires_grad_(True)
 
     @torch.no_grad()
-    def at_rest(self) -> Float[Tensor, "V 3"]:
-        """The model's head of this identity, its face relaxed, in the model's frame."""
+    def commit_latent(self) -> None:
+        """End a stage: keep the offsets that the latent has reached."""
+        self._offsets = self.skin_offsets().detach()
+        self.latent = self._fixed_bind_pose = None
+
+    def skin_offsets(self) -> Float[Tensor, "S 3"]:
+        """Return the free offsets of the skin's vertices, bind pose, metres."""
+        return self._offsets if self.latent is None else self.latent.offsets()
+
+    def rotation(self) -> Float[Tensor, "3 3"]:
+        """Return the rotation of the whole head, world from model."""
+        return axis_angle_to_matrix(self.tensors["root"]) @ self.base_rotation
+
+    def vertices(self, skin_offsets: Float[Tensor, "S 3"]) -> Float[Tensor, "V 3"]:
+        """Return the mesh in the capture's world, metres."""
+        return self._posed(skin_offsets, self.tensors)
+
+    def contact_vertices(self, skin_offsets: Float[Tensor, "S 3"]) -> Float[Tensor, "V 3"]:
+        """Return the same mesh, differentiable only in the offsets and the coefficients of the tongue.
+
+        Identity, pose and eyeballs are detached: images determine them, and contacts between parts must not.
+        """
+        detached = {name: tensor.detach() for name, tensor in self.tensors.items()}
+        detached["expression"] = torch.where(self._inner, self.tensors["expression"], detached["expression"])
+        return self._posed(skin_offsets, detached)
+
+    @torch.no_grad()
+    def bind_pose_vertices(self) -> Float[Tensor, "V 3"]:
+        """Return the model's head of this identity with a neutral expression and no offsets, model frame, metres."""
         identity = self.tensors["identity"]
         return self.model.bind(identity, torch.zeros_like(self.tensors["expression"]))
 
-    def _posed(self, skin_offsets: Tensor, tensors: Mapping[str, Tensor]) -> Float[Tensor, "V 3"]:
-        bind, joints = self._bind or self._bind_pose(tensors)
-        bind = bind + self._offsets(skin_offsets, bind, tensors["eyes"])
-        root = axis_angle_to_matrix(tensors["root"]) @ self.base_rotation
-        local = torch.cat([root[None], axis_angle_to_matrix(tensors["joints"])])
-        # The root turns the head about its joint; the pivot, turned likewise, is then put in its place.
-        pivot = root @ (self.pivot - joints[0]) + joints[0]
-        return tensors["scale"].exp() * (self.model.pose(bind, joints, local) - pivot) + tensors["position"]
-
     @torch.no_grad()
     def parameters(self) -> tuple[Parameters, Float[Tensor, "V 3"]]:
-        """The model's own parameters and bind-space offsets that give the same mesh."""
+        """Return the model's parameters and offsets (bind pose, metres) that give the same mesh."""
         rotation, scale = self.rotation(), self.tensors["scale"].exp()
         bind, joints = self._bind_pose(self.tensors)
         root = matrix_to_axis_angle(rotation.double().cpu().numpy())
         rotations = torch.cat([torch.tensor(root, dtype=torch.float32, device=rotation.device)[None], self["joints"]])
-        # The model turns about its root joint, we about the pivot.
+        # The model rotates about its root joint, the variables about the pivot.
         translation = self["position"] - scale * (rotation @ (self.pivot - joints[0]) + joints[0])
         parameters = Parameters(
             identity=self["identity"].detach().clone(),
@@ -164,24 +168,60 @@ class Unknowns:
             translation=translation,
             scale=scale,
         )
-        return parameters, self._offsets(self.skin_offsets(), bind, self["eyes"])
+        return parameters, self._all_offsets(self.skin_offsets(), bind, self["eyes"])
+
+    def _bind_pose(self, tensors: Mapping[str, Tensor]) -> tuple[Float[Tensor, "V 3"], Float[Tensor, "J 3"]]:
+        """Vertices without offsets, and joints."""
+        identity = tensors["identity"]
+        return self.model.bind(identity, tensors["expression"]), self.model.joints(identity)
+
+    def _all_offsets(self, skin_offsets: Tensor, bind: Tensor, eyes: Tensor) -> Float[Tensor, "V 3"]:
+        """Offsets of all vertices in the bind pose: the skin's, and the motion of the eyeballs."""
+        offsets = self.fixed_offsets.index_add(0, self._skin, skin_offsets)
+        for motion, index in zip(eyes, self._eyes, strict=True):
+            eyeball = bind[index]
+            scaled = torch.expm1(motion[3]) * (eyeball - eyeball.mean(0).detach())
+            offsets = offsets.index_add(0, index, motion[:3] + scaled)
+        return offsets
+
+    def _posed(self, skin_offsets: Tensor, tensors: Mapping[str, Tensor]) -> Float[Tensor, "V 3"]:
+        bind, joints = self._fixed_bind_pose or self._bind_pose(tensors)
+        bind = bind + self._all_offsets(skin_offsets, bind, tensors["eyes"])
+        root = axis_angle_to_matrix(tensors["root"]) @ self.base_rotation
+        local = torch.cat([root[None], axis_angle_to_matrix(tensors["joints"])])
+        # The root joint rotates the head about itself; then the pivot, rotated likewise, is moved to its position.
+        pivot = root @ (self.pivot - joints[0]) + joints[0]
+        return tensors["scale"].exp() * (self.model.pose(bind, joints, local) - pivot) + tensors["position"]
 
 
 def pivot(data: GNMData) -> Float[np.ndarray, "3"]:
-    """The point of the model that `Start.position` places: the centre of the head without neck and chest."""
+    """Return the point of the model at `InitialGuess.position`: the centre of the head without neck and chest, metres.
+
+    Raises:
+        InputError: the model lacks a vertex group.
+    """
     head = (group(data, "skin_exterior") > 0.5) & ~neck_other(data)
     points = data.template_vertex_positions[head]
     return (points.min(0) + points.max(0)) / 2
 
 
-def start_of(parameters: Parameters, offsets: Float[np.ndarray, "V 3"], model: GNM, data: GNMData) -> Start:
-    """The start that reproduces a registration (used to begin from a neutral)."""
+def initial_guess_from(
+    parameters: Parameters, offsets: Float[np.ndarray, "V 3"], model: GNM, data: GNMData
+) -> InitialGuess:
+    """Return the initial guess whose mesh is that of a registration, such as the subject's neutral.
+
+    Args:
+        parameters: of the registration, without batch axes.
+        offsets: of the registration, bind pose, metres.
+        model: the registration's, as a function.
+        data: the same model's arrays.
+    """
     rotation = axis_angle_to_matrix(parameters.rotations[0].double()).cpu().numpy()
     joints = model.joints(parameters.identity)[0].double().cpu().numpy()
     scale = float(parameters.scale)
     centre = pivot(data)
     position = parameters.translation.double().cpu().numpy() + scale * (rotation @ (centre - joints) + joints)
-    return Start(
+    return InitialGuess(
         rotation=rotation,
         position=position,
         scale=scale,
@@ -193,16 +233,15 @@ def start_of(parameters: Parameters, offsets: Float[np.ndarray, "V 3"], model: G
 
 
 def skin_vertices(data: GNMData) -> Int[np.ndarray, "S"]:
-    """The vertices that carry free offsets: all of the skin, its inner linings included."""
+    """Return the vertices that carry free offsets: all of the skin, its inner surfaces included."""
     return np.flatnonzero(group(data, "skin") > 0.5)
 
 
-def skin_topology(
+def skin_triangles(
     triangles: Int[np.ndarray, "F 3"], skin: Int[np.ndarray, "S"], vertex_count: int
-) -> tuple[Int[np.ndarray, "G 3"], Int[np.ndarray, "E 2"]]:
-    """Triangles of the skin alone, in indices into `skin`, and the edges among them."""
-    local = np.full(vertex_count, -1)
-    local[skin] = np.arange(len(skin))
-    own = local[triangles]
-    own = own[(own >= 0).all(1)]
-    return own, edges(own).vertices
+) -> Int[np.ndarray, "G 3"]:
+    """Return the triangles whose corners all belong to the skin, as indices into `skin`."""
+    row = np.full(vertex_count, -1)
+    row[skin] = np.arange(len(skin))
+    corners = row[triangles]
+    return corners[(corners >= 0).all(1)]

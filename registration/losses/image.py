@@ -1,4 +1,8 @@
-"""What rendered images are compared by. Every term is a mean over the subject's pixels of the views of a step."""
+"""Losses between rendered and captured images.
+
+P are the pixels of the views of a step. Every loss is a sum over pixels divided by one common denominator, the number
+of pixels that the subject covers, so that the ratio of the losses does not depend on how many pixels each compares.
+"""
 
 import torch
 from jaxtyping import Bool, Float
@@ -8,66 +12,110 @@ from torch import Tensor
 from registration.types import Rendered, Targets
 
 _ENCODING_FLOOR = 1e-4
-# A rendered mask or class jumps from 0 to 1; near its target the pull fades instead of flipping its sign.
-_RAMP = 0.25
+_HUBER_DELTA = 0.25  # of a mask or class, which the renderer draws as 0 or 1: the gradient fades close to the target
 
 
-def subject_pixels(targets: Targets) -> Tensor:
-    """How many pixels the subject covers: the common denominator, so that terms keep their ratio."""
+def subject_pixels(targets: Targets) -> Float[Tensor, ""]:
+    """Return the area of the subject in pixels, at least 1: the denominator of every image loss."""
     return targets.mask.sum().clamp_min(1.0)
 
 
-def encoded(linear: Tensor) -> Tensor:
-    """Linear light to a perceptual scale: its square root, close to sRGB and cheap to differentiate."""
+def srgb_encoded(linear: Float[Tensor, "*S"]) -> Float[Tensor, "*S"]:
+    """Return linear light on a perceptual scale: sqrt(max(x, 1e-4)), close to sRGB and cheap to differentiate."""
     return linear.clamp_min(_ENCODING_FLOOR).sqrt()
 
 
-def agreement(rendered: Rendered, targets: Targets, surfaces: list[int]) -> Bool[Tensor, "P"]:
-    """1 where rendered and target pixel lie on the same kind of surface, else 0.
+def pixel_agreement(rendered: Rendered, targets: Targets, surfaces: list[int]) -> Bool[Tensor, "P"]:
+    """Return where rendering and target show the same kind of surface.
 
-    `surfaces` are the classes that are surfaces of their own (eyes, mouth interior). Without this test lids creep over
-    the eyeballs to match the eyeballs' normals.
+    Without this test eyelids creep over the eyeballs to match the eyeballs' normals.
+
+    Args:
+        rendered: the mesh.
+        targets: at the same pixels.
+        surfaces: the classes that are surfaces of their own (eyes, mouth interior); their coverages must differ by less
+            than 0.5 in total.
     """
     difference = (rendered.classes[..., surfaces] - targets.classes[..., surfaces]).detach().abs().sum(-1)
     return (rendered.mask > 0.5) & (difference < 0.5)
 
 
-def rgb_l1(rendered: Rendered, targets: Targets, agree: Tensor) -> Tensor:
-    """Smoothed L1 on perceptually encoded colour."""
-    difference = encoded(rendered.rgb) - encoded(targets.rgb)
+def rgb_l1(rendered: Rendered, targets: Targets, agree: Bool[Tensor, "P"]) -> Float[Tensor, ""]:
+    """Return the smoothed L1 difference of encoded colours.
+
+    Sum over pixels and channels of w sqrt((e(r) - e(t))^2 + 1e-4), over the subject's pixels.
+
+    Args:
+        rendered: the mesh; colours r exposed as the cameras'.
+        targets: colours t, weights w.
+        agree: the pixels that are compared.
+    """
+    difference = srgb_encoded(rendered.rgb) - srgb_encoded(targets.rgb)
     return ((difference.square() + 1e-4).sqrt().sum(-1) * targets.rgb_weight * agree).sum() / subject_pixels(targets)
 
 
-def rgb_ssim(rendered: Rendered, targets: Targets, agree: Tensor) -> Tensor:
-    """1 - SSIM on perceptually encoded colour, window 11, sigma 1.5 px."""
-    # What is not compared must not enter the windows' statistics: there both images show the target.
+def rgb_ssim(rendered: Rendered, targets: Targets, agree: Bool[Tensor, "P"]) -> Float[Tensor, ""]:
+    """Return the structural dissimilarity of encoded colours [Wang 2004].
+
+    Sum over pixels of w (1 - SSIM), over the subject's pixels; windows of 11 px with a standard deviation of 1.5 px,
+    SSIM as the mean over channels.
+
+    Args:
+        rendered: the mesh; colours exposed as the cameras'.
+        targets: colours, weights w.
+        agree: the pixels that are compared.
+    """
+    # Pixels that are not compared must not affect the windows' statistics: there both images show the target.
     compared = agree & (targets.rgb_weight > 0)
-    shown = torch.where(compared[:, None], encoded(rendered.rgb), encoded(targets.rgb))
-    ours, theirs = (targets.pixels.image(c).permute(0, 3, 1, 2) for c in (shown, encoded(targets.rgb)))
+    colours = torch.where(compared[:, None], srgb_encoded(rendered.rgb), srgb_encoded(targets.rgb))
+    ours, theirs = (targets.pixels.image(c).permute(0, 3, 1, 2) for c in (colours, srgb_encoded(targets.rgb)))
     dissimilarity = 1 - ssim(ours, theirs, 11).mean(1)
     weight = targets.pixels.image((targets.rgb_weight * agree)[:, None])[..., 0]
     return (dissimilarity * weight).sum() / subject_pixels(targets)
 
 
-def normals(rendered: Rendered, targets: Targets, agree: Tensor, truncation: float) -> Tensor:
-    """Length of the normals' difference, weighted by incidence; differences beyond `truncation` are outliers."""
+def normals(rendered: Rendered, targets: Targets, agree: Bool[Tensor, "P"], truncation: float) -> Float[Tensor, ""]:
+    """Return the truncated difference of unit normals.
+
+    Sum over pixels of w d, d = sqrt(|n_r - n_t|^2 + 1e-6) where d < truncation, over the subject's pixels. The weights
+    of the targets contain the incidence.
+
+    Args:
+        rendered: the mesh; normals in the world.
+        targets: normals in the world, weights w.
+        agree: the pixels that are compared.
+        truncation: larger differences are outliers and do not count; 2 is the largest one.
+    """
     difference = ((rendered.normals - targets.normals).square().sum(-1) + 1e-6).sqrt()
     weight = targets.normal_weight * agree * (difference.detach() < truncation)
     return (difference * weight).sum() / subject_pixels(targets)
 
 
-def mask(rendered: Rendered, targets: Targets) -> Tensor:
-    """Rendered against seen silhouette, outside and inside."""
-    return (_ramp(rendered.mask - targets.mask) * targets.mask_weight).sum() / subject_pixels(targets)
+def mask(rendered: Rendered, targets: Targets) -> Float[Tensor, ""]:
+    """Return the difference of the silhouettes: the sum over pixels of w huber(m_r - m_t), over the subject's pixels.
+
+    Args:
+        rendered: the mesh; coverage m_r in [0, 1].
+        targets: coverage m_t in [0, 1], weights w; inside and outside of the subject.
+    """
+    return (_huber(rendered.mask - targets.mask) * targets.mask_weight).sum() / subject_pixels(targets)
 
 
-def classes(rendered: Rendered, targets: Targets, class_weights: Float[Tensor, "K"]) -> Tensor:
-    """Soft class shares against the labels' shares, where both see the subject."""
-    difference = (_ramp(rendered.classes - targets.classes) * class_weights).sum(-1)
+def classes(rendered: Rendered, targets: Targets, class_weights: Float[Tensor, "K"]) -> Float[Tensor, ""]:
+    """Return the difference of the classes' coverages, where the mesh covers the pixel.
+
+    Sum over pixels and classes of w v_k huber(c_r - c_t), over the subject's pixels.
+
+    Args:
+        rendered: the mesh; coverage c_r of each class in [0, 1].
+        targets: coverage c_t of each class in [0, 1], weights w.
+        class_weights: v, of each class.
+    """
+    difference = (_huber(rendered.classes - targets.classes) * class_weights).sum(-1)
     return (difference * targets.class_weight * (rendered.mask.detach() > 0.5)).sum() / subject_pixels(targets)
 
 
-def _ramp(difference: Tensor) -> Tensor:
-    """|x|, rounded off within `_RAMP` of zero (Huber)."""
+def _huber(difference: Float[Tensor, "*S"]) -> Float[Tensor, "*S"]:
+    """x^2 / (2 d) where |x| < d, else |x| - d / 2, with d = `_HUBER_DELTA`."""
     size = difference.abs()
-    return torch.where(size < _RAMP, size.square() / (2 * _RAMP), size - _RAMP / 2)
+    return torch.where(size < _HUBER_DELTA, size.square() / (2 * _HUBER_DELTA), size - _HUBER_DELTA / 2)

@@ -1,4 +1,4 @@
-"""Landmarks: how far the model's projected points lie from those seen in the images."""
+"""Landmark loss: the model's projected points against points detected in the images."""
 
 import numpy as np
 import torch
@@ -11,7 +11,7 @@ _MIN_CONFIDENCE = 0.5
 
 
 def project(cameras: tuple[Camera, ...], points: Float[Tensor, "L 3"]) -> Float[Tensor, "N L 2"]:
-    """World points (m) in every camera's pixels; differentiable."""
+    """Return world points (metres) in the pixels of every camera; differentiable, without distortion."""
 
     def stack(values: list[np.ndarray]) -> Tensor:
         return torch.stack([torch.as_tensor(v) for v in values]).to(points)
@@ -24,16 +24,33 @@ def project(cameras: tuple[Camera, ...], points: Float[Tensor, "L 3"]) -> Float[
 
 
 def residuals(
-    cameras: tuple[Camera, ...], points: Float[Tensor, "L 3"], seen: Float[Tensor, "N L 3"], px_per_head: float
+    cameras: tuple[Camera, ...], points: Float[Tensor, "L 3"], detected: Float[Tensor, "N L 3"], px_per_head: float
 ) -> tuple[Float[Tensor, "N L"], Float[Tensor, "N L"]]:
-    """Distances in px at 512 px of head height, and which count (confidence > 0.5), as 0 or 1."""
-    difference = project(cameras, points) - seen[..., :2]
-    return (difference.square().sum(-1) + 1e-12).sqrt() * (512 / px_per_head), (seen[..., 2] > _MIN_CONFIDENCE).to(
-        points
-    )
+    """Return the distances between projected and detected landmarks.
+
+    Args:
+        cameras: of the N views.
+        points: of the model, world, metres.
+        detected: x_px, y_px and confidence in each view.
+        px_per_head: height of the head in the views, px.
+
+    Returns:
+        Distances, px at 512 px of head height; and 1 where the detection's confidence exceeds 0.5, else 0.
+    """
+    difference = project(cameras, points) - detected[..., :2]
+    distance = (difference.square().sum(-1) + 1e-12).sqrt() * (512 / px_per_head)
+    return distance, (detected[..., 2] > _MIN_CONFIDENCE).to(points)
 
 
-def robust(residual_px: Tensor, weight: Tensor, sigma_px: float) -> Tensor:
-    """Geman-McClure mean of residuals: quadratic below `sigma_px`, saturating at 1 far above it."""
+def geman_mcclure(residual_px: Float[Tensor, "*S"], weight: Float[Tensor, "*S"], sigma_px: float) -> Float[Tensor, ""]:
+    """Return the weighted mean of the Geman-McClure function r^2 / (r^2 + sigma^2) [Geman 1987].
+
+    Quadratic below `sigma_px`, and 1 far above it, so that outliers do not pull.
+
+    Args:
+        residual_px: r, at 512 px of head height.
+        weight: of each residual.
+        sigma_px: where the function is one half.
+    """
     squared = (residual_px / sigma_px).square()
     return (squared / (1 + squared) * weight).sum() / weight.sum().clamp_min(1.0)

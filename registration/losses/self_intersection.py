@@ -1,12 +1,16 @@
-"""What keeps the parts of a head out of one another: lids and eyeballs, lips, teeth, tongue, ears and the head.
+"""Self-intersection penalty between head parts: eyelids and eyeballs, lips, teeth, tongue, ears and the head.
 
-A vertex is penalised by the square of how much deeper it lies in the other part than in the template, beyond a margin:
-contact is the normal state of lids and lips, and the template runs through itself in places. An eyeball is the union of
-two spheres; everything else is a surface that vertices get behind. Eye sockets and the mouth's lining are left out: in
-the model they lie inside their neighbours.
+For a pair of parts the loss is
+
+    sum over vertices v of relu(depth(v) - tolerance(v))^2   [mm^2]
+
+depth(v) is how deep v lies in the other part; tolerance(v) is its depth in the template plus a margin: eyelids and lips
+are normally in contact, and the template has intersections. An eyeball is the union of two spheres; every other part is
+a surface with an inside. Eye sockets and the oral lining are excluded: in the model they lie inside their neighbours.
 """
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -23,108 +27,160 @@ from registration.geometry.topology import connected_parts, edges
 from registration.model import regions
 from registration.model.gnm_npz import GNMData
 
-# Lengths in mm of the template's size.
-_MARGIN = 0.05  # so much deeper than at rest costs nothing
-_OUTSIDE, _INSIDE = 3.0, 8.0  # vertices so far in front of and behind a surface are watched
-_BEHIND_EARS = 25.0  # the part of the head that ears can get to
-_AROUND = 5.0  # skin around that and around lips, by which it is told what lies inside
-_LINING = 6.0  # of the mouth, as far as it belongs to a lip
-_LIDS = 6.0  # from the eyeball
-_LEAST_CORNEA = 8  # vertices; fewer are no second sphere
+# Lengths in mm, for a head of the template's size.
+_MARGIN = 0.05  # added to the depth in the template
+_OUTSIDE, _INSIDE = 3.0, 8.0  # distance of candidate vertices in front of and behind a surface
+_BEHIND_EARS = 25.0  # distance from the ears of the part of the head that they can touch
+_INTERIOR_DISTANCE = 5.0  # of the skin around ears and lips that bounds the interior there
+_LINING = 6.0  # distance along the surface from a lip of the oral lining that belongs to it
+_LIDS = 6.0  # distance of eyelid vertices from the eyeball
+_MIN_CORNEA = 8  # vertices of a second sphere
 OF_THE_TONGUE = ("tongue-teeth", "tongue-lips", "tongue-palate", "tongue-gums")
 
 
-class SelfIntersection:
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Candidates:
+    """What may touch in one pose of the head."""
+
+    scale: float  # size of the head relative to the template
+    origin: Float[Tensor, "3"]  # of the skin, world, metres
+    index: Int[Tensor, "U"]  # the vertices that take part
+    watched: Watched  # in rows of `index`
+    slot: Int[Tensor, "M"]  # of each candidate, into the tolerances
+    pair: Int[Tensor, "M"]  # of each candidate, into `SelfIntersectionPenalty.pairs`
+
+
+class SelfIntersectionPenalty:
     """How much deeper than in the template the parts of a posed head run into one another.
 
-    Works in the mesh's own geometry: any rigid pose and any scale of the head. What may touch what is looked up by
-    `refresh`, before the first call and then every ten steps or so.
+    Independent of the rigid pose and the scale of the head. The vertices that may touch are determined by
+    `update_candidates`: before the first call with another head, and then about every ten steps.
+
+    Args:
+        data: the model.
+        device: of the vertices.
+
+    Raises:
+        InputError: the model lacks a vertex group that names a part.
     """
 
     def __init__(self, data: GNMData, device: torch.device):
-        """Finds the parts, and how deep they overlap at rest.
-
-        Raises InputError if the model lacks a vertex group that names a part.
-        """
         self._device = device
         self._skin = np.flatnonzero(regions.exterior(data))
         template = torch.as_tensor(data.template_vertex_positions, dtype=torch.float32, device=device)
-        self._size = _spread(template[self._skin])
+        self._size = _rms_radius(template[self._skin])
         rest = data.template_vertex_positions.astype(np.float64) * MM_PER_M
         self._eyeballs = [_Eyeball(data, shell, rest, device) for shell in regions.eyeball_shells(data)]
         self._surfaces = _surfaces(data, rest)
         self.pairs = ("lids-eyeballs", *dict.fromkeys(name for name, _ in self._surfaces))
-        # Every point of every contact has a slot, which says how deep it may lie.
+        # Every vertex of every contact has a slot in the tolerances.
         points = [eyeball.points for eyeball in self._eyeballs] + [surface.points for _, surface in self._surfaces]
         self._slots = np.cumsum([0, *(len(index) for index in points)])
-        self._own = torch.zeros(self._slots[-1], device=device)  # that of the template
-        self._allowed = self._own
-        self.accept(template)
-        self._own = self._allowed = self._allowed + _MARGIN
+        none = torch.zeros(self._slots[-1], device=device)
+        self._candidates = self._find_candidates(template, none)
+        self._template_tolerance = self._depths_at_least(none, template, self.pairs) + _MARGIN
+        self._tolerance = self._template_tolerance
 
-    def accept(self, vertices: Float[Tensor, "V 3"], pairs: Sequence[str] | None = None) -> None:
-        """From now on what is no deeper than in this head or in the template costs nothing, in some pairs or in all.
+    def set_rest_depths(self, vertices: Float[Tensor, "V 3"], pairs: Sequence[str] | None = None) -> None:
+        """Set the tolerances to the depths in a head or in the template, whichever are larger.
 
-        `vertices` are posed, in metres. What was accepted before is forgotten.
+        Replaces what an earlier call has set.
+
+        Args:
+            vertices: world, metres.
+            pairs: those that the head's depths are for; None: all. The others have the template's.
         """
-        self._allowed = self._own
-        self.refresh(vertices)
-        slot, pair, _, depth = self._depths(vertices.detach())
-        chosen = [number for number, name in enumerate(self.pairs) if pairs is None or name in pairs]
-        taken = torch.isin(pair, torch.tensor(chosen, device=self._device))
-        self._allowed = self._own.scatter_reduce(0, slot[taken], depth[taken], "amax")
+        least = self._template_tolerance
+        self._candidates = self._find_candidates(vertices, least)
+        self._tolerance = self._depths_at_least(least, vertices, self.pairs if pairs is None else pairs)
 
-    def refresh(self, vertices: Float[Tensor, "V 3"]) -> None:
-        """Look up the head's size and what is near enough to touch. `vertices` are posed, in metres."""
-        vertices = vertices.detach()
-        self._scale = _spread(vertices[self._skin]) / self._size
-        self._origin = vertices[self._skin].mean(0)
-        local = self._local(vertices).cpu().numpy()
-        allowed = np.split(self._allowed.cpu().numpy(), self._slots[1:-1])[len(self._eyeballs) :]
-        found = [surface.watched(local, most) for (_, surface), most in zip(self._surfaces, allowed, strict=True)]
-        self._index, self._watched = Watched.joined(found).to(self._device).compact()
-        of = np.repeat(np.arange(len(found)), [len(rows.place) for rows in found])
-        first = self._slots[len(self._eyeballs) + of]
-        pair = np.array([self.pairs.index(name) for name, _ in self._surfaces])[of]
-        self._slot = self._watched.place + torch.as_tensor(first, device=self._device)
-        self._pair = torch.as_tensor(pair, device=self._device)
+    def update_candidates(self, vertices: Float[Tensor, "V 3"]) -> None:
+        """Determine the head's size and the vertices that may touch another part.
 
-    def __call__(self, vertices: Float[Tensor, "V 3"]) -> dict[str, Tensor]:
-        """The penalty of each pair of parts: squares of excess depths summed over vertices; scalars, mm^2.
-
-        `vertices` are posed, in metres. Differentiable in both parts; value and gradient are zero for the template.
+        Args:
+            vertices: world, metres.
         """
-        slot, pair, _, depth = self._depths(vertices)
-        excess = torch.relu(depth - self._allowed[slot])
+        self._candidates = self._find_candidates(vertices, self._tolerance)
+
+    def __call__(self, vertices: Float[Tensor, "V 3"]) -> dict[str, Float[Tensor, ""]]:
+        """Return the penalty of each pair of parts.
+
+        Args:
+            vertices: world, metres.
+
+        Returns:
+            Pair -> sum over vertices of squared excess depths, mm^2. Differentiable in both parts; value and gradient
+            are zero for the template.
+        """
+        slot, pair, _, depth = self._depths(vertices, self._candidates, self._tolerance)
+        excess = torch.relu(depth - self._tolerance[slot])
         total = excess.new_zeros(len(self.pairs)).index_add(0, pair, excess.square())
-        return dict(zip(self.pairs, self._scale**2 * total, strict=True))
+        return dict(zip(self.pairs, self._candidates.scale**2 * total, strict=True))
 
     @torch.no_grad()
     def excess_mm(self, vertices: Float[Tensor, "V 3"]) -> dict[str, Float[Tensor, "V"]]:
-        """For each pair of parts, by how much each vertex of the mesh lies too deep in the other part, mm."""
-        slot, pair, points, depth = self._depths(vertices)
-        excess = self._scale * torch.relu(depth - self._allowed[slot])
-        found = excess.new_zeros(len(self.pairs), len(vertices))
-        found.view(-1).scatter_reduce_(0, pair * len(vertices) + points, excess, "amax")
-        return dict(zip(self.pairs, found, strict=True))
+        """Return how much too deep each vertex lies in the other part.
 
-    def _local(self, vertices: Float[Tensor, "U 3"]) -> Float[Tensor, "U 3"]:
-        return (vertices - self._origin) * (MM_PER_M / self._scale)
+        Args:
+            vertices: world, metres.
+
+        Returns:
+            Pair -> excess depth of every vertex of the mesh, mm of this head.
+        """
+        slot, pair, points, depth = self._depths(vertices, self._candidates, self._tolerance)
+        excess = self._candidates.scale * torch.relu(depth - self._tolerance[slot])
+        by_pair = excess.new_zeros(len(self.pairs), len(vertices))
+        by_pair.view(-1).scatter_reduce_(0, pair * len(vertices) + points, excess, "amax")
+        return dict(zip(self.pairs, by_pair, strict=True))
+
+    def _depths_at_least(
+        self, least: Float[Tensor, "Z"], vertices: Float[Tensor, "V 3"], pairs: Sequence[str]
+    ) -> Float[Tensor, "Z"]:
+        """The depths of some pairs in a head, mm of the template's size, or `least` where that is more."""
+        slot, pair, _, depth = self._depths(vertices.detach(), self._candidates, least)
+        chosen = [number for number, name in enumerate(self.pairs) if name in pairs]
+        taken = torch.isin(pair, torch.tensor(chosen, device=self._device))
+        return least.scatter_reduce(0, slot[taken], depth[taken], "amax")
+
+    def _find_candidates(self, vertices: Float[Tensor, "V 3"], tolerance: Float[Tensor, "Z"]) -> _Candidates:
+        vertices = vertices.detach()
+        skin = vertices[self._skin]
+        scale, origin = _rms_radius(skin) / self._size, skin.mean(0)
+        local = ((vertices - origin) * (MM_PER_M / scale)).cpu().numpy()
+        tolerances = np.split(tolerance.cpu().numpy(), self._slots[1:-1])[len(self._eyeballs) :]
+        watched = [surface.watched(local, most) for (_, surface), most in zip(self._surfaces, tolerances, strict=True)]
+        index, joined = Watched.joined(watched).to(self._device).compact()
+        surface = np.repeat(np.arange(len(watched)), [len(rows.place) for rows in watched])
+        first = self._slots[len(self._eyeballs) + surface]
+        pair = np.array([self.pairs.index(name) for name, _ in self._surfaces])[surface]
+        return _Candidates(
+            scale=scale,
+            origin=origin,
+            index=index,
+            watched=joined,
+            slot=joined.place + torch.as_tensor(first, device=self._device),
+            pair=torch.as_tensor(pair, device=self._device),
+        )
 
     def _depths(
-        self, vertices: Float[Tensor, "V 3"]
+        self, vertices: Float[Tensor, "V 3"], candidates: _Candidates, tolerance: Float[Tensor, "Z"]
     ) -> tuple[Int[Tensor, "M"], Int[Tensor, "M"], Int[Tensor, "M"], Float[Tensor, "M"]]:
-        """Slot, pair, vertex and depth (mm of the template's size) of all that is deeper than allowed, and of lids."""
-        near = self._local(vertices.index_select(0, self._index))
-        now = depths(near, self._watched)
-        deep = (now.depth > self._allowed[self._slot]).nonzero()[:, 0]
-        points = self._watched.points
-        found = [(self._slot[deep], self._pair[deep], self._index[points[deep]], now.again(near, points, deep))]
+        """Slot, pair, vertex and depth (mm of the template's size) of eyelids and of all deeper than tolerated."""
+
+        def local(index: Int[Tensor, "U"]) -> Float[Tensor, "U 3"]:
+            return (vertices.index_select(0, index) - candidates.origin) * (MM_PER_M / candidates.scale)
+
+        near = local(candidates.index)
+        current = depths(near, candidates.watched)
+        deep = (current.depth > tolerance[candidates.slot]).nonzero()[:, 0]
+        points = candidates.watched.points
+        differentiable = current.again(near, points, deep)
+        parts = [(candidates.slot[deep], candidates.pair[deep], candidates.index[points[deep]], differentiable)]
         for eyeball, start in zip(self._eyeballs, self._slots, strict=False):
-            depth = eyeball.depths(self._local(vertices.index_select(0, eyeball.index)))
+            depth = eyeball.depths(local(eyeball.index))
             slot = torch.arange(start, start + len(depth), device=self._device)
-            found.append((slot, torch.zeros_like(slot), eyeball.index[: len(depth)], depth))
-        slot, pair, points, depth = (torch.cat(columns) for columns in zip(*found, strict=True))
+            parts.append((slot, torch.zeros_like(slot), eyeball.index[: len(depth)], depth))
+        slot, pair, points, depth = (torch.cat(columns) for columns in zip(*parts, strict=True))
         return slot, pair, points, depth
 
 
@@ -138,7 +194,7 @@ class _Eyeball:
         main = on_main_sphere(rest[index])
         centre, radius = (value.numpy() for value in fit_sphere(torch.as_tensor(rest[index[main]])))
         bulge = ~main & (np.linalg.norm(rest[index] - centre, axis=1) > radius)
-        spheres = [index[main], index[bulge]] if bulge.sum() >= _LEAST_CORNEA else [index[main]]
+        spheres = [index[main], index[bulge]] if bulge.sum() >= _MIN_CORNEA else [index[main]]
         self.points = np.flatnonzero(regions.exterior(data) & _near(rest, shell, _LIDS))
         self.index = torch.as_tensor(np.concatenate([self.points, *spheres]), device=device)
         self._sizes = [len(part) for part in (self.points, *spheres)]
@@ -146,15 +202,15 @@ class _Eyeball:
     def depths(self, vertices: Float[Tensor, "U 3"]) -> Float[Tensor, "P"]:
         """How deep each point lies in the eyeball; negative outside. Differentiable in the vertices at `index`."""
         lids, *spheres = vertices.split(self._sizes)
-        found = []
+        in_spheres = []
         for sphere in spheres:
             centre, radius = fit_sphere(sphere)
-            found.append(radius - (lids - centre).norm(dim=-1))
-        return torch.stack(found).amax(0)
+            in_spheres.append(radius - (lids - centre).norm(dim=-1))
+        return torch.stack(in_spheres).amax(0)
 
 
 def _surfaces(data: GNMData, rest: Float[np.ndarray, "V 3"]) -> list[tuple[str, Solids]]:
-    """Vertices and the parts that they can get into, each with the name of its pair."""
+    """Vertices and the parts that they can penetrate, each with the name of its pair."""
     mesh, skin = data.triangles.astype(np.int64), regions.solids(data)["skin"]
     upper, lower = regions.lips(data)
     inner_upper, inner_lower = _linings(data, rest)
@@ -168,7 +224,7 @@ def _surfaces(data: GNMData, rest: Float[np.ndarray, "V 3"]) -> list[tuple[str, 
         return Solids(np.flatnonzero(points), parts, inside=_INSIDE, outside=_OUTSIDE, flesh=flesh)
 
     around_mouth, around_ears = (
-        Flesh(skin[_near(rest, members, _AROUND)[skin].all(1)])
+        Flesh(skin[_near(rest, members, _INTERIOR_DISTANCE)[skin].all(1)])
         for members in (upper | lower | regions.mouth_lining(data), ears | head)
     )
     return [
@@ -186,9 +242,9 @@ def _surfaces(data: GNMData, rest: Float[np.ndarray, "V 3"]) -> list[tuple[str, 
 
 
 def _linings(data: GNMData, rest: Float[np.ndarray, "V 3"]) -> tuple[Bool[np.ndarray, "V"], Bool[np.ndarray, "V"]]:
-    """What the mouth's lining adds to the upper and the lower lip, so that neither ends where they touch.
+    """The oral lining that extends the upper and the lower lip, so that neither ends where they touch.
 
-    Lips overlap at rest, so what belongs to which is told by the way along the surface.
+    Lips overlap in the template; the distance along the surface decides which vertex belongs to which.
     """
     lining = regions.mouth_lining(data)
     ends = edges(data.triangles.astype(np.int64)).vertices
@@ -205,19 +261,19 @@ def _linings(data: GNMData, rest: Float[np.ndarray, "V 3"]) -> tuple[Bool[np.nda
 
 
 def _teeth(data: GNMData) -> list[Int[np.ndarray, "_ 3"]]:
-    """The triangles of each tooth; what joins teeth is gum."""
-    own = data.triangles[regions.teeth(data)[data.triangles].all(1)].astype(np.int64)
-    part = connected_parts(own) if len(own) else np.empty(0, int)
-    return [own[part == number] for number in np.unique(part)]
+    """The triangles of each tooth."""
+    teeth = data.triangles[regions.teeth(data)[data.triangles].all(1)].astype(np.int64)
+    part = connected_parts(teeth) if len(teeth) else np.empty(0, int)
+    return [teeth[part == number] for number in np.unique(part)]
 
 
 def _near(rest: Float[np.ndarray, "V 3"], members: Bool[np.ndarray, "V"], distance: float) -> Bool[np.ndarray, "V"]:
-    """What lies within a distance of some vertices."""
+    """Vertices within a distance (mm) of some members."""
     if not members.any():
         return np.zeros(len(rest), bool)
     return np.isfinite(cKDTree(rest[members]).query(rest, distance_upper_bound=distance)[0])
 
 
-def _spread(points: Float[Tensor, "P 3"]) -> float:
-    """Root mean square distance from the centre."""
+def _rms_radius(points: Float[Tensor, "P 3"]) -> float:
+    """Root mean square distance from the centroid."""
     return float((points - points.mean(0)).square().sum(-1).mean().sqrt())

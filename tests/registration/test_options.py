@@ -10,7 +10,7 @@ import pytest
 import tyro
 
 from registration.errors import InputError
-from registration.fit.recipes import RECIPES, Rate, Region, Stage, Weights, draft, load_recipe, preview
+from registration.fit.recipes import RECIPES, OffsetRegion, Rate, Stage, Weights, draft, load_recipe, preview
 from registration.inputs import NOT_HASHED, input_hash
 from registration.model import gnm_npz
 from registration.model.landmarks import LandmarkScheme
@@ -192,7 +192,7 @@ def test_a_new_field_anywhere_decides_the_hash(
         ("options.variant", "cuda"),
         ("options.recipe.stages.0.weights", Weights(rgb=0.25)),
         ("options.recipe.stages.0.free", (("identity", Rate(start=1.0, end=0.5)),)),
-        ("options.recipe.regions", (Region(name="lips"),)),
+        ("options.recipe.regions", (OffsetRegion(name="lips"),)),
     ],
 )
 def test_what_decides(

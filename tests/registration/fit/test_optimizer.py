@@ -3,15 +3,15 @@
 import pytest
 import torch
 
-from registration.fit.optimizer import AdamBlock, AdamUniformBlock, minimise
+from registration.fit.optimizer import AdamBlock, AdamUniformBlock, minimize
 from registration.fit.recipes import Rate
 
 
 def test_a_rate_is_held_and_then_falls_by_equal_ratios():
     rate = Rate(start=0.1, end=0.001, hold=0.5)
-    assert [rate.at(p) for p in (0.0, 0.3, 0.5, 0.75, 1.0)] == pytest.approx([0.1, 0.1, 0.1, 0.01, 0.001])
-    assert Rate(start=2.0, end=0.5).at(0.5) == pytest.approx(1.0)
-    assert Rate(start=0.3, end=0.1, hold=1.0).at(1.0) == pytest.approx(0.3)
+    assert [rate.value(p) for p in (0.0, 0.3, 0.5, 0.75, 1.0)] == pytest.approx([0.1, 0.1, 0.1, 0.01, 0.001])
+    assert Rate(start=2.0, end=0.5).value(0.5) == pytest.approx(1.0)
+    assert Rate(start=0.3, end=0.1, hold=1.0).value(1.0) == pytest.approx(0.3)
 
 
 def test_adam_steps_by_its_rate():
@@ -87,7 +87,7 @@ def test_a_quadratic_is_solved():
     rate = Rate(start=0.1, end=1e-4, hold=0.5)
     blocks = [AdamUniformBlock(field, rate), AdamBlock([shift], rate)]
     seen: list[int] = []
-    history, failure = minimise(blocks, objective, 300, seen.append)
+    history, failure = minimize(blocks, objective, 300, seen.append)
     assert failure is None and seen == list(range(300))
     assert {name: len(values) for name, values in history.items()} == {"fit": 300, "small": 300}
     assert history["fit"][0] == pytest.approx(target.square().mean().item())
@@ -105,16 +105,16 @@ def test_the_rate_follows_the_steps():
             progress.append(share)
 
     block = Recorder()
-    minimise([block], lambda step: {"a": block.tensors[0].sum()}, 5)
+    minimize([block], lambda step: {"a": block.tensors[0].sum()}, 5)
     assert progress == [0.0, 0.25, 0.5, 0.75, 1.0]
-    minimise([block], lambda step: {"a": block.tensors[0].sum()}, 1)
+    minimize([block], lambda step: {"a": block.tensors[0].sum()}, 1)
     assert progress[5:] == [0.0]
 
 
 def test_gradients_do_not_add_up_over_steps():
     tensor = torch.zeros(1, requires_grad=True)
     seen: list[float] = []
-    minimise(
+    minimize(
         [AdamBlock([tensor], Rate(start=1e-3, end=1e-3))],
         lambda step: {"a": 2 * tensor.sum()},
         4,
@@ -133,7 +133,7 @@ def test_a_term_that_is_not_finite_stops_the_loop(bad):
         return {"good": tensor.square().sum(), "bad": tensor.sum() * (bad if step == 3 else 1.0)}
 
     block = AdamBlock([tensor], Rate(start=0.1, end=0.1))
-    history, failure = minimise([block], objective, 10, lambda step: kept.append(tensor.detach().clone()))
+    history, failure = minimize([block], objective, 10, lambda step: kept.append(tensor.detach().clone()))
     assert failure == "bad not finite at step 3"
     assert len(kept) == 3 and len(history["bad"]) == len(history["good"]) == 4
     torch.testing.assert_close(tensor.detach(), kept[-1])
@@ -143,6 +143,6 @@ def test_a_gradient_that_is_not_finite_stops_the_loop():
     """The root of zero is fine, its slope is not."""
     tensor = torch.zeros(2, requires_grad=True)
     block = AdamBlock([tensor], Rate(start=0.1, end=0.1))
-    _, failure = minimise([block], lambda step: {"root": (0 * tensor).sqrt().sum()}, 3)
+    _, failure = minimize([block], lambda step: {"root": (0 * tensor).sqrt().sum()}, 3)
     assert failure == "gradient not finite at step 0"
     assert (tensor.detach() == 0).all()

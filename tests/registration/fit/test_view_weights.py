@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from registration.fit.view_weights import Trust, ViewErrors, view_errors
+from registration.fit.view_weights import ViewErrors, ViewWeights, view_errors
 from registration.types import Camera, Pixels, Rendered, Targets
 
 NAMES = tuple(f"cam{i:02}" for i in range(8))
@@ -26,37 +26,37 @@ def errors(outline=None, landmarks=None, brightness=None) -> ViewErrors:
 
 
 def test_views_alike_are_all_trusted():
-    trust = Trust.of(errors())
-    assert not trust.notes and (trust.geometry == 1).all() and (trust.colour == 1).all()
+    weights = ViewWeights.from_errors(errors())
+    assert not weights.notes and (weights.geometry == 1).all() and (weights.colour == 1).all()
 
 
 def test_a_fit_that_is_off_everywhere_blames_no_view():
     everywhere = {view: 20.0 for view in range(8)}
-    assert not Trust.of(errors(outline=everywhere, landmarks=everywhere)).notes
+    assert not ViewWeights.from_errors(errors(outline=everywhere, landmarks=everywhere)).notes
 
 
 @pytest.mark.parametrize("what", ["outline", "landmarks"])
 def test_a_shifted_view_is_named_and_hardly_counts(what):
-    trust = Trust.of(errors(**{what: {3: 35.0}}))
-    assert list(trust.notes) == ["cam03"] and "35 px off" in trust.notes["cam03"]
-    assert trust.geometry[3] < 0.01 and trust.colour[3] < 0.01
-    assert (trust.geometry[torch.arange(8) != 3] == 1).all()
+    weights = ViewWeights.from_errors(errors(**{what: {3: 35.0}}))
+    assert list(weights.notes) == ["cam03"] and "35 px off" in weights.notes["cam03"]
+    assert weights.geometry[3] < 0.01 and weights.colour[3] < 0.01
+    assert (weights.geometry[torch.arange(8) != 3] == 1).all()
 
 
 @pytest.mark.parametrize("log_gain, told", [(-6.0, "times as bright"), (np.log(2.5), "2.5 times as bright")])
 def test_a_black_or_overexposed_view_keeps_its_shape(log_gain, told):
-    trust = Trust.of(errors(brightness={5: -1.0 + log_gain}))
-    assert list(trust.notes) == ["cam05"] and told in trust.notes["cam05"]
-    assert trust.colour[5] == 0 and trust.geometry[5] == 1
+    weights = ViewWeights.from_errors(errors(brightness={5: -1.0 + log_gain}))
+    assert list(weights.notes) == ["cam05"] and told in weights.notes["cam05"]
+    assert weights.colour[5] == 0 and weights.geometry[5] == 1
 
 
 def test_gains_of_ten_percent_are_no_reason():
-    assert not Trust.of(errors(brightness={i: -1.0 + 0.1 * (-1) ** i for i in range(8)})).notes
+    assert not ViewWeights.from_errors(errors(brightness={i: -1.0 + 0.1 * (-1) ** i for i in range(8)})).notes
 
 
 def test_a_view_without_landmarks_or_mask_is_not_suspected():
-    trust = Trust.of(errors(outline={2: float("nan")}, landmarks={2: float("nan")}))
-    assert not trust.notes and torch.isfinite(trust.geometry).all()
+    weights = ViewWeights.from_errors(errors(outline={2: float("nan")}, landmarks={2: float("nan")}))
+    assert not weights.notes and torch.isfinite(weights.geometry).all()
 
 
 def test_the_reason_names_views():
@@ -105,9 +105,11 @@ def test_errors_of_a_shifted_silhouette():
 
 
 def test_weights_reach_the_targets_of_the_chosen_views():
-    trust = Trust(geometry=torch.tensor([1.0, 0.01, 1.0]), colour=torch.tensor([1.0, 1.0, 0.0]), notes={"x": "y"})
+    weights = ViewWeights(
+        geometry=torch.tensor([1.0, 0.01, 1.0]), colour=torch.tensor([1.0, 1.0, 0.0]), notes={"x": "y"}
+    )
     batch = targets()
-    applied = trust.applied(batch, [1, 2])
+    applied = weights.apply(batch, [1, 2])
     first = batch.pixels.view == 0
     for name in ("normal_weight", "mask_weight", "class_weight"):
         before, after = getattr(batch, name), getattr(applied, name)
@@ -115,4 +117,4 @@ def test_weights_reach_the_targets_of_the_chosen_views():
         torch.testing.assert_close(after[~first], before[~first])
     assert (applied.rgb_weight[~first] == 0).all() and (applied.rgb_weight[first] == batch.rgb_weight[first]).all()
     assert (applied.landmarks["68"][0, :, 2] == 0).all() and (applied.landmarks["68"][1, :, 2] == 1).all()
-    assert Trust.full(3).applied(batch, [1, 2]) is batch
+    assert ViewWeights.uniform(3).apply(batch, [1, 2]) is batch

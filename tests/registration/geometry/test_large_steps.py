@@ -8,7 +8,7 @@ import pytest
 import torch
 from scipy.spatial import Delaunay
 
-from registration.fit.optimizer import AdamUniformBlock, minimise
+from registration.fit.optimizer import AdamUniformBlock, minimize
 from registration.fit.recipes import Rate
 from registration.geometry.large_steps import (
     LargeSteps,
@@ -166,7 +166,7 @@ def test_a_known_displacement_is_recovered_from_a_third_of_the_vertices():
         def loss(step, steps=steps, latent=latent):
             return {"seen": (steps.displacement(latent)[seen] - target[seen]).square().sum(-1).mean() * 1e6}
 
-        _, failure = minimise([AdamUniformBlock(latent, Rate(start=start, end=end))], loss, count)
+        _, failure = minimize([AdamUniformBlock(latent, Rate(start=start, end=end))], loss, count)
         assert failure is None
         found = steps.displacement(latent).detach()
     rms_mm = float((found - target).square().sum(-1).mean().sqrt()) * 1e3

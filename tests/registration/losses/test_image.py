@@ -182,10 +182,10 @@ def test_surfaces_of_their_own_must_agree():
     rendered = [[1.0, 0, 0], [0, 1, 0], [0, 1, 0], [0.6, 0.4, 0], [0, 1, 0]]
     seen = replace(seen, classes=torch.tensor(shares, dtype=torch.float64))
     shown = replace(same(seen), classes=torch.tensor(rendered, dtype=torch.float64))
-    assert image.agreement(shown, seen, [1, 2]).tolist() == [True, False, True, True, False]
-    assert image.agreement(shown, seen, []).all()
+    assert image.pixel_agreement(shown, seen, [1, 2]).tolist() == [True, False, True, True, False]
+    assert image.pixel_agreement(shown, seen, []).all()
     missed = replace(shown, mask=torch.tensor([0.4, 1, 1, 1, 1], dtype=torch.float64))
-    assert image.agreement(missed, seen, [1, 2]).tolist() == [False, False, True, True, False]
+    assert image.pixel_agreement(missed, seen, [1, 2]).tolist() == [False, False, True, True, False]
 
 
 def test_ssim_is_that_of_a_window_of_eleven():
@@ -199,7 +199,7 @@ def test_ssim_is_that_of_a_window_of_eleven():
     # Elsewhere the rendering would be replaced by what was seen: leave a trace of weight.
     seen = replace(seen, rgb_weight=seen.rgb_weight.clamp_min(1e-12))
     value = image.rgb_ssim(same(other), seen, everywhere(seen)).item() * len(seen.mask)
-    a, b = (seen.pixels.image(image.encoded(t.rgb))[0].numpy() for t in (other, seen))
+    a, b = (seen.pixels.image(image.srgb_encoded(t.rgb))[0].numpy() for t in (other, seen))
     _, full = structural_similarity(
         a,
         b,

@@ -44,15 +44,15 @@ def test_robust_mean_by_hand():
     residual = torch.tensor([0.0, 3.0, 300.0, 1e6], dtype=torch.float64)
     weight = torch.tensor([1.0, 1, 1, 0], dtype=torch.float64)
     expected = (0 + 0.5 + 1e4 / (1 + 1e4)) / 3
-    assert landmark.robust(residual, weight, 3.0).item() == pytest.approx(expected)
+    assert landmark.geman_mcclure(residual, weight, 3.0).item() == pytest.approx(expected)
     small = torch.tensor([0.03], dtype=torch.float64)
-    assert landmark.robust(small, torch.ones(1), 3.0).item() == pytest.approx(1e-4, rel=1e-3)
-    assert landmark.robust(residual, torch.zeros(4), 3.0).item() == 0
+    assert landmark.geman_mcclure(small, torch.ones(1), 3.0).item() == pytest.approx(1e-4, rel=1e-3)
+    assert landmark.geman_mcclure(residual, torch.zeros(4), 3.0).item() == 0
 
 
 def test_an_outlier_hardly_pulls():
     residual = torch.tensor([3.0, 300.0], dtype=torch.float64, requires_grad=True)
-    landmark.robust(residual, torch.ones(2), 3.0).backward()
+    landmark.geman_mcclure(residual, torch.ones(2), 3.0).backward()
     assert 0 < residual.grad[1] < 1e-5 * residual.grad[0]
 
 
@@ -61,7 +61,7 @@ def test_gradient_through_projection():
 
     def cost(points: torch.Tensor) -> torch.Tensor:
         distance, counts = landmark.residuals(cameras(), points, seen, 300.0)
-        return landmark.robust(distance, counts, 3.0)
+        return landmark.geman_mcclure(distance, counts, 3.0)
 
     assert torch.autograd.gradcheck(cost, torch.tensor(POINTS, requires_grad=True))
 
@@ -70,5 +70,5 @@ def test_a_perfect_fit_has_a_finite_gradient():
     points = torch.tensor(POINTS, requires_grad=True)
     seen = torch.tensor(np.stack([np.column_stack([c.project(POINTS)[0], np.ones(5)]) for c in cameras()]))
     distance, counts = landmark.residuals(cameras(), points, seen, 300.0)
-    landmark.robust(distance, counts, 3.0).backward()
+    landmark.geman_mcclure(distance, counts, 3.0).backward()
     assert points.grad.isfinite().all() and points.grad.abs().max() < 1e-3

@@ -4,17 +4,17 @@ import numpy as np
 import pytest
 import torch
 
-from registration.losses.regularization import Elasticity, prior, strengths
+from registration.losses.regularization import OffsetRegularizer, gaussian_prior, regularization_weights
 from tests.registration.geometry.test_large_steps import lattice, wave
 
 EDGE_M = 0.0005
 
 
-def elasticity(columns: int, rows: int, half_gain_m: float, decay_m: float = 0.025) -> Elasticity:
+def elasticity(columns: int, rows: int, half_gain_m: float, decay_m: float = 0.025) -> OffsetRegularizer:
     points, triangles = lattice(columns, rows)
     # The lattice closes on itself, so its positions do not tell its edges' lengths: unfold one cell of it.
     count = columns * rows
-    flat = Elasticity(
+    flat = OffsetRegularizer(
         triangles,
         np.concatenate([points, np.zeros((count, 1))], 1) * EDGE_M,
         half_gain_m=np.full(count, half_gain_m),
@@ -27,7 +27,7 @@ def elasticity(columns: int, rows: int, half_gain_m: float, decay_m: float = 0.0
     return flat
 
 
-def kept(penalty: Elasticity, mode: torch.Tensor) -> float:
+def kept(penalty: OffsetRegularizer, mode: torch.Tensor) -> float:
     """What a fit to `mode`, pulled with strength one, keeps of it: the minimum over the mode's height."""
     height = torch.tensor(0.0, dtype=torch.float32, requires_grad=True)
     rest = (height * mode - mode).square().sum(-1).mean() + sum(penalty(height * mode).values())
@@ -43,7 +43,7 @@ def test_gain_of_waves(turns, half_gain_mm):
     columns, rows = 60, 60
     field, k = wave(columns, rows, turns)
     mode = torch.tensor(np.outer(0.001 * field, [0.6, 0, 0.8]), dtype=torch.float32)
-    a, b, c = (float(s[0]) for s in strengths(np.array([half_gain_mm * 1e-3]), np.array([0.025])))
+    a, b, c = (float(s[0]) for s in regularization_weights(np.array([half_gain_mm * 1e-3]), np.array([0.025])))
     q = np.linalg.norm(k) / EDGE_M
     found = kept(elasticity(columns, rows, half_gain_mm * 1e-3), mode)
     assert found == pytest.approx(1 / (1 + a + b * q**2 + c * q**4), rel=0.05)
@@ -62,7 +62,7 @@ def test_an_offset_without_data_decays_over_the_decay_length():
     points, triangles = lattice(columns, rows)
     count = columns * rows
     flat = np.concatenate([points, np.zeros((count, 1))], 1) * edge_m
-    penalty = Elasticity(
+    penalty = OffsetRegularizer(
         triangles,
         flat,
         half_gain_m=np.full(count, 0.004),
@@ -106,7 +106,7 @@ def test_stiffness_is_per_place():
     points, triangles = lattice(40, 40)
     count = 1600
     half = np.where(np.arange(count) % 40 < 20, 0.004, 0.008)
-    penalty = Elasticity(
+    penalty = OffsetRegularizer(
         triangles,
         np.concatenate([points, np.zeros((count, 1))], 1) * EDGE_M,
         half_gain_m=half,
@@ -123,8 +123,8 @@ def test_stiffness_is_per_place():
 
 def test_prior():
     coefficients = torch.tensor([1.0, -2.0, 0.0], requires_grad=True)
-    value = prior(coefficients)
+    value = gaussian_prior(coefficients)
     assert value.item() == pytest.approx(5 / 3)
     value.backward()
     torch.testing.assert_close(coefficients.grad, torch.tensor([2 / 3, -4 / 3, 0.0]))
-    assert prior(torch.zeros(0)).item() == 0
+    assert gaussian_prior(torch.zeros(0)).item() == 0

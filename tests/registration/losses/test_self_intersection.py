@@ -17,7 +17,7 @@ from bench.support.crossed_parts import (
 )
 from registration.errors import InputError
 from registration.geometry.topology import vertex_normals
-from registration.losses.self_intersection import SelfIntersection
+from registration.losses.self_intersection import SelfIntersectionPenalty
 from registration.model import gnm_npz, regions
 from registration.model.gnm_npz import GNMData
 from tests.conftest import SHARED, needs_shared
@@ -43,8 +43,8 @@ def full() -> GNMData:
 
 
 @pytest.fixture(scope="module")
-def penalty(full) -> SelfIntersection:
-    return SelfIntersection(full, CPU)
+def penalty(full) -> SelfIntersectionPenalty:
+    return SelfIntersectionPenalty(full, CPU)
 
 
 def template(data: GNMData) -> torch.Tensor:
@@ -79,10 +79,10 @@ CROSSED: dict[str, Callable[[GNMData], torch.Tensor]] = {
 @pytest.mark.parametrize("model", ["tiny", pytest.param("full", marks=needs_shared)])
 def test_a_template_costs_nothing_wherever_it_is(model, request):
     data = tiny_model() if model == "tiny" else request.getfixturevalue("full")
-    penalty = SelfIntersection(data, CPU)
+    penalty = SelfIntersectionPenalty(data, CPU)
     for vertices in (template(data), posed(template(data), 1.0), posed(template(data), 1.3)):
         vertices = vertices.clone().requires_grad_(True)
-        penalty.refresh(vertices)
+        penalty.update_candidates(vertices)
         costs = penalty(vertices)
         assert tuple(costs) == PAIRS and all(cost.shape == () and cost.item() == 0 for cost in costs.values())
         torch.stack(list(costs.values())).sum().backward()
@@ -95,7 +95,7 @@ def test_a_missing_part_is_named(name):
     keep = data.vertex_group_names != name
     lacking = replace(data, vertex_groups=data.vertex_groups[keep], vertex_group_names=data.vertex_group_names[keep])
     with pytest.raises(InputError, match=f"no vertex group '{name}'"):
-        SelfIntersection(lacking, CPU)
+        SelfIntersectionPenalty(lacking, CPU)
 
 
 @pytest.mark.parametrize("name", ["teeth", "tongue", "ears", "gums", "lower_lip", "upper_lip"])
@@ -103,15 +103,15 @@ def test_a_part_without_vertices_touches_nothing(name):
     data = tiny_model()
     groups = data.vertex_groups.copy()
     groups[[k for k, group in enumerate(data.vertex_group_names) if group in (name, f"{name}_region")]] = 0
-    penalty = SelfIntersection(replace(data, vertex_groups=groups), CPU)
+    penalty = SelfIntersectionPenalty(replace(data, vertex_groups=groups), CPU)
     assert not any(penalty(template(data)).values())
 
 
 def test_a_tooth_in_the_tongue_pushes_both():
     data = tiny_model()
-    penalty = SelfIntersection(data, CPU)
+    penalty = SelfIntersectionPenalty(data, CPU)
     vertices = moved(data, regions.tongue(data), (0.0, -8.0, 0.0)).requires_grad_(True)
-    penalty.refresh(vertices)
+    penalty.update_candidates(vertices)
     penalty(vertices)["tongue-teeth"].backward()
     up, tongue, teeth = vertices.grad[:, 1], regions.tongue(data), regions.teeth(data)
     assert up[tongue].sum() < 0 < up[teeth].sum() and not up[~(tongue | teeth)].any()  # the gradient looks uphill
@@ -122,7 +122,7 @@ def test_a_tooth_in_the_tongue_pushes_both():
 @pytest.mark.parametrize("pair", PAIRS)
 def test_gradients_of_every_pair(full, penalty, pair):
     vertices = CROSSED[pair](full).double()
-    penalty.refresh(vertices)
+    penalty.update_candidates(vertices)
     at = vertices.clone().requires_grad_(True)
     cost = penalty(at)[pair]
     cost.backward()
@@ -138,12 +138,12 @@ def test_gradients_of_every_pair(full, penalty, pair):
 @needs_shared
 def test_excess_is_in_millimetres_of_the_head_at_hand(full, penalty):
     vertices = CROSSED["tongue-teeth"](full)
-    penalty.refresh(vertices)
+    penalty.update_candidates(vertices)
     excess, cost = penalty.excess_mm(vertices)["tongue-teeth"], penalty(vertices)["tongue-teeth"]
     assert excess.max() > 1 and excess.square().sum() <= cost * (1 + 1e-5)
     for scale in (0.5, 1.2):
         elsewhere = posed(vertices, scale)
-        penalty.refresh(elsewhere)
+        penalty.update_candidates(elsewhere)
         torch.testing.assert_close(
             penalty.excess_mm(elsewhere)["tongue-teeth"], scale * excess, atol=1e-3, rtol=0, check_dtype=False
         )
@@ -152,19 +152,19 @@ def test_excess_is_in_millimetres_of_the_head_at_hand(full, penalty):
 
 def test_what_is_accepted_costs_nothing_in_its_pairs_alone():
     data = tiny_model()
-    penalty = SelfIntersection(data, CPU)
+    penalty = SelfIntersectionPenalty(data, CPU)
     crossed = moved(data, regions.tongue(data), (0.0, -8.0, 0.0))
 
     def cost(pair: str) -> float:
-        penalty.refresh(crossed)
+        penalty.update_candidates(crossed)
         return penalty(crossed)[pair].item()
 
     before = cost("tongue-teeth")
-    penalty.accept(posed(crossed, 1.2), ["lips-teeth"])
+    penalty.set_rest_depths(posed(crossed, 1.2), ["lips-teeth"])
     assert cost("tongue-teeth") == before > 0
-    penalty.accept(posed(crossed, 1.2), ["tongue-teeth"])
+    penalty.set_rest_depths(posed(crossed, 1.2), ["tongue-teeth"])
     assert cost("tongue-teeth") < 1e-6 * before  # what turning it did to its numbers
-    penalty.accept(template(data))  # what was accepted before is forgotten
+    penalty.set_rest_depths(template(data))  # what was accepted before is forgotten
     assert cost("tongue-teeth") == before
 
 
@@ -184,7 +184,7 @@ def test_skin_at_the_corners_of_the_mouth_is_not_in_the_other_lip(full, penalty)
         vertices = vertices + np.einsum("e,evc->vc", random.normal(size=len(basis)) * share, basis)
     basis = full.vertex_identity_basis
     head = torch.as_tensor(vertices + np.einsum("e,evc->vc", random.normal(size=len(basis)), basis)).float()
-    penalty.refresh(head)
+    penalty.update_candidates(head)
     excess = penalty.excess_mm(head)["upper-lower lip"]
     # By the closest surface alone, 16 vertices of the skin beside the mouth would be up to 7 mm too deep.
     assert 0 < excess.count_nonzero() < 10 and not outside(full, head, excess).any()
@@ -198,7 +198,7 @@ def test_what_official_faces_do_by_themselves(full, penalty):
     deepest = {}
     for name, delta in zip(names, [*samples["identity_deltas"], *samples["expression_deltas"]], strict=True):
         vertices = template(full) + torch.as_tensor(delta)
-        penalty.refresh(vertices)
+        penalty.update_candidates(vertices)
         found = penalty.excess_mm(vertices)
         deepest[name] = {pair: float(excess.max()) for pair, excess in found.items()}
         assert not outside(full, vertices, found["upper-lower lip"]).any(), name
@@ -217,7 +217,7 @@ def test_a_tongue_pushed_into_the_teeth(full, penalty, direction):
     deepest = []
     for push in (0.0, 1.0, 2.0, 3.0, 4.0, 5.0):
         vertices = moved(full, tongue, tuple(push * axis for axis in direction))
-        penalty.refresh(vertices)
+        penalty.update_candidates(vertices)
         found = penalty.excess_mm(vertices)["tongue-teeth"].numpy()[tongue]
         points = vertices.numpy().astype(np.float64)
         truth = tooth_depths_mm(points[tongue], points, teeth)

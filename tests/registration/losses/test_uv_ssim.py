@@ -14,7 +14,7 @@ from bench.support import sliding
 from bench.support.sliding import Problem
 from registration.geometry.quads import corner_triangles, triangles_of
 from registration.geometry.texels import eroded, texels
-from registration.losses.uv_ssim import trusted
+from registration.losses.uv_ssim import confident_texels
 from registration.model import gnm_npz
 from registration.model.regions import blush, exterior, inner_lips, lids
 from registration.render import backend
@@ -45,7 +45,7 @@ def problem() -> Problem:
         triangles=triangles,
         corner_uvs=corner_uvs,
         texture=texture,
-        trust=skin.astype(float),
+        weights=skin.astype(float),
         truth=points,
         start=sliding.slid(points, triangles, skin, 2.0),
         moves=skin,
@@ -71,7 +71,7 @@ def test_equal_textures_cost_little_and_slid_ones_much(problem):
 def test_nothing_known_costs_nothing(problem):
     vertices = torch.tensor(problem.start, dtype=torch.float32, requires_grad=True)
     for silent in (
-        replace(problem, trust=np.zeros(len(problem.truth))),
+        replace(problem, weights=np.zeros(len(problem.truth))),
         replace(problem, batch=replace(problem.batch, rgb_weight=torch.zeros_like(problem.batch.rgb_weight))),
     ):
         value = silent.loss(SIZE_PX)(vertices, silent.batch)
@@ -151,7 +151,7 @@ def test_resolutions_of_the_reference_agree(problem):
 
 def test_windows_hold_one_chart(problem):
     """At every scale: what has a weight is further from all other charts than a window reaches."""
-    loss = replace(problem, trust=np.ones(len(problem.truth))).loss(SIZE_PX)
+    loss = replace(problem, weights=np.ones(len(problem.truth))).loss(SIZE_PX)
     atlas = texels(problem.triangles, problem.corner_uvs, SIZE_PX)
     charts = atlas.image(atlas.chart, -1)
     first = [places.min() // 4 * 4 for places in np.nonzero(eroded(charts, 2))]  # where the compared part begins
@@ -209,13 +209,13 @@ def test_trust_of_the_tiny_head():
     data = tiny_model()
     confidence = np.full(len(data.template_vertex_positions), 0.5)
     confidence[:600] = 0.1
-    trust = trusted(data, confidence)
-    assert ((trust > 0) == (exterior(data) & (np.arange(len(trust)) >= 600))).all()
-    plain = (trust > 0) & (lids(data) + inner_lips(data) + blush(data) == 0)
-    assert (trust[plain] == 1).all() and plain.any()
-    cheeks = (trust > 0) & (blush(data) == 1) & (lids(data) == 0)
-    assert (trust[cheeks] == 0.5).all() and cheeks.any()
-    assert (trust[(trust > 0) & (lids(data) > 0.5)] < 0.6).all()
+    weights = confident_texels(data, confidence)
+    assert ((weights > 0) == (exterior(data) & (np.arange(len(weights)) >= 600))).all()
+    plain = (weights > 0) & (lids(data) + inner_lips(data) + blush(data) == 0)
+    assert (weights[plain] == 1).all() and plain.any()
+    cheeks = (weights > 0) & (blush(data) == 1) & (lids(data) == 0)
+    assert (weights[cheeks] == 0.5).all() and cheeks.any()
+    assert (weights[(weights > 0) & (lids(data) > 0.5)] < 0.6).all()
 
 
 @needs_shared

@@ -179,18 +179,18 @@ def scan_damaged(request: Request) -> None:
 # The model
 
 
-@bad("there is no model file", where="tiny_gnm.npz", got="no such file", fix="gnmreg model fetch")
+@bad("The head model is missing", where="tiny_gnm.npz", got="no such file", fix="gnmreg model fetch")
 def model_missing(request: Request) -> None:
     request.model.unlink()
 
 
-@bad("the model file cannot be read", where="tiny_gnm.npz", got="", fix="gnmreg model fetch")
+@bad("The head model cannot be read", where="tiny_gnm.npz", got="", fix="gnmreg model fetch")
 def model_truncated(request: Request) -> None:
     content = request.model.read_bytes()
     request.model.write_bytes(content[: len(content) // 2])
 
 
-@bad("lacks the field 'skinning_weights'", where="tiny_gnm.npz", got="22 of them", fix="gnmreg model fetch")
+@bad("field 'skinning_weights' is missing", where="tiny_gnm.npz", got="22 of them", fix="gnmreg model fetch")
 def model_without_a_field(request: Request) -> None:
     request.change_model(skinning_weights=None)
 
@@ -342,7 +342,7 @@ def out_is_someone_else_s(request: Request) -> None:
     (request.out / "thesis.txt").write_text("years of work")
 
 
-@bad("The output folder cannot be used", where="out", got="also notes.txt", fix="move these files away")
+@bad("The output folder cannot be used", where="out", got="also notes.txt", fix="move these files elsewhere")
 def out_is_ours_and_holds_more(request: Request) -> None:
     write_neutral(request.out, gnm_npz.read(request.model))
     (request.out / "notes.txt").write_text("what I saw")
@@ -368,7 +368,7 @@ def one_view_asked_for(request: Request) -> None:
     request.options["views"] = 1
 
 
-@bad("Nothing tells where the head is", where="capture", got="no masks", fix="masks")
+@bad("The head cannot be located", where="capture", got="no masks", fix="masks")
 def neither_landmarks_nor_masks(request: Request) -> None:
     for part in ("landmarks", "masks", "segmentation"):
         shutil.rmtree(request.capture / part)
@@ -447,7 +447,7 @@ def test_no_head_in_the_masks(request_: Request):
     with pytest.raises(InputError) as caught:
         request_.register()
     error = caught.value
-    assert error.what == "The head was not found"
+    assert error.what == "The pose of the head cannot be estimated"
     assert "masks" in error.where
     assert "0.7" in error.expected and float(error.got.split()[0]) < 0.7
     assert "--landmarks" in error.fix

@@ -3,14 +3,14 @@
 import pytest
 import torch
 
-from registration.fit.problem import Outcome
+from registration.fit.problem import FitTrace
 from registration.fit.view_weights import ViewErrors
 from registration.register import _status
 
 NAN = torch.full((2,), torch.nan)
 CALM = ViewErrors(names=("a", "b"), outline_px=NAN, landmark_px=NAN, brightness=torch.zeros(2))
 TORN = ViewErrors(names=("a", "b"), outline_px=NAN, landmark_px=torch.tensor([1.0, 40.0]), brightness=torch.zeros(2))
-STILL, MOVING = Outcome(motion_mm=0.01), Outcome(motion_mm=0.2)
+STILL, MOVING = FitTrace(motion_mm=0.01), FitTrace(motion_mm=0.2)
 GOOD = {"68": 0.5, "oral": float("nan")}
 
 
@@ -38,5 +38,5 @@ def test_a_fit_that_still_moves_has_stopped(landmarks: dict[str, float], status:
 
 
 def test_what_broke_the_fit_is_the_reason() -> None:
-    broken = Outcome(failure="the loss is not finite")
+    broken = FitTrace(failure="the loss is not finite")
     assert _status(broken, {"68": 50.0}, [], TORN) == ("failed", "the loss is not finite")

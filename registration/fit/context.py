@@ -1,0 +1,140 @@
+"""What a fit is made of whatever its initial guess: model, targets, recipe, and what is computed from them once."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+
+from registration.fit.recipes import Recipe
+from registration.fit.variables import skin_triangles, skin_vertices
+from registration.geometry.large_steps import normalised_laplacian, spacing
+from registration.losses.self_intersection import SelfIntersectionPenalty
+from registration.losses.uv_ssim import UVSSIM
+from registration.model.gnm import GNM
+from registration.model.gnm_npz import GNMData
+from registration.model.landmarks import LandmarkScheme
+from registration.model.regions import crossing_parts, offset_regions, vertex_classes
+from registration.render.renderer import Renderer
+from registration.targets.classes import ClassMap
+from registration.types import Registration, Targets
+
+# Surfaces of their own: where a pixel shows one and its target another, only classes are compared.
+_SEPARATE_SURFACES = ("left_eye", "right_eye", "mouth_interior")
+_REGION_RINGS = 2  # of vertices around an offset region that belong to it, so that its boundary can follow
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class FitContext:
+    """The inputs of a fit, and what every stage needs of them."""
+
+    data: GNMData
+    model: GNM  # the same model as a function, on the device of the fit
+    pyramid: tuple[Targets, ...]  # level 0 is the finest
+    classes: ClassMap
+    schemes: Mapping[str, LandmarkScheme]  # of the model
+    corner_uvs: Float[np.ndarray, "F 3 2"]  # of the texture's atlas
+    recipe: Recipe
+    seed: int
+    neutral: Registration | None = None  # of the subject, if the capture shows an expression
+
+    @property
+    def device(self) -> torch.device:
+        """The device of all tensors of the fit."""
+        return self.model.template.device
+
+    @property
+    def view_count(self) -> int:
+        """How many views there are."""
+        return len(self.pyramid[0].names)
+
+    @cached_property
+    def renderer(self) -> Renderer:
+        """The renderer of the model's mesh."""
+        return Renderer(
+            self.data.triangles,
+            self.corner_uvs,
+            vertex_classes(self.data)[1] @ self.classes.from_model,
+            parts=crossing_parts(self.data) * bool(self.recipe.edge_samples),  # a single part has no crossings
+            edge_samples=self.recipe.edge_samples,
+            seed=self.seed,
+        )
+
+    @cached_property
+    def view_order(self) -> "ViewOrder":
+        """The order in which steps take views."""
+        return ViewOrder(self.view_count, self.seed)
+
+    @cached_property
+    def captured_schemes(self) -> dict[str, LandmarkScheme]:
+        """The landmark schemes that model and capture share."""
+        return {name: scheme for name, scheme in self.schemes.items() if name in self.pyramid[0].landmarks}
+
+    @cached_property
+    def separate_surfaces(self) -> list[int]:
+        """Classes that are surfaces of their own (`losses.image.pixel_agreement`)."""
+        return [self.classes.names.index(name) for name in _SEPARATE_SURFACES if name in self.classes.names]
+
+    @cached_property
+    def skin(self) -> "SkinMesh":
+        """The part of the mesh that carries free offsets."""
+        return SkinMesh.from_model(self.data, self.recipe)
+
+    @cached_property
+    def self_intersection(self) -> SelfIntersectionPenalty:
+        """The penalty on parts of the head that run into one another."""
+        return SelfIntersectionPenalty(self.data, self.device)
+
+    @cached_property
+    def uv_ssim(self) -> UVSSIM | None:
+        """The comparison with the neutral's texture, if there is a neutral."""
+        if self.neutral is None:
+            return None
+        texture = torch.as_tensor(self.neutral.texture, device=self.device)
+        return UVSSIM(self.data, self.neutral.corner_uvs, texture, self.neutral.confidence, self.recipe.slide_px)
+
+
+class ViewOrder:
+    """The order in which steps take views: random permutations; a view that still waits does not join the next one."""
+
+    def __init__(self, count: int, seed: int):
+        self._count = count
+        self._random = np.random.default_rng(seed)
+        self._waiting: list[int] = []
+
+    def take(self, count: int) -> list[int]:
+        """Return the next `count` views, or all if there are fewer, sorted."""
+        count = min(count, self._count)
+        while len(self._waiting) < count:
+            order = self._random.permutation(self._count)
+            self._waiting += [int(view) for view in order if int(view) not in self._waiting]
+        taken, self._waiting = self._waiting[:count], self._waiting[count:]
+        return sorted(taken)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class SkinMesh:
+    """The vertices and triangles that carry free offsets, as rows of the skin."""
+
+    triangles: Int[np.ndarray, "G 3"]
+    points: Float[np.ndarray, "S 3"]  # of the template, metres
+    edge_length_m: Float[np.ndarray, "S"]  # mean over each vertex' edges
+    region: Int[np.ndarray, "S"]  # 0, or 1 + index into the recipe's regions
+
+    @classmethod
+    def from_model(cls, data: GNMData, recipe: Recipe) -> "SkinMesh":
+        """Cut the skin out of the model's mesh and mark the recipe's regions."""
+        skin = skin_vertices(data)
+        triangles = skin_triangles(data.triangles, skin, len(data.template_vertex_positions))
+        points = data.template_vertex_positions[skin]
+        neighbours = normalised_laplacian(triangles, len(skin)) != 0  # and each vertex itself
+        masks = offset_regions(data)
+        region = np.zeros(len(skin), np.int64)
+        for number, settings in enumerate(recipe.regions, start=1):
+            members = masks[settings.name][skin]
+            for _ in range(_REGION_RINGS):
+                members = members | (neighbours @ members)
+            region[members] = number
+        return cls(triangles=triangles, points=points, edge_length_m=spacing(triangles, points), region=region)

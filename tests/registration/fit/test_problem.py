@@ -1,0 +1,164 @@
+"""The fitting problem on a small synthetic capture: terms, traces, and what is shared between initial guesses."""
+
+from collections.abc import Mapping
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from registration.fit import problem as problem_module
+from registration.fit import terms
+from registration.fit.context import FitContext, ViewOrder
+from registration.fit.initialization import from_landmarks
+from registration.fit.problem import FitProblem, assess, refine
+from registration.fit.recipes import Recipe, Stage, preview
+from registration.fit.terms import StageContext, StepState, Term
+from registration.fit.variables import InitialGuess
+from registration.inputs import RegistrationInputs, read_inputs
+from registration.model.atlas import texture_atlas
+from registration.model.gnm import GNM
+from registration.options import RegisterOptions
+from registration.render import backend
+from registration.targets.classes import class_map
+from registration.targets.pyramid import build_pyramid
+from tests.registration.register import synthetic
+
+OFFSETS = {"offset l2", "offset coupling", "offset laplacian"}
+IMAGES = {"normals", "mask", "classes", "landmarks 68"}
+
+
+def short(steps: int = 2) -> Recipe:
+    """The preview with few steps."""
+    recipe = preview()
+    return replace(recipe, stages=tuple(replace(stage, steps=steps, level=1) for stage in recipe.stages[:2]))
+
+
+@pytest.fixture(scope="module")
+def inputs(tmp_path_factory: pytest.TempPathFactory) -> RegistrationInputs:
+    truth = synthetic.make(tmp_path_factory.mktemp("fit") / "neutral")
+    return read_inputs(truth.root, synthetic.MODEL, RegisterOptions(recipe=short(), views=3))
+
+
+@pytest.fixture
+def context(inputs: RegistrationInputs) -> FitContext:
+    device, classes = backend.activate("llvm"), class_map(inputs.capture.classes)
+    return FitContext(
+        data=inputs.data,
+        model=GNM(inputs.data, device=device),
+        pyramid=build_pyramid(inputs.capture, classes, finest_head_px=128, levels=2),
+        classes=classes,
+        schemes=inputs.schemes,
+        corner_uvs=texture_atlas(inputs.data),
+        recipe=inputs.recipe,
+        seed=0,
+    )
+
+
+@pytest.fixture
+def initial(inputs: RegistrationInputs) -> InitialGuess:
+    return from_landmarks(inputs.data, inputs.schemes["68"], inputs.landmarks["68"], free_scale=True)
+
+
+def test_stages_have_the_losses_of_their_weights_and_variables(context: FitContext, initial: InitialGuess) -> None:
+    trace = FitProblem(context, initial).run(context.recipe.stages)
+    model, offsets = context.recipe.stages
+    assert trace.failure is None and np.isfinite(trace.motion_mm)
+    assert set(trace.history[model.name]) == IMAGES | {"identity", "expression", "joints", "eyes"}
+    assert set(trace.history[offsets.name]) == IMAGES | OFFSETS | {"rgb", "ssim", "eyes"}
+    assert all(len(values) == 2 for losses in trace.history.values() for values in losses.values())
+    assert set(trace.seconds) == {model.name, offsets.name}
+
+
+def test_a_new_term_is_a_factory_in_the_list(
+    context: FitContext, initial: InitialGuess, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def height(stage_context: StageContext) -> Term | None:
+        def term(state: StepState) -> Mapping[str, torch.Tensor]:
+            return {"height": 10.0 * state.vertices[:, 1].mean()}
+
+        return term if stage_context.stage.frees("position") else None
+
+    before = FitProblem(context, initial)
+    before.run(context.recipe.stages[:1])
+    monkeypatch.setattr(terms, "TERMS", (*terms.TERMS, height))
+    after = FitProblem(replace(context), initial)
+    trace = after.run(context.recipe.stages)
+    model, offsets = context.recipe.stages
+    assert "height" in trace.history[model.name] and "height" not in trace.history[offsets.name]
+    assert after.variables["position"][1] < before.variables["position"][1]
+
+
+def test_a_failed_stage_ends_the_fit_and_is_named(
+    context: FitContext, initial: InitialGuess, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def broken(stage_context: StageContext) -> Term | None:
+        return lambda state: {"broken": state.vertices.sum() * (torch.nan if state.step == 1 else 0.0)}
+
+    monkeypatch.setattr(terms, "TERMS", (*terms.TERMS, broken))
+    steps: list[tuple[str, int]] = []
+    trace = FitProblem(context, initial).run(
+        context.recipe.stages, lambda stage, step: steps.append((stage.name, step))
+    )
+    assert trace.failure == "stage model: broken not finite at step 1"
+    assert list(trace.history) == ["model"] and steps == [("model", 0)]
+
+
+def test_offsets_are_a_latent_only_while_a_stage_runs(context: FitContext, initial: InitialGuess) -> None:
+    problem = FitProblem(context, initial)
+    latent: list[bool] = []
+    problem.run(context.recipe.stages, lambda stage, step: latent.append(problem.variables.latent is not None))
+    assert latent == [False, False, True, True] and problem.variables.latent is None
+    assert problem.variables.skin_offsets().any()
+
+
+def test_outliers_of_the_initial_guess_do_not_count(context: FitContext, initial: InitialGuess) -> None:
+    points = synthetic.read(synthetic.MODEL).template_vertex_positions  # far from the capture's world
+    wrong = {"68": context.schemes["68"].points(points)}
+    used = np.zeros(68, bool)
+    used[:10] = True
+    few = FitProblem(context, replace(initial, landmarks_used={"68": used}))
+    assert few.landmarks_used["68"].sum() == 10
+    partly = {"68": np.where(used[:, None], context.schemes["68"].points(few.vertices().numpy()), wrong["68"])}
+    assert few.landmark_residuals_px(partly)["68"] == pytest.approx(0.0, abs=1e-2)
+    assert FitProblem(context, initial).landmark_residuals_px(partly)["68"] > 10
+
+
+def test_a_pose_is_assessed_and_refined_without_touching_other_problems(
+    context: FitContext, initial: InitialGuess, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    shifted = replace(initial, position=initial.position + [0.02, 0.0, 0.0])
+    assert assess(context, initial).overlap > assess(context, shifted).overlap + 0.05
+    rigid = problem_module.rigid_stage
+    monkeypatch.setattr(problem_module, "rigid_stage", lambda level: replace(rigid(level), steps=10))
+    refined = refine(context, shifted)
+    assert assess(context, refined).overlap > assess(context, shifted).overlap + 0.03
+    assert refined.identity is shifted.identity
+
+
+def test_steps_take_all_views_evenly_and_none_twice() -> None:
+    order = ViewOrder(7, seed=3)
+    steps = [order.take(3) for _ in range(70)]
+    assert all(len(set(step)) == 3 and step == sorted(step) for step in steps)
+    counts = np.bincount([view for step in steps for view in step], minlength=7)
+    assert counts.sum() == 210 and counts.min() >= 24 and set(steps[0]) & set(steps[1]) == set()
+    again = ViewOrder(7, seed=3)
+    assert [again.take(3) for _ in range(70)] == steps
+    assert ViewOrder(2, seed=0).take(5) == [0, 1]
+
+
+def test_a_stage_without_a_weight_has_no_term(context: FitContext, initial: InitialGuess) -> None:
+    stage = Stage(name="nothing", steps=1, level=1)
+    weights = replace(stage.weights, normals=0.0, mask=0.0, classes=0.0, landmarks=0.0, tongue=0.0)
+    problem = FitProblem(context, initial)
+    made = terms.make_terms(
+        StageContext(
+            fit=context,
+            stage=replace(stage, weights=weights),
+            variables=problem.variables,
+            appearance=problem.appearance,
+            landmarks_used=problem.landmarks_used,
+            regularizer=None,
+        )
+    )
+    assert made == ()
