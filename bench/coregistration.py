@@ -16,12 +16,13 @@ import argparse
 import sys
 import time
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
-from coregister.evaluate.evaluation import HeldOut
-from coregister.evaluate.linear_fit import LinearPart, fit, identity_part, surface_part
+from coregister.evaluate.evaluation import HeldOutSubject
+from coregister.evaluate.linear_fit import LinearPart, fit_correspondence, identity_part
 from coregister.evaluate.scan_fit import fit_scan
 from coregister.evaluate.specificity import specificity_mm
 from coregister.first_model import build as bootstrap
@@ -31,6 +32,7 @@ from coregister.stopping_rule import Rule
 from coregister.synthetic.capture import Studio
 from registration.capture.scan import read_truth
 from registration.evaluate.distances import Surface, spread
+from registration.geometry.topology import vertex_areas
 from registration.model import gnm_npz, regions
 from registration.model.gnm_npz import GNMData
 from registration.progress import shown
@@ -64,22 +66,29 @@ def own_samples(data: GNMData, count: int, seed: int) -> list[TrainingSubject]:
     return subjects
 
 
-def vertices_mm(data: GNMData, people: Sequence[HeldOut], part: LinearPart) -> dict[str, float]:
+def surface_part(data: GNMData) -> LinearPart:
+    """Return the identity components on the whole exterior skin, vertices weighted by area."""
+    part = identity_part(data, regions.exterior(data))
+    area = vertex_areas(data.template_vertex_positions, data.triangles)[part.rows]
+    return replace(part, weights=area / area.mean())
+
+
+def vertices_mm(data: GNMData, people: Sequence[HeldOutSubject], part: LinearPart) -> dict[str, float]:
     """Number of components -> mean distance between the same vertices, over the people."""
     counts = [k for k in COMPONENTS if k <= len(part.basis)]
-    found = [fit(part, one.neutral[part.rows], counts) for one in people]
+    found = [fit_correspondence(part, one.neutral[part.rows], counts) for one in people]
     means = np.array([[part.mean(one.distance_mm) for one in fits] for fits in found]).mean(0)
     return dict(zip(map(str, counts), means.tolist(), strict=True))
 
 
-def surface_mm(data: GNMData, people: Sequence[HeldOut], part: LinearPart) -> dict[str, float]:
+def surface_mm(data: GNMData, people: Sequence[HeldOutSubject], part: LinearPart) -> dict[str, float]:
     """The same of points of the true surface, spread by area, from the model's, with the number that counts."""
     count, outside = int(AT), identity_part(data, regions.exterior(data))
     if count > len(part.basis):
         return {}
     found = []
     for number, one in enumerate(people):
-        start = fit(part, one.neutral[part.rows], [count])
+        start = fit_correspondence(part, one.neutral[part.rows], [count])
         truth = Surface(vertices=one.neutral[outside.rows].astype(np.float64), triangles=outside.triangles)
         points, _ = spread(truth, POINTS, seed=number)
         found.append(fit_scan(outside, points, start)[0].distance_mm.mean())

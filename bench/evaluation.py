@@ -14,7 +14,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from coregister.evaluate.evaluation import HeldOut, Settings, evaluate
+from coregister.evaluate.evaluation import EvaluationSettings, HeldOutSubject, evaluate
 from coregister.first_model import assembly as anatomy_of
 from coregister.first_model import build, makehuman, population
 from coregister.first_model.assembly import Anatomy
@@ -42,7 +42,7 @@ class Moves(dict):
         return self[name]
 
 
-def people(anatomy: Anatomy, data: GNMData, moves: Moves, count: int) -> list[HeldOut]:
+def people(anatomy: Anatomy, data: GNMData, moves: Moves, count: int) -> list[HeldOutSubject]:
     rng = np.random.default_rng(_HELD_OUT_SEED)
     acts = [expressions.named(name) for name in ACTS]
     face = data.triangles[(regions.group(data, "hockey_mask") > 0.5)[data.triangles].all(1)]
@@ -54,7 +54,7 @@ def people(anatomy: Anatomy, data: GNMData, moves: Moves, count: int) -> list[He
         area = np.linalg.norm(np.cross(b - a, c - a), axis=1)
         drawn = rng.choice(len(face), SCAN_POINTS, p=area / area.sum())
         found.append(
-            HeldOut(
+            HeldOutSubject(
                 subject=f"person_{number}",
                 neutral=neutral,
                 expressions=np.stack([expressions.perform(anatomy, act, neutral, joints) for act in acts]),
@@ -96,7 +96,7 @@ def main() -> None:
         most = min(COMPONENTS[-1], len(model.vertex_identity_basis))
         components = (*(k for k in COMPONENTS if k < most), most)
         begun = time.perf_counter()
-        settings = Settings(components=components, samples=arguments.samples)
+        settings = EvaluationSettings(components=components, samples=arguments.samples)
         one = evaluate({name: model}, subjects, model.triangles, settings).models[name]
         seconds = time.perf_counter() - begun
         for number, count in enumerate(one.identity.components):

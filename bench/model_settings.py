@@ -22,7 +22,7 @@ import numpy as np
 from jaxtyping import Float
 
 from bench.evaluation import Moves
-from coregister.evaluate.linear_fit import fit, identity_part
+from coregister.evaluate.linear_fit import fit_correspondence, identity_part
 from coregister.evaluate.specificity import specificity_mm
 from coregister.first_model import assembly as anatomy_of
 from coregister.first_model import build as bootstrap
@@ -84,7 +84,7 @@ def next_model(heads: Float[np.ndarray, "N V 3"], previous: GNMData, settings: I
 
 def errors_mm(data: GNMData, heads: Float[np.ndarray, "N V 3"]) -> Float[np.ndarray, "k"]:
     part = identity_part(data)
-    fits = [fit(part, head[part.rows], COMPONENTS) for head in heads]
+    fits = [fit_correspondence(part, head[part.rows], COMPONENTS) for head in heads]
     return np.array([[one.distance_mm.mean() for one in found] for found in fits]).mean(0)
 
 

@@ -25,7 +25,7 @@ from jaxtyping import Float
 from rich.console import Console
 from rich.table import Table
 
-from coregister.evaluate.linear_fit import Fit, fit, identity_part
+from coregister.evaluate.linear_fit import LinearFit, fit_correspondence, identity_part
 from coregister.evaluate.scan_fit import fit_scan
 from coregister.next_model.build import build_model
 from coregister.next_model.identity import IdentitySettings
@@ -87,12 +87,12 @@ def errors_mm(
 ) -> Float[np.ndarray, "2 k"]:
     """Mean distances of the model from the scan's points and from the registration's vertices."""
     was_seen = identity_part(data, regions.head_skin(data) & (registration.confidence >= _SURE))
-    starts = fit(was_seen, registration.vertices[was_seen.rows], counts)
+    starts = fit_correspondence(was_seen, registration.vertices[was_seen.rows], counts)
     scans = fit_scan(identity_part(data, regions.exterior(data)), points, starts)
     return np.array([_means(scans), _means(starts)])
 
 
-def _means(fits: Sequence[Fit]) -> list[float]:
+def _means(fits: Sequence[LinearFit]) -> list[float]:
     return [float(one.distance_mm.mean()) for one in fits]
 
 

@@ -1,7 +1,7 @@
-"""Means over subjects and how far they can be trusted: intervals by bootstrap over subjects, never over samples.
+"""Confidence intervals of means over subjects: bootstrap over subjects, never over samples [Hesterberg 2015].
 
-Samples of one subject resemble one another, so that counting each would promise too much. A subject counts once,
-however many samples it has.
+Samples of one subject are correlated, so that resampling them would make intervals too narrow. Every subject has one
+value, whatever the number of its samples; docs/algorithms.md, "Confidence intervals".
 """
 
 from collections.abc import Callable
@@ -17,47 +17,57 @@ DRAWS = 2000
 
 @dataclass(frozen=True, kw_only=True)
 class Interval:
-    """A mean and its 95 % interval; `low` and `high` are None where one subject alone tells nothing of others."""
+    """A mean and its 95 % confidence interval; `low` and `high` are None for one subject."""
 
     mean: float
     low: float | None
     high: float | None
 
 
-def interval(values: Float[np.ndarray, "N"], *, seed: int, draws: int = DRAWS) -> Interval:
-    """The mean of one value per subject; subjects whose value is NaN do not count.
+def bootstrap_interval(values: Float[np.ndarray, "N"], *, seed: int, draws: int = DRAWS) -> Interval:
+    """Return the interval of the mean of one value per subject.
+
+    Args:
+        values: of the subjects; NaN: the subject has none and is excluded.
+        seed: of the resampling.
+        draws: number of resamples.
 
     Raises:
         ValueError: no subject has a value.
     """
-    return interval_of(values[:, None], lambda sums: sums[..., 0], seed=seed, draws=draws)
+    return bootstrap_statistic_interval(values[:, None], lambda means: means[..., 0], seed=seed, draws=draws)
 
 
-def interval_of(
+def bootstrap_statistic_interval(
     values: Float[np.ndarray, "N C"],
     statistic: Callable[[Float[np.ndarray, "*B C"]], Float[np.ndarray, "*B"]],
     *,
     seed: int,
     draws: int = DRAWS,
 ) -> Interval:
-    """A statistic of the columns' means, the same subjects drawn for all columns: paired.
+    """Return the interval of a statistic of the columns' means. All columns have the same resamples: paired.
 
-    Expanded percentiles (Hesterberg, What Teachers Should Know About the Bootstrap, 2015): plain ones are too narrow
-    for a few subjects, for they leave out the factor n / (n - 1) and Student's heavier tails. Rows with a NaN do not
-    count.
+    Expanded percentiles [Hesterberg 2015]: plain percentiles are too narrow for few subjects, since they lack the
+    factor n / (n - 1) and the heavier tails of Student's distribution.
+
+    Args:
+        values: a row a subject; rows with a NaN are excluded.
+        statistic: of the columns' means, vectorized.
+        seed: of the resampling.
+        draws: number of resamples.
 
     Raises:
-        ValueError: no row is without NaN.
+        ValueError: every row has a NaN.
     """
-    known = values[np.isfinite(values).all(1)]
-    count = len(known)
+    complete = values[np.isfinite(values).all(1)]
+    count = len(complete)
     if not count:
         raise ValueError("an interval needs at least one subject with a value")
-    mean = float(statistic(known.mean(0)))
+    mean = float(statistic(complete.mean(0)))
     if count == 1:
         return Interval(mean=mean, low=None, high=None)
     rng = np.random.default_rng(seed)
-    shares = rng.multinomial(count, np.full(count, 1 / count), size=draws) / count
+    weights = rng.multinomial(count, np.full(count, 1 / count), size=draws) / count
     tail = norm.cdf(np.sqrt(count / (count - 1)) * t.ppf((1 - LEVEL) / 2, count - 1))
-    low, high = np.quantile(statistic(shares @ known), [tail, 1 - tail])
+    low, high = np.quantile(statistic(weights @ complete), [tail, 1 - tail])
     return Interval(mean=mean, low=float(low), high=float(high))

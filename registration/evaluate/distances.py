@@ -8,6 +8,7 @@ from jaxtyping import Bool, Float, Int
 
 from registration.frames import MM_PER_M
 from registration.geometry.closest_point import barycentric_points, closest_points
+from registration.geometry.surface_samples import sample_surface
 from registration.geometry.topology import edges
 
 SAMPLES = 100_000
@@ -47,9 +48,7 @@ def distances_mm(points: Float[np.ndarray, "P 3"], surface: Surface) -> Float[np
 
 def spread(surface: Surface, count: int, seed: int = 0) -> tuple[Float[np.ndarray, "N 3"], Int[np.ndarray, "N"]]:
     """Random points of a surface, as many on every square millimetre, and the face of each."""
-    area, rng = np.linalg.norm(surface.normals(), axis=1), np.random.default_rng(seed)
-    face = rng.choice(len(area), count, p=area / area.sum())
-    weight = rng.dirichlet((1.0, 1.0, 1.0), count)
+    face, weight = sample_surface(surface.vertices, surface.triangles, count, np.random.default_rng(seed))
     return barycentric_points(surface.vertices, surface.triangles, face, weight), face
 
 

@@ -44,11 +44,11 @@ def evaluate(
         seed: Seed of the random heads.
         force: Evaluate again although the folder holds the result of the same input.
     """
-    from coregister.evaluate.evaluation import Settings
+    from coregister.evaluate.evaluation import EvaluationSettings
     from registration.progress import shown
     from workflows.steps.evaluate import PAGE, evaluate_models, lines
 
-    settings = Settings(components=components, samples=samples, seed=seed)
+    settings = EvaluationSettings(components=components, samples=samples, seed=seed)
     with shown() as progress:
         manifest = evaluate_models(
             models, held_out=held_out, out=out, captures=captures, settings=settings, force=force, progress=progress

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from markupsafe import Markup
 
-from coregister.evaluate.evaluation import Curve, Evaluation, Row
+from coregister.evaluate.evaluation import Curve, MetricRow, ModelEvaluation
 from registration.model.gnm_npz import GNMData
 from registration.report.charts import Line, number_curves
 from registration.report.heat_map import scale_limit_mm
@@ -14,7 +14,7 @@ from registration.report.inputs import HeatMap
 from workflows.pages.base import heat_images, render
 
 
-def write_evaluate_page(evaluation: Evaluation, models: Mapping[str, GNMData], manifest: Mapping[str, Any]) -> str:
+def write_evaluate_page(evaluation: ModelEvaluation, models: Mapping[str, GNMData], manifest: Mapping[str, Any]) -> str:
     """Return the page: curves, gains, tables and maps of the distance."""
     limit_mm = max(scale_limit_mm(metrics.vertex_mm) for metrics in evaluation.models.values())
     return render(
@@ -32,14 +32,14 @@ def write_evaluate_page(evaluation: Evaluation, models: Mapping[str, GNMData], m
     )
 
 
-def _tiles(evaluation: Evaluation) -> list[tuple[str, str, str]]:
+def _tiles(evaluation: ModelEvaluation) -> list[tuple[str, str, str]]:
     components = evaluation.settings.components[-1]
     tiles = []
     for name, metrics in evaluation.models.items():
-        mean = float(metrics.identity.at(components).mean())
+        mean = float(metrics.identity.at_components(components).mean())
         tiles.append((f"{mean:.2f}", "mm", f"{name}: generalization, {components} components"))
         if metrics.specificity is not None:
-            random = float(metrics.specificity.at(components).mean())
+            random = float(metrics.specificity.at_components(components).mean())
             tiles.append((f"{random:.2f}", "mm", f"{name}: specificity, {components} components"))
     for gain in evaluation.gains:
         if gain.components == components:
@@ -47,7 +47,7 @@ def _tiles(evaluation: Evaluation) -> list[tuple[str, str, str]]:
     return tiles
 
 
-def _generalization(evaluation: Evaluation) -> dict[str, list[Line]]:
+def _generalization(evaluation: ModelEvaluation) -> dict[str, list[Line]]:
     panels: dict[str, list[Line]] = {"identity, mm": [], "identity, scan to surface, mm": []}
     for name, metrics in evaluation.models.items():
         panels["identity, mm"].append(_line(name, metrics.identity))
@@ -58,7 +58,7 @@ def _generalization(evaluation: Evaluation) -> dict[str, list[Line]]:
     return panels
 
 
-def _specificity(evaluation: Evaluation) -> dict[str, list[Line]]:
+def _specificity(evaluation: ModelEvaluation) -> dict[str, list[Line]]:
     panels: dict[str, list[Line]] = {"specificity, mm": []}
     for name, metrics in evaluation.models.items():
         if metrics.specificity is not None:
@@ -81,7 +81,7 @@ def _line(name: str, curve: Curve) -> Line:
 
 
 def _heat_maps(
-    evaluation: Evaluation, models: Mapping[str, GNMData], limit_mm: float
+    evaluation: ModelEvaluation, models: Mapping[str, GNMData], limit_mm: float
 ) -> dict[str, list[tuple[str, str]]]:
     maps = {}
     for name, metrics in evaluation.models.items():
@@ -95,9 +95,9 @@ def _heat_maps(
     return maps
 
 
-def _metrics(evaluation: Evaluation) -> dict[str, dict[str, dict[str, Row]]]:
+def _metrics(evaluation: ModelEvaluation) -> dict[str, dict[str, dict[str, MetricRow]]]:
     """Kind -> name -> model -> row."""
-    tables: dict[str, dict[str, dict[str, Row]]] = {}
+    tables: dict[str, dict[str, dict[str, MetricRow]]] = {}
     for model, metrics in evaluation.models.items():
         for row in metrics.rows:
             tables.setdefault(row.kind, {}).setdefault(row.name, {})[model] = row

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Int
 
-from coregister.evaluate.evaluation import NEUTRAL, HeldOut
+from coregister.evaluate.evaluation import NEUTRAL, HeldOutSubject
 from registration.capture.native import natural_key, read
 from registration.capture.scan import read_scan
 from registration.errors import InputError
@@ -31,7 +31,7 @@ _FIX = "see docs/formats.md, Held-out subjects"
 class HeldOutSet:
     """Subjects, the topology of their meshes, and digests of what they were read from."""
 
-    subjects: tuple[HeldOut, ...]
+    subjects: tuple[HeldOutSubject, ...]
     triangles: Int[np.ndarray, "F 3"]
     inputs: Mapping[str, str]
 
@@ -70,7 +70,7 @@ def read_held_out(source: Path, captures: Path | None = None) -> HeldOutSet:
     return HeldOutSet(subjects=tuple(subjects), triangles=topologies[0], inputs=inputs)
 
 
-def _arrays(subjects: tuple[HeldOut, ...] | list[HeldOut]) -> list[np.ndarray]:
+def _arrays(subjects: tuple[HeldOutSubject, ...] | list[HeldOutSubject]) -> list[np.ndarray]:
     texts = [
         np.array([s.subject, *s.categories, json.dumps(dict(s.tags), sort_keys=True, default=str)]) for s in subjects
     ]
@@ -105,7 +105,7 @@ def _of_file(file: Path) -> HeldOutSet:
     return HeldOutSet(subjects=found, triangles=triangles.astype(np.int64), inputs={})
 
 
-def _of_rows(subject: str, rows: Int[np.ndarray, "M"], arrays: Mapping[str, np.ndarray], file: Path) -> HeldOut:
+def _of_rows(subject: str, rows: Int[np.ndarray, "M"], arrays: Mapping[str, np.ndarray], file: Path) -> HeldOutSubject:
     labels = arrays["labels"].astype(str)
     neutral = [int(row) for row in rows if labels[row] == NEUTRAL]
     if len(neutral) != 1:
@@ -113,7 +113,7 @@ def _of_rows(subject: str, rows: Int[np.ndarray, "M"], arrays: Mapping[str, np.n
         raise _bad("A held-out subject has not one neutral", file, f'one mesh labelled "{NEUTRAL}" a subject', got)
     others = [int(row) for row in rows if row != neutral[0]]
     categories = arrays.get("categories", labels).astype(str)
-    return HeldOut(
+    return HeldOutSubject(
         subject=subject,
         neutral=arrays["vertices"][neutral[0]],
         expressions=arrays["vertices"][others],
@@ -122,7 +122,7 @@ def _of_rows(subject: str, rows: Int[np.ndarray, "M"], arrays: Mapping[str, np.n
     )
 
 
-def _of_folder(file: Path) -> tuple[HeldOut, Registration, str]:
+def _of_folder(file: Path) -> tuple[HeldOutSubject, Registration, str]:
     """A subject's neutral, its registration and the name of its folder."""
     try:
         manifest: dict[str, Any] = json.loads(file.read_text("utf-8"))
@@ -135,7 +135,7 @@ def _of_folder(file: Path) -> tuple[HeldOut, Registration, str]:
         raise _bad("A held-out subject has no neutral", file, f"a usable registration {neutral!r}", status)
     registration = load_registration(file.parent / neutral)
     vertices = registration.vertices
-    return HeldOut(subject=subject, neutral=vertices, expressions=vertices[None][:0]), registration, neutral
+    return HeldOutSubject(subject=subject, neutral=vertices, expressions=vertices[None][:0]), registration, neutral
 
 
 def _stabilized(folder: Path) -> dict[str, dict[str, Any]]:
@@ -149,7 +149,7 @@ def _stabilized(folder: Path) -> dict[str, dict[str, Any]]:
     }
 
 
-def _with_captures(one: HeldOut, folder: Path, registration: Registration, neutral: str) -> HeldOut:
+def _with_captures(one: HeldOutSubject, folder: Path, registration: Registration, neutral: str) -> HeldOutSubject:
     """Tags and scan of the neutral's capture, and the categories of expressions whose captures tell one."""
     capture = read(folder / neutral)
     told = {}

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from coregister.evaluate.evaluation import HeldOut
+from coregister.evaluate.evaluation import HeldOutSubject
 from coregister.next_model.training_data import NEUTRAL, TrainingMesh, TrainingSubject, transfer_to_unposed, unpose
 from registration.capture.scan import read_truth
 from registration.model.gnm import GNM
@@ -136,12 +136,12 @@ def registered_meshes(folder: Path, model: GNMData) -> SubjectMeshes | None:
 
 def held_out(
     name: str, meshes: SubjectMeshes, skin: SkullSkin, categories: Mapping[str, str], tags: Mapping[str, Any]
-) -> HeldOut:
+) -> HeldOutSubject:
     """One subject to measure models on: expressions lie in the neutral's world, the skull where the neutral has it."""
     vertices: Float[np.ndarray, "S V 3"] = meshes.vertices
     if meshes.names:
         vertices = stabilize_subject(meshes, skin).vertices
-    return HeldOut(
+    return HeldOutSubject(
         subject=name,
         neutral=meshes.neutral,
         expressions=vertices,
@@ -150,7 +150,7 @@ def held_out(
     )
 
 
-def write_held_out(people: Sequence[HeldOut], triangles: np.ndarray, file: Path) -> None:
+def write_held_out(people: Sequence[HeldOutSubject], triangles: np.ndarray, file: Path) -> None:
     """The NPZ file of `gnmreg model evaluate --held-out` (docs/formats.md), in one rename; tags that all have."""
     rows = [(one, NEUTRAL, NEUTRAL, one.neutral) for one in people]
     rows += [(o, c, c, v) for o in people for c, v in zip(o.categories, o.expressions, strict=True)]

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from coregister.evaluate.evaluation import Evaluation, Settings, check, evaluate
+from coregister.evaluate.evaluation import EvaluationSettings, ModelEvaluation, check, evaluate
 from coregister.evaluate.linear_fit import identity_part
 from registration.errors import InputError
 from registration.model import gnm_npz
@@ -31,7 +31,7 @@ def evaluate_models(
     held_out: Path,
     out: Path,
     captures: Path | None = None,
-    settings: Settings | None = None,
+    settings: EvaluationSettings | None = None,
     force: bool = False,
     progress: Progress | None = None,
 ) -> dict[str, Any]:
@@ -43,7 +43,7 @@ def evaluate_models(
     Raises:
         InputError: as `read_held_out`, `evaluation.check` and `check_out`, before anything is computed.
     """
-    settings = settings or Settings()
+    settings = settings or EvaluationSettings()
     check_out(out)
     named = model_paths if isinstance(model_paths, Mapping) else _named(model_paths)
     models = {name: gnm_npz.read(path) for name, path in named.items()}
@@ -60,7 +60,7 @@ def evaluate_models(
             "kind": KIND,
             "schema": SCHEMA,
             "input_hash": wanted,
-            "figures": evaluation.figures,
+            "figures": evaluation.metrics,
             "config": settings,
             "inputs": inputs,
             "versions": versions(),
@@ -88,7 +88,7 @@ def evaluate_round(
     have = min(len(identity_part(gnm_npz.read(Path(path))).basis) for path in models.values())
     counts = tuple(k for k in components if k <= have) or (have,)
     paths = {name: Path(path) for name, path in models.items()}
-    settings = Settings(components=counts, samples=samples, seed=seed)
+    settings = EvaluationSettings(components=counts, samples=samples, seed=seed)
     manifest = evaluate_models(paths, held_out=Path(people), out=Path(out), settings=settings, progress=progress)
     told: JsonRecord = {"out": out, "input_hash": manifest["input_hash"], "components": list(counts), "at": counts[-1]}
     for figure, curve in (("generalization_mm", "identity"), ("specificity_mm", "specificity")):
@@ -138,7 +138,7 @@ def _named(paths: Sequence[Path]) -> dict[str, Path]:
     return named
 
 
-def _write(manifest: Mapping[str, Any], evaluation: Evaluation, models: Mapping[str, GNMData], out: Path) -> None:
+def _write(manifest: Mapping[str, Any], evaluation: ModelEvaluation, models: Mapping[str, GNMData], out: Path) -> None:
     """The folder appears, or is replaced, in one rename."""
     with atomic_directory(out) as fresh:
         (fresh / MANIFEST).write_text(json.dumps(manifest, indent=1, allow_nan=False) + "\n", encoding="utf-8")

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from coregister.evaluate import evaluation as whole
-from coregister.evaluate.evaluation import HeldOut, Settings, evaluate
+from coregister.evaluate import evaluation
+from coregister.evaluate.evaluation import EvaluationSettings, HeldOutSubject, evaluate
 from coregister.first_model import population
 from coregister.synthetic import expressions
 from registration.errors import InputError
@@ -17,7 +17,7 @@ from registration.storage.hashing import to_jsonable
 from tests.conftest import SHARED, needs_shared
 from tests.coregister.spectrum import DEVIATIONS_MM, heads, spectrum_model, with_identity
 
-SETTINGS = Settings(components=(2, 4, 8), samples=5, draws=500)
+SETTINGS = EvaluationSettings(components=(2, 4, 8), samples=5, draws=500)
 AGES = (25, 31, 38, 64)
 
 
@@ -34,7 +34,7 @@ def people(model, count=4, seed=0):
         neutral = heads(model, rng.standard_normal((1, len(model.vertex_identity_basis))))[0]
         acts = np.tensordot(rng.standard_normal((2, 12)), model.expression_basis, 1)
         found.append(
-            HeldOut(
+            HeldOutSubject(
                 subject=f"subject_{number}",
                 neutral=neutral,
                 expressions=neutral + acts,
@@ -59,15 +59,17 @@ def found(model):
 def test_a_model_on_its_own_samples(model, found):
     own = found.models["own"]
     assert own.identity.components == (2, 4, 8, 12)
-    assert own.identity.at(12).max() < 1e-6
+    assert own.identity.at_components(12).max() < 1e-6
     means = [interval.mean for interval in own.identity.intervals]
     assert means == sorted(means, reverse=True)
-    assert own.expressions["lower_face"].at(12).max() < 1e-6
-    assert own.scans is not None and own.scans.at(12).max() < 1e-2
-    assert (own.scans.at(2) <= own.identity.at(2) + 1e-9).all()  # the surface is nearer than the vertex
+    assert own.expressions["lower_face"].at_components(12).max() < 1e-6
+    assert own.scans is not None and own.scans.at_components(12).max() < 1e-2
+    assert (
+        own.scans.at_components(2) <= own.identity.at_components(2) + 1e-9
+    ).all()  # the surface is nearer than the vertex
     assert own.unconverged == 0
     skin = regions.head_skin(model)
-    assert own.vertex_mm[skin].mean() == pytest.approx(own.identity.at(8).mean())
+    assert own.vertex_mm[skin].mean() == pytest.approx(own.identity.at_components(8).mean())
     assert np.isnan(own.vertex_mm[~skin]).all()
     share = np.cumsum(DEVIATIONS_MM**2) / (DEVIATIONS_MM**2).sum()
     np.testing.assert_allclose(own.compactness["identity"].share, share, rtol=1e-6)
@@ -101,11 +103,11 @@ def test_tables_count_subjects_and_split_them_by_what_they_share(model, found):
     own = found.models["own"]
     rows = {(row.kind, row.name): row for row in own.rows}
     assert {name for kind, name in rows if kind == "category"} == {"neutral", "jaw", "lips"}
-    assert {name for kind, name in rows if kind == "age"} == {"20 to 29", "30 to 39", "60 to 69"}
-    assert rows["age", "30 to 39"].subjects == 2 and rows["age", "20 to 29"].subjects == 1
-    assert rows["age", "20 to 29"].distance_mm.low is None
+    assert {name for kind, name in rows if kind == "age"} == {"20-29", "30-39", "60-69"}
+    assert rows["age", "30-39"].subjects == 2 and rows["age", "20-29"].subjects == 1
+    assert rows["age", "20-29"].distance_mm.low is None
     assert "note" not in {kind for kind, _ in rows}  # everybody has another one
-    neutrals = own.identity.at(8)
+    neutrals = own.identity.at_components(8)
     assert rows["gender", "female"].distance_mm.mean == pytest.approx(neutrals[::2].mean())
     assert rows["gender", "male"].distance_mm.mean == pytest.approx(neutrals[1::2].mean())
     assert rows["category", "jaw"].distance_mm.mean < 1e-6  # all components: the model's own samples
@@ -124,7 +126,7 @@ def test_gains_are_paired_and_of_the_same_number_of_components(model):
         (name, k) for name in ("own", "same") for k in (2, 4, 8)
     ]
     for gain in result.gains[:3]:
-        first, other = (result.models[name].identity.at(gain.components) for name in ("weak", "own"))
+        first, other = (result.models[name].identity.at_components(gain.components) for name in ("weak", "own"))
         assert gain.gain.mean == pytest.approx(1 - other.mean() / first.mean())
         assert gain.gain.low < gain.gain.mean < gain.gain.high
         assert gain.difference_mm.mean == pytest.approx(first.mean() - other.mean())
@@ -136,8 +138,8 @@ def test_gains_are_paired_and_of_the_same_number_of_components(model):
 
 def test_equal_seeds_make_equal_figures_that_fit_into_a_manifest(model, found):
     again = evaluate({"own": model}, people(model), model.triangles, SETTINGS)
-    text = json.dumps(to_jsonable(found.figures), allow_nan=False)
-    assert text == json.dumps(to_jsonable(again.figures), allow_nan=False)
+    text = json.dumps(to_jsonable(found.metrics), allow_nan=False)
+    assert text == json.dumps(to_jsonable(again.metrics), allow_nan=False)
     other = evaluate({"own": model}, people(model), model.triangles, replace(SETTINGS, seed=1))
     assert other.models["own"].specificity.values_mm.tolist() != found.models["own"].specificity.values_mm.tolist()
 
@@ -204,7 +206,7 @@ def test_what_cannot_be_evaluated_is_refused_before_any_work(model, name, monkey
     def never(*_, **__):
         raise AssertionError("work was begun")
 
-    monkeypatch.setattr(whole.general, "fit", never)
+    monkeypatch.setattr(evaluation.linear_fit, "fit_correspondence", never)
     make, what = BAD[name]
     with pytest.raises(InputError) as error:
         evaluate(*make(model, people(model), SETTINGS))
@@ -223,8 +225,8 @@ def test_a_model_of_the_official_size_on_its_own_samples():
         neutral = heads(data, rng.standard_normal((1, len(data.vertex_identity_basis))))[0]
         move = np.tensordot(rng.standard_normal(len(members)), data.expression_basis[members].astype(np.float64), 1)
         both = {"expressions": (neutral + move)[None], "categories": ("any",)}
-        subjects.append(HeldOut(subject=f"{number}", neutral=neutral, **both))
-    settings = Settings(components=(10, 20, 40), samples=0)
+        subjects.append(HeldOutSubject(subject=f"{number}", neutral=neutral, **both))
+    settings = EvaluationSettings(components=(10, 20, 40), samples=0)
     found = evaluate({"own": data}, subjects, data.triangles, settings).models["own"]
     means = [interval.mean for interval in found.identity.intervals]
     assert found.unconverged == 0 and means == sorted(means, reverse=True)
@@ -243,7 +245,7 @@ def test_people_beyond_the_first_models_span(anatomy, model, model_file):
         person = draw(source, rng)
         neutral, joints = anatomy.person(person, {name: source.target(name) for name in person.weights})
         moved = np.stack([expressions.perform(anatomy, act, neutral, joints) for act in acts])
-        return HeldOut(
+        return HeldOutSubject(
             subject=f"{draw.__name__}_{number}",
             neutral=neutral,
             expressions=moved,
@@ -251,7 +253,7 @@ def test_people_beyond_the_first_models_span(anatomy, model, model_file):
             tags=person.tags,
         )
 
-    settings = Settings(components=(10, 20, 40), samples=0)
+    settings = EvaluationSettings(components=(10, 20, 40), samples=0)
     means = {}
     for draw in (population.model_person, population.any_person):
         result = evaluate({"first": data}, [someone(k, draw) for k in range(8)], data.triangles, settings)

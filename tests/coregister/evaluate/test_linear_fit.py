@@ -7,7 +7,7 @@ import pytest
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
-from coregister.evaluate import linear_fit as general
+from coregister.evaluate import linear_fit
 from registration.model import gnm_npz, regions
 from tests.coregister.spectrum import DEVIATIONS_MM, TINY, heads, spectrum_model, with_identity
 
@@ -21,7 +21,7 @@ def model():
 
 @pytest.fixture(scope="module")
 def part(model):
-    return general.identity_part(model)
+    return linear_fit.identity_part(model)
 
 
 def samples(model, part, count, seed=1):
@@ -38,7 +38,7 @@ def test_a_models_own_samples_are_found_again_wherever_they_lie(model, part):
     coefficients, shapes = samples(model, part, 5)
     for wanted, shape in zip(coefficients, shapes, strict=True):
         for target in (shape, moved(shape)):
-            found = general.fit(part, target, RANKS)[-1]
+            found = linear_fit.fit_correspondence(part, target, RANKS)[-1]
             assert found.converged
             assert found.distance_mm.max() < 1e-6
             np.testing.assert_allclose(found.coefficients, wanted, atol=1e-6)
@@ -51,7 +51,7 @@ def test_with_fewer_components_the_tail_is_left(model, part):
     coefficients, shapes = samples(model, part, 200)
     rms = np.empty((len(shapes), len(RANKS)))
     for row, shape in enumerate(shapes):
-        found = general.fit(part, shape, RANKS)
+        found = linear_fit.fit_correspondence(part, shape, RANKS)
         rms[row] = [np.sqrt((one.distance_mm**2).mean()) for one in found]
     for column, count in enumerate(RANKS):
         own = np.sqrt((coefficients[:, count:] ** 2 * DEVIATIONS_MM[count:] ** 2).sum(1))  # of this very sample
@@ -61,20 +61,22 @@ def test_with_fewer_components_the_tail_is_left(model, part):
         assert (rms[:, column] ** 2).mean() == pytest.approx(expected, rel=0.15, abs=1e-9)  # of 200 samples
 
 
-@pytest.mark.parametrize("part_of", [general.identity_part, general.surface_part])
-def test_bases_that_are_not_orthogonal_and_rigid_motion_are_solved_to_the_least_squares_minimum(part_of):
-    part = part_of(gnm_npz.read(TINY))
-    assert (part.weights is None) == (part_of is general.identity_part)
+@pytest.mark.parametrize("weighted", [False, True])
+def test_bases_that_are_not_orthogonal_and_rigid_motion_are_solved_to_the_least_squares_minimum(weighted):
+    part = linear_fit.identity_part(gnm_npz.read(TINY))
+    if weighted:
+        weights = np.random.default_rng(2).uniform(0.2, 1.8, len(part.rows))
+        part = replace(part, weights=weights / weights.mean())
     off = part.gram / np.sqrt(np.outer(np.diag(part.gram), np.diag(part.gram)))
     assert np.abs(off - np.eye(len(off))).max() > 0.3  # else a transpose would do
     rng = np.random.default_rng(3)
     target = moved(part.shape(rng.normal(0, 1, len(part.basis))) + rng.normal(0, 2e-3, part.rest.shape))
-    found = general.fit(part, target, [4])[0]
+    found = linear_fit.fit_correspondence(part, target, [4])[0]
     pose = found.T_model_world
 
     def residual(unknown):
         placed = Rotation.from_rotvec(unknown[4:7]).apply(target @ pose[:3, :3].T + pose[:3, 3]) + unknown[7:]
-        return 1e3 * ((placed - part.shape(unknown[:4])) * part.root).ravel()
+        return 1e3 * ((placed - part.shape(unknown[:4])) * part.scale).ravel()
 
     reference = least_squares(residual, np.r_[np.zeros(4), rng.normal(0, 1e-2, 6)], xtol=1e-12, ftol=1e-12, gtol=1e-12)
     assert len(part.rows) * part.mean(found.distance_mm**2) == pytest.approx(2 * reference.cost, rel=1e-8)
@@ -84,9 +86,9 @@ def test_bases_that_are_not_orthogonal_and_rigid_motion_are_solved_to_the_least_
 def test_what_the_part_leaves_open_gets_the_least_coefficients(model):
     twice = np.concatenate([model.vertex_identity_basis, model.vertex_identity_basis[:1]])
     doubled = with_identity(model, twice)
-    part = general.identity_part(doubled)
+    part = linear_fit.identity_part(doubled)
     target = part.rest + part.basis[0]
-    found = general.fit(part, target, [len(part.basis)])[0]
+    found = linear_fit.fit_correspondence(part, target, [len(part.basis)])[0]
     assert found.converged and found.distance_mm.max() < 1e-6
     assert found.coefficients[[0, -1]] == pytest.approx([0.5, 0.5], abs=1e-6)
 
@@ -95,11 +97,11 @@ def test_components_of_eyes_are_no_components_of_the_head(model):
     eyes = np.zeros((2, *model.template_vertex_positions.shape))
     eyes[:, regions.group(model, "left_eye") > 0.5] = 1e-3
     with_eyes = with_identity(model, np.concatenate([eyes[:1], model.vertex_identity_basis, eyes[1:]]))
-    np.testing.assert_array_equal(general.identity_part(with_eyes).basis, general.identity_part(model).basis)
+    np.testing.assert_array_equal(linear_fit.identity_part(with_eyes).basis, linear_fit.identity_part(model).basis)
 
 
 def test_expressions_leave_the_tail_of_their_region_and_nothing_of_others(model):
-    part = general.expression_parts(model)["lower_face"]
+    part = linear_fit.expression_parts(model)["lower_face"]
     coefficients = np.random.default_rng(4).standard_normal((50, 12))
     inside = np.zeros(len(model.template_vertex_positions), bool)
     inside[part.part.rows] = True
@@ -115,7 +117,7 @@ def test_expressions_leave_the_tail_of_their_region_and_nothing_of_others(model)
 
 
 def test_a_soft_mask_asks_each_region_for_its_share(model):
-    found = general.expression_parts(model)["lower_face"]
+    found = linear_fit.expression_parts(model)["lower_face"]
     mask = np.linspace(0.1, 1.0, len(found.mask))
     basis = found.part.basis * mask[:, None]
     soft = replace(found, mask=mask, part=replace(found.part, basis=basis))
@@ -128,12 +130,12 @@ def test_a_soft_mask_asks_each_region_for_its_share(model):
 
 
 def test_variance_is_that_of_the_components(part):
-    np.testing.assert_allclose(general.variance_mm2(part), DEVIATIONS_MM**2, rtol=1e-9)
+    np.testing.assert_allclose(linear_fit.variance_mm2(part), DEVIATIONS_MM**2, rtol=1e-9)
 
 
 def test_the_right_eyes_basis_is_as_good_as_the_lefts_on_mirrored_displacements(model):
     data = gnm_npz.read(TINY)
-    parts = general.expression_parts(data)
+    parts = linear_fit.expression_parts(data)
     rng = np.random.default_rng(5)
     left = rng.normal(0, 1e-3, (4, *data.template_vertex_positions.shape))
     right = left[:, data.mirror_indices] * (-1, 1, 1)

@@ -5,8 +5,8 @@ import pytest
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
-from coregister.evaluate import linear_fit as general
-from coregister.evaluate.linear_fit import Fit, LinearPart
+from coregister.evaluate import linear_fit
+from coregister.evaluate.linear_fit import LinearFit, LinearPart
 from coregister.evaluate.scan_fit import fit_scan
 from registration.frames import transform_points
 from registration.geometry.closest_point import barycentric_points, closest_points
@@ -24,7 +24,7 @@ def grid(steps, size):
 
 
 def start(count=0, pose=None):
-    return Fit(
+    return LinearFit(
         coefficients=np.zeros(count),
         T_model_world=np.eye(4) if pose is None else pose,
         distance_mm=np.zeros(0),
@@ -89,14 +89,14 @@ def model():
 
 
 def test_a_scan_that_only_slides_along_a_head_of_the_model_is_at_no_distance(model):
-    part = general.identity_part(model)
+    part = linear_fit.identity_part(model)
     wanted = np.random.default_rng(2).standard_normal(len(part.basis))
     truth = heads(model, wanted[None])[0, part.rows]
     pose = shifted(0.3, -0.2, 1.0, (0.4, 1.9, -0.3))
     points = transform_points(pose, spread(part, truth, 3000, 3))
     # The registration it starts from lies on the surface, but its vertices have slid: correspondence is wrong.
     slid = transform_points(pose, truth + np.random.default_rng(4).normal(0, 1e-3, truth.shape))
-    begin = general.fit(part, slid, [12])
+    begin = linear_fit.fit_correspondence(part, slid, [12])
     found = fit_scan(part, points, begin)[0]
     assert begin[0].distance_mm.mean() > 0.3
     assert found.converged
@@ -105,11 +105,11 @@ def test_a_scan_that_only_slides_along_a_head_of_the_model_is_at_no_distance(mod
 
 
 def test_the_fit_ends_where_least_squares_over_the_same_distances_ends(model):
-    part = general.identity_part(model)
+    part = linear_fit.identity_part(model)
     rng = np.random.default_rng(5)
     truth = part.shape(rng.standard_normal(12)) + rng.normal(0, 4e-4, part.rest.shape)  # of no model
     points = spread(part, truth, 800, 6)
-    begin = general.fit(part, truth, [4])
+    begin = linear_fit.fit_correspondence(part, truth, [4])
     found = fit_scan(part, points, begin)[0]
     assert found.converged
 
@@ -128,9 +128,11 @@ def test_the_fit_ends_where_least_squares_over_the_same_distances_ends(model):
 
 
 def test_equal_seeds_make_equal_fits(model):
-    part = general.identity_part(model)
+    part = linear_fit.identity_part(model)
     points = spread(part, part.rest, 6000, 7)  # more than a fit takes: some are drawn
-    begin = general.fit(part, part.rest + 1e-3 * np.random.default_rng(8).standard_normal(part.rest.shape), [4])
+    begin = linear_fit.fit_correspondence(
+        part, part.rest + 1e-3 * np.random.default_rng(8).standard_normal(part.rest.shape), [4]
+    )
     one, two = (fit_scan(part, points, begin, seed=9)[0] for _ in range(2))
     np.testing.assert_array_equal(one.coefficients, two.coefficients)
     assert len(one.distance_mm) == 6000

@@ -5,7 +5,7 @@ import pytest
 import trimesh
 from scipy.spatial.transform import Rotation
 
-from coregister.evaluate import linear_fit as general
+from coregister.evaluate import linear_fit
 from coregister.evaluate.linear_fit import LinearPart
 from coregister.evaluate.specificity import specificity_mm
 from tests.coregister.spectrum import spectrum_model
@@ -15,7 +15,7 @@ SAMPLES, SEED = 12, 3
 
 @pytest.fixture(scope="module")
 def part():
-    return general.identity_part(spectrum_model())
+    return linear_fit.identity_part(spectrum_model())
 
 
 def drawn_heads(part, count):

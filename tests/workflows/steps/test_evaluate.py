@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import workflows.steps.evaluate
-from coregister.evaluate.evaluation import Settings
+from coregister.evaluate.evaluation import EvaluationSettings
 from registration.errors import InputError
 from registration.model import gnm_npz
 from registration.stabilize import stabilized_folder as stabilized
@@ -19,7 +19,7 @@ from workflows.cli.app import main
 from workflows.records.held_out import read_held_out
 from workflows.steps.evaluate import evaluate_models
 
-SETTINGS = Settings(components=(2, 4), samples=3, draws=200)
+SETTINGS = EvaluationSettings(components=(2, 4), samples=3, draws=200)
 NAMES = ("anna", "ben", "cleo")
 LABELS = ("neutral", "jaw_open", "smile")
 
@@ -136,7 +136,7 @@ def test_the_same_again_is_left_alone_and_another_seed_is_not(place, out, monkey
     told = json.loads((out / "manifest.json").read_text())
     again = evaluate_models(paths, held_out=place / "people.npz", out=out, settings=SETTINGS)
     assert again == told and not calls
-    other = Settings(components=(2, 4), samples=3, draws=200, seed=1)
+    other = EvaluationSettings(components=(2, 4), samples=3, draws=200, seed=1)
     changed = evaluate_models(paths, held_out=place / "people.npz", out=out, settings=other)
     assert len(calls) == 1 and changed["input_hash"] != told["input_hash"]
     back = evaluate_models(paths, held_out=place / "people.npz", out=out, settings=SETTINGS)
