@@ -1,4 +1,4 @@
-"""How a capture's label classes meet the model's."""
+"""The correspondence between the label classes of a capture and those of the model."""
 
 from dataclasses import dataclass
 
@@ -14,17 +14,21 @@ SKIN = CLASSES[0]
 
 @dataclass(frozen=True, kw_only=True)
 class ClassMap:
-    """K shared classes; what the capture does not tell apart is skin, what the model does not know is excluded."""
+    """K shared classes. What the capture does not distinguish is skin; what is unknown to the model is excluded."""
 
     names: tuple[str, ...]
     from_capture: Float[np.ndarray, "C K"]
     from_model: Float[np.ndarray, "M K"]
     excluded: Float[np.ndarray, "C"]  # 1 for hair, clothes and other classes without a counterpart
-    neck: Float[np.ndarray, "C"]  # 1 for the neck, which is skin, but whose silhouette is not the model's
+    neck: Float[np.ndarray, "C"]  # 1 for the neck: skin, but its silhouette is not compared
 
 
 def class_map(capture_classes: tuple[str, ...]) -> ClassMap:
-    """The classes that a capture and every model share."""
+    """Return the classes that a capture shares with every model.
+
+    Args:
+        capture_classes: names of the label indices; may be empty.
+    """
     names = tuple(name for name in CLASSES if name == SKIN or name in capture_classes)
     shared = {name: name for name in names} | {NECK: SKIN}
 

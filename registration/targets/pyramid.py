@@ -1,4 +1,4 @@
-"""From a capture to what the losses compare with: windows around the head, at several resolutions.
+"""From a capture to the targets of the losses: image crops around the head, at several resolutions.
 
 Each view is decoded once, at the finest resolution a recipe asks for; coarser levels are block means of that one.
 """
@@ -16,14 +16,14 @@ from registration.capture.pixels import read_labels, read_mask, read_view, undis
 from registration.targets.classes import BACKGROUND, ClassMap
 from registration.types import Camera, Capture, Pixels, Targets, View, ViewPixels
 
-_MARGIN = 0.08  # of the head's height: how far around the head pixels are kept and silhouettes pull
-_NECK = 0.3  # of the head's height: how much of what is below the head is kept
-_PURE = 0.99  # coverage from which a pixel counts as wholly inside the subject
-_LEAST_NORMAL = 0.85  # mean length of a block's normals below which they disagree too much
+_MARGIN = 0.08  # times the head's height: distance around the head of the pixels and silhouettes that are compared
+_NECK = 0.3  # times the head's height: part below the head that a crop contains
+_MIN_COVERAGE = 0.99  # of a pixel inside the subject
+_MIN_NORMAL_LENGTH = 0.85  # of the mean of a block's unit normals; below it they differ too much
 
 
 @dataclass(frozen=True, kw_only=True)
-class _Window:
+class _ViewCrop:
     """The pixels around the head of one view; channels can be averaged in blocks."""
 
     name: str
@@ -32,7 +32,7 @@ class _Window:
     normals: Float[np.ndarray, "H W 3"]  # world frame; 0 where none
     mask: Float[np.ndarray, "H W"]
     classes: Float[np.ndarray, "H W K"]
-    neck: Float[np.ndarray, "H W"]
+    neck: Float[np.ndarray, "H W"]  # coverage, as the next
     excluded: Float[np.ndarray, "H W"]
     valid: Float[np.ndarray, "H W"]
     landmarks: Mapping[str, Float[np.ndarray, "L 3"]]
@@ -50,34 +50,35 @@ def build_pyramid(
     levels: int,
     progress: Callable[[int], None] = lambda done: None,
 ) -> tuple[Targets, ...]:
-    """Targets from fine to coarse; each level halves the one before.
+    """Return the targets of all views from fine to coarse; each level has half the resolution of the one before.
 
     Args:
         capture: its views are decoded one at a time.
-        mapping: the classes to keep.
-        finest_head_px: resolution at level 0: views are reduced by the whole factor that brings the subject's height
-            closest to this from above; never enlarged.
+        mapping: the classes to compare.
+        finest_head_px: resolution at level 0. Views are downsampled by the integer factor that brings the subject's
+            height closest to this from above, never enlarged.
         levels: how many.
+        progress: called with the number of views that are decoded.
 
     Raises:
         InputError: an image cannot be decoded.
     """
     downsample = max(1, int(_subject_height(capture) / finest_head_px))
-    windows = []
+    crops = []
     for done, view in enumerate(capture.views):
         progress(done)
-        windows.append(_window(view, capture, mapping, min(downsample, view.camera.width_px, view.camera.height_px)))
+        crops.append(_view_crop(view, capture, mapping, min(downsample, view.camera.width_px, view.camera.height_px)))
     block = 2 ** (levels - 1)
     height, width = (
-        -(-max(w.mask.shape[axis] for w in windows) // block) * block for axis in (0, 1)
+        -(-max(crop.mask.shape[axis] for crop in crops) // block) * block for axis in (0, 1)
     )  # rounded up to whole blocks of the coarsest level
-    windows = [_padded(w, height, width) for w in windows]
-    out = []
+    crops = [_padded(crop, height, width) for crop in crops]
+    pyramid = []
     for level in range(levels):
         if level:
-            windows = [_halved(w) for w in windows]
-        out.append(_targets(windows, mapping))
-    return tuple(out)
+            crops = [_halved(crop) for crop in crops]
+        pyramid.append(_targets(crops, mapping))
+    return tuple(pyramid)
 
 
 def _subject_height(capture: Capture) -> float:
@@ -87,21 +88,21 @@ def _subject_height(capture: Capture) -> float:
         rows = np.arange(view.camera.height_px)
         if view.segmentation is not None:
             labels = read_labels(view.segmentation, view.camera, capture.classes)
-            # The head alone: shoulders would make a close-up of one view as small as a bust of another.
-            away = [i for i, name in enumerate(capture.classes) if name in (BACKGROUND, "neck_other")]
-            rows = np.flatnonzero(~np.isin(labels, away).all(1))
+            # The head alone: with shoulders the heads of close-ups and of busts would have different resolutions.
+            other = [i for i, name in enumerate(capture.classes) if name in (BACKGROUND, "neck_other")]
+            rows = np.flatnonzero(~np.isin(labels, other).all(1))
         elif view.mask is not None:
             rows = np.flatnonzero((read_mask(view.mask, view.camera) > 127).any(1))
         heights.append(int(np.ptp(rows)) + 1 if len(rows) else view.camera.height_px)
     return float(np.median(heights))
 
 
-def _window(view: View, capture: Capture, mapping: ClassMap, downsample: int) -> _Window:
+def _view_crop(view: View, capture: Capture, mapping: ClassMap, downsample: int) -> _ViewCrop:
     pixels = read_view(view, capture, downsample=downsample)
     shape = pixels.rgb.shape[:2]
-    none = np.zeros(shape, np.float32)
+    zeros = np.zeros(shape, np.float32)
     classes = np.zeros((*shape, len(mapping.names)), np.float32)
-    neck = excluded = none
+    neck = excluded = zeros
     if pixels.label_shares is not None:
         classes = pixels.label_shares @ mapping.from_capture
         neck, excluded = pixels.label_shares @ mapping.neck, pixels.label_shares @ mapping.excluded
@@ -114,12 +115,12 @@ def _window(view: View, capture: Capture, mapping: ClassMap, downsample: int) ->
         points = undistort_landmarks(view, scheme).copy()
         points[:, :2] /= downsample
         landmarks[scheme] = points
-    whole = _Window(
+    full = _ViewCrop(
         name=view.name,
         camera=pixels.camera,
         rgb=pixels.rgb.astype(np.float32),
         normals=normals,
-        mask=none + 1 if mask is None else mask,
+        mask=zeros + 1 if mask is None else mask,
         classes=classes,
         neck=neck,
         excluded=excluded,
@@ -130,7 +131,7 @@ def _window(view: View, capture: Capture, mapping: ClassMap, downsample: int) ->
         has_normals=pixels.normals is not None,
         head_px=float(shape[0]),
     )
-    return _cut_to_head(whole)
+    return _crop_to_head(full)
 
 
 def _coverage(pixels: ViewPixels, capture: Capture) -> Float[np.ndarray, "H W"] | None:
@@ -141,100 +142,102 @@ def _coverage(pixels: ViewPixels, capture: Capture) -> Float[np.ndarray, "H W"] 
     return None
 
 
-def _cut_to_head(whole: _Window) -> _Window:
-    head, _ = _head_and_other(whole)
-    if not whole.has_mask or not head.any():
-        return whole
+def _crop_to_head(full: _ViewCrop) -> _ViewCrop:
+    head, _ = _head_and_other(full)
+    if not full.has_mask or not head.any():
+        return full
     rows, columns = np.flatnonzero(head.any(1)), np.flatnonzero(head.any(0))
     head_px = float(np.ptp(rows) + 1)
     margin = int(np.ceil(_MARGIN * head_px)) + 8
     top, left = max(0, rows[0] - margin), max(0, columns[0] - margin)
     bottom, right = rows[-1] + 1 + margin, columns[-1] + 1 + margin
     bottom += int(_NECK * head_px)
-    cut = _each(whole, lambda value: value[top:bottom, left:right])
-    height, width = cut["mask"].shape
-    landmarks = {scheme: points - [left, top, 0] for scheme, points in whole.landmarks.items()}
-    camera = whole.camera.cropped(int(left), int(top), width, height)
-    return replace(whole, camera=camera, landmarks=landmarks, head_px=head_px, **cut)
+    channels = _each(full, lambda value: value[top:bottom, left:right])
+    height, width = channels["mask"].shape
+    landmarks = {scheme: points - [left, top, 0] for scheme, points in full.landmarks.items()}
+    camera = full.camera.cropped(int(left), int(top), width, height)
+    return replace(full, camera=camera, landmarks=landmarks, head_px=head_px, **channels)
 
 
-def _each(window: _Window, change: Callable[[np.ndarray], np.ndarray]) -> dict[str, Any]:
-    """Every channel of a window, changed alike."""
-    return {name: change(value) for name, value in vars(window).items() if isinstance(value, np.ndarray)}
+def _each(crop: _ViewCrop, change: Callable[[np.ndarray], np.ndarray]) -> dict[str, Any]:
+    """Apply a function to every channel of a crop."""
+    return {name: change(value) for name, value in vars(crop).items() if isinstance(value, np.ndarray)}
 
 
-def _padded(window: _Window, height: int, width: int) -> _Window:
-    """The window grown at its right and bottom by pixels that no term compares."""
-    rows, columns = height - window.mask.shape[0], width - window.mask.shape[1]
+def _padded(crop: _ViewCrop, height: int, width: int) -> _ViewCrop:
+    """Extend a crop at its right and bottom by pixels that no loss compares."""
+    rows, columns = height - crop.mask.shape[0], width - crop.mask.shape[1]
 
     def pad(value: np.ndarray) -> np.ndarray:
         return np.pad(value, [(0, rows), (0, columns)] + [(0, 0)] * (value.ndim - 2))
 
-    grown = _each(window, pad)
-    return replace(window, camera=window.camera.cropped(0, 0, width, height), **grown)
+    channels = _each(crop, pad)
+    return replace(crop, camera=crop.camera.cropped(0, 0, width, height), **channels)
 
 
-def _halved(window: _Window) -> _Window:
+def _halved(crop: _ViewCrop) -> _ViewCrop:
+    """A crop at half the resolution: means over blocks of 2 x 2 pixels."""
+
     def mean(value: np.ndarray) -> np.ndarray:
         h, w = value.shape[0] // 2, value.shape[1] // 2
         return value.reshape(h, 2, w, 2, *value.shape[2:]).mean((1, 3))
 
-    means = _each(window, mean)
+    means = _each(crop, mean)
     height, width = means["mask"].shape
     return replace(
-        window,
-        camera=window.camera.scaled(width, height),
-        landmarks={scheme: points * [0.5, 0.5, 1] for scheme, points in window.landmarks.items()},
-        head_px=window.head_px / 2,
+        crop,
+        camera=crop.camera.scaled(width, height),
+        landmarks={scheme: points * [0.5, 0.5, 1] for scheme, points in crop.landmarks.items()},
+        head_px=crop.head_px / 2,
         **means,
     )
 
 
-def _targets(windows: list[_Window], mapping: ClassMap) -> Targets:
-    weighed = [_weigh(w) for w in windows]
-    taking_part = np.stack([np.any([w[name] > 0 for name in w if name.endswith("weight")], axis=0) for w in weighed])
-    pixels = Pixels.of([w.camera for w in windows], torch.as_tensor(taking_part))
-    place = tuple(axis.numpy() for axis in (pixels.view, pixels.y, pixels.x))
+def _targets(crops: list[_ViewCrop], mapping: ClassMap) -> Targets:
+    weighted = [_apply_weights(crop) for crop in crops]
+    compared = np.stack([np.any([w[name] > 0 for name in w if name.endswith("weight")], axis=0) for w in weighted])
+    pixels = Pixels.of([crop.camera for crop in crops], torch.as_tensor(compared))
+    indices = tuple(axis.numpy() for axis in (pixels.view, pixels.y, pixels.x))
 
     def listed(values: list[np.ndarray]) -> torch.Tensor:
-        return torch.as_tensor(np.stack([value.astype(np.float16) for value in values])[place])
+        return torch.as_tensor(np.stack([value.astype(np.float16) for value in values])[indices])
 
-    schemes = sorted({scheme for w in windows for scheme in w.landmarks})
+    schemes = sorted({scheme for crop in crops for scheme in crop.landmarks})
     return Targets(
-        names=tuple(w.name for w in windows),
+        names=tuple(crop.name for crop in crops),
         class_names=mapping.names,
         pixels=pixels,
-        rgb=listed([w.rgb for w in windows]),
-        mask=listed([w.mask for w in windows]),
-        classes=listed([w.classes for w in windows]),
-        landmarks={scheme: _stack_landmarks(windows, scheme) for scheme in schemes},
-        px_per_head=float(np.median([w.head_px for w in windows])),
-        **{name: listed([w[name] for w in weighed]) for name in weighed[0]},
+        rgb=listed([crop.rgb for crop in crops]),
+        mask=listed([crop.mask for crop in crops]),
+        classes=listed([crop.classes for crop in crops]),
+        landmarks={scheme: _stack_landmarks(crops, scheme) for scheme in schemes},
+        px_per_head=float(np.median([crop.head_px for crop in crops])),
+        **{name: listed([w[name] for w in weighted]) for name in weighted[0]},
     )
 
 
-def _stack_landmarks(windows: list[_Window], scheme: str) -> torch.Tensor:
+def _stack_landmarks(crops: list[_ViewCrop], scheme: str) -> torch.Tensor:
     """(N, L, 3) in float32; a view without the scheme has confidence 0."""
-    count = max(len(w.landmarks[scheme]) for w in windows if scheme in w.landmarks)
+    count = max(len(crop.landmarks[scheme]) for crop in crops if scheme in crop.landmarks)
     absent = np.zeros((count, 3))
-    return torch.as_tensor(np.stack([w.landmarks.get(scheme, absent) for w in windows]).astype(np.float32))
+    return torch.as_tensor(np.stack([crop.landmarks.get(scheme, absent) for crop in crops]).astype(np.float32))
 
 
-def _weigh(window: _Window) -> dict[str, np.ndarray]:
-    """Unit normals, and where each term compares."""
-    known = window.valid * (window.excluded < 0.01)
-    inside = (window.mask > _PURE) * known
-    length = np.linalg.norm(window.normals, axis=-1)
-    sound = inside * (length > _LEAST_NORMAL)
-    normals = window.normals / np.maximum(length, 1e-6)[..., None] * sound[..., None]
-    facing = np.clip(-(_directions(window.camera) * normals).sum(-1), 0, 1)
+def _apply_weights(crop: _ViewCrop) -> dict[str, np.ndarray]:
+    """Unit normals, and the weight of each pixel in each loss."""
+    valid = crop.valid * (crop.excluded < 0.01)
+    inside = (crop.mask > _MIN_COVERAGE) * valid
+    length = np.linalg.norm(crop.normals, axis=-1)
+    has_normal = inside * (length > _MIN_NORMAL_LENGTH)
+    normals = crop.normals / np.maximum(length, 1e-6)[..., None] * has_normal[..., None]
+    facing = np.clip(-(_directions(crop.camera) * normals).sum(-1), 0, 1)
     core = cv2.erode(inside.astype(np.uint8), np.ones((3, 3), np.uint8)).astype(np.float32)
     return {
         "normals": normals,
         "normal_weight": facing,
-        "rgb_weight": core * (facing if window.has_normals else 1.0),
-        "mask_weight": _silhouette_weight(window) * known if window.has_mask else 0 * known,
-        "class_weight": inside * (window.classes.sum(-1) > 0.5),
+        "rgb_weight": core * (facing if crop.has_normals else 1.0),
+        "mask_weight": _silhouette_weight(crop) * valid if crop.has_mask else 0 * valid,
+        "class_weight": inside * (crop.classes.sum(-1) > 0.5),
     }
 
 
@@ -245,13 +248,13 @@ def _directions(camera: Camera) -> Float[np.ndarray, "H W 3"]:
     return rays / np.linalg.norm(rays, axis=-1, keepdims=True)
 
 
-def _silhouette_weight(window: _Window) -> Float[np.ndarray, "H W"]:
-    """1 where the silhouette is the head's: on the head, and on the background that is nearest to it, not far away.
+def _silhouette_weight(crop: _ViewCrop) -> Float[np.ndarray, "H W"]:
+    """1 on the head, and on the background close to it that is closer to the head than to neck, hair or clothes.
 
-    A model ends elsewhere on the chest than a scan, and hair is not in it.
+    The model ends elsewhere on the chest than the subject, and has no hair.
     """
-    subject = window.mask > 0.5
-    head, other = _head_and_other(window)
+    subject = crop.mask > 0.5
+    head, other = _head_and_other(crop)
 
     def distance_to(region: np.ndarray) -> np.ndarray:
         return (
@@ -261,15 +264,15 @@ def _silhouette_weight(window: _Window) -> Float[np.ndarray, "H W"]:
         )
 
     to_head = distance_to(head)
-    near = to_head < np.where(subject, np.inf, _MARGIN * window.head_px + 2)
+    near = to_head < np.where(subject, np.inf, _MARGIN * crop.head_px + 2)
     return (near & (to_head < distance_to(other))).astype(np.float32)
 
 
-def _head_and_other(window: _Window) -> tuple[Bool[np.ndarray, "H W"], Bool[np.ndarray, "H W"]]:
-    """The subject's head, and its neck, hair and clothes; of neither are pixels that the mask has and no label."""
-    subject = window.mask > 0.5
-    other = subject & (window.neck + window.excluded > 0.5)
+def _head_and_other(crop: _ViewCrop) -> tuple[Bool[np.ndarray, "H W"], Bool[np.ndarray, "H W"]]:
+    """The subject's head, and its neck, hair and clothes; pixels in the mask without a label are neither."""
+    subject = crop.mask > 0.5
+    other = subject & (crop.neck + crop.excluded > 0.5)
     head = subject & ~other
-    if window.has_classes:
-        head &= window.classes.sum(-1) + window.excluded > 0.5
+    if crop.has_classes:
+        head &= crop.classes.sum(-1) + crop.excluded > 0.5
     return head, other

@@ -1,4 +1,4 @@
-"""What a registration says of itself."""
+"""Status and reason of a registration."""
 
 import pytest
 import torch
