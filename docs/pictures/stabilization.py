@@ -22,8 +22,8 @@ from registration.stabilize.components import Head, regional_components
 from registration.stabilize.stabilized_folder import StoredComponents
 from tests.workflows.web.test_review import CHROMIUM, FLAGS
 from workflows.steps.stabilize import along
-from workflows.web.review import Page
-from workflows.web.review_state import Review
+from workflows.web.review import ReviewPage
+from workflows.web.review_state import ReviewState
 
 PICTURE = Path(__file__).parents[1] / "stabilization.jpg"
 SIZE = {"width": 1500, "height": 960}
@@ -55,7 +55,7 @@ def stored(head: Head) -> StoredComponents:
 def main() -> None:
     head = Head.of(gnm_npz.read(build.bootstrap()))
     with tempfile.TemporaryDirectory() as folder, sync_playwright() as playwright:
-        page = Page(Review(stored(head), head, Path(folder) / "log.jsonl", "picture"), port=0)
+        page = ReviewPage(ReviewState(stored(head), head, Path(folder) / "log.jsonl", "picture"), port=0)
         browser = playwright.chromium.launch(executable_path=CHROMIUM or shutil.which("chromium"), args=list(FLAGS))
         tab = browser.new_page(viewport=SIZE)
         tab.goto(f"http://127.0.0.1:{page.port}")

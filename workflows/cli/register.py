@@ -18,7 +18,7 @@ def register(
     out: Folder,
     neutral: OptionalRegistration = None,
     force: bool = False,
-    options: RegisterOptions = _DEFAULTS,
+    fit: RegisterOptions = _DEFAULTS,
 ) -> int:
     """Fit the head model to one capture and write the registered mesh.
 
@@ -28,13 +28,13 @@ def register(
         out: The registration folder to write; one that gnmreg wrote before is replaced.
         neutral: Start from this registration of the same subject's neutral and keep its identity.
         force: Register again although the folder holds the result of the same input.
-        options: How the capture is registered.
+        fit: How the capture is registered.
     """
     from registration.progress import shown
     from registration.register import register
 
     with shown() as progress:
-        result = register(capture, model, out, options, neutral=neutral, force=force, progress=progress)
+        result = register(capture, model, out, fit, neutral=neutral, force=force, progress=progress)
     print(f"{result.status}: {result.reason}\n{out}")
     return 1 if result.status == "failed" else 0
 
@@ -48,7 +48,7 @@ def subject(
         str | None, arg(metavar="NAME", help_behavior_hint='(default: the one labelled "neutral")')
     ] = None,
     force: bool = False,
-    options: RegisterOptions = _DEFAULTS,
+    fit: RegisterOptions = _DEFAULTS,
 ) -> int:
     """Register all captures of a subject: the neutral, then the expressions.
 
@@ -60,13 +60,13 @@ def subject(
         out: The folder to write: a registration for each capture, subject.json and index.html.
         neutral: The neutral's sub-folder.
         force: Register again although the folder holds the results of the same input.
-        options: How the captures are registered.
+        fit: How the captures are registered.
     """
     from registration.progress import shown
     from workflows.steps.subject import register_subject
 
     with shown() as progress:
-        result = register_subject(subject, model, out, options, neutral=neutral, force=force, progress=progress)
+        result = register_subject(subject, model, out, fit, neutral=neutral, force=force, progress=progress)
     for row in result.rows:
         print(f"{row.name}: {row.status}: {row.reason}")
     print(out / "index.html")

@@ -1,6 +1,6 @@
-"""`gnmreg debug --view`: a fit in three dimensions, stage after stage, with the capture's scan and cameras.
+"""`gnmreg debug --view`: a fit in 3D, stage after stage, with the capture's scan and cameras.
 
-The page reads what `registration.report.stage_snapshots.write_stage` leaves, and shows a stage as soon as it is there.
+The page reads the files of `registration.report.stage_snapshots.write_stage` and shows a stage once it is written.
 """
 
 import threading
@@ -24,24 +24,30 @@ from registration.report.heat_map import scale_limit_mm
 from registration.report.pictures import scale_colours
 from registration.types import Camera, Capture
 from workflows.web import panels
-from workflows.web.glb import still_head
-from workflows.web.server import Served
+from workflows.web.glb import static_glb
+from workflows.web.server import PageServer
 
-TO_SCAN, MOVED, PLAIN = "distance to the scan", "moved in this stage", "nothing"
+TO_SCAN, MOTION, PLAIN = "distance to the scan", "motion in this stage", "nothing"
 _SKIN, _SCAN = (206, 176, 158), (96, 110, 128)
-_POINTS = 60_000  # of the scan, shown at most
-_THUMBNAIL_PX = 200  # height of the images in the cameras' frusta, at most
+_MAX_POINTS = 60_000  # of the scan, displayed
+_MAX_THUMBNAIL_PX = 200  # height of the images in the cameras' frusta
 _POLL_S = 0.5
 
 
-class FitPage(Served):
-    """The page of one fit; everyone who opens it sees the same."""
+class FitPage(PageServer):
+    """The page of one fit; all browsers share one state."""
 
     def __init__(self, stages: Path, capture: Capture, outside: Bool[np.ndarray, "V"], port: int = 0):
-        """Serves at once. `stages` need not be there yet; `outside`: vertices that a scan can show.
+        """Start the server.
+
+        Args:
+            stages: folder of the snapshots; it need not exist yet.
+            capture: the capture that is registered.
+            outside: vertices that a scan can contain.
+            port: port on the loopback interface; 0: any free one.
 
         Raises:
-            InputError: the scan cannot be read, or the port cannot be had.
+            InputError: the scan cannot be read, or the port is in use.
         """
         self._folder, self._capture, self._outside = Path(stages), capture, outside
         self._scan = None if capture.scan is None else read_scan(capture.scan)
@@ -52,21 +58,22 @@ class FitPage(Served):
         threading.Thread(target=self._live, daemon=True).start()
 
     def close(self) -> None:
+        """Stop the server and the thread that reads snapshots."""
         self._closed.set()
         super().close()
 
     @property
     def stages(self) -> list[str]:
-        """What there is to choose."""
+        """Names of the stages read so far."""
         return list(self._meshes)
 
     def _build(self) -> None:
-        """Scene and controls before the first stage."""
+        """Create the scene and the controls."""
         gui, scene, capture = self._server.gui, self._server.scene, self._capture
         gui.add_markdown(f"### {capture.subject}, {capture.expression}\n{len(capture.views)} views")
         # viser's setters have types of their own that type checkers take for read-only properties.
         self._stage: Any = gui.add_dropdown("Stage", ("waiting",))
-        self._colours: Any = gui.add_dropdown("Colours show", (*([TO_SCAN] if self._scan else []), MOVED, PLAIN))
+        self._colours: Any = gui.add_dropdown("Colours show", (*([TO_SCAN] if self._scan else []), MOTION, PLAIN))
         self._bar = gui.add_html("")
         scan: Any = gui.add_checkbox("Scan", False, disabled=self._scan is None)
         cameras: Any = gui.add_checkbox("Cameras", False)
@@ -74,7 +81,7 @@ class FitPage(Served):
         self._sheet: Any = gui.add_image(np.full((2, 4, 3), 255, np.uint8))
         self._points: Any = None
         if self._scan is not None:
-            step = -(-len(self._scan.vertices) // _POINTS)
+            step = -(-len(self._scan.vertices) // _MAX_POINTS)
             points = self._scan.vertices[::step].astype(np.float32)
             self._points = scene.add_point_cloud("/scan", points, _SCAN, point_size=5e-4, precision="float32")
             self._points.visible = False
@@ -85,16 +92,16 @@ class FitPage(Served):
         cameras.on_update(lambda _: setattr(self._frusta, "visible", cameras.value))
 
     def _live(self) -> None:
-        """Stages as they come, and the cameras, whose images take seconds."""
+        """Read new stages, and the cameras' images, which take seconds."""
         for view in self._capture.views:
             self.refresh()
             camera = view.camera
             bare = replace(view, mask=None, normals=None, segmentation=None)
-            pixels = read_view(bare, self._capture, downsample=-(-camera.height_px // _THUMBNAIL_PX))
+            pixels = read_view(bare, self._capture, downsample=-(-camera.height_px // _MAX_THUMBNAIL_PX))
             image = (np.clip(linear_to_srgb(pixels.rgb), 0, 1) * 255).astype(np.uint8)
             if self._closed.is_set():
                 return
-            turn = Rotation.from_matrix(camera.T_cam_world[:3, :3].T).as_quat(scalar_first=True)
+            rotation = Rotation.from_matrix(camera.T_cam_world[:3, :3].T).as_quat(scalar_first=True)
             self._server.scene.add_camera_frustum(
                 f"/cameras/{view.name}",
                 fov=2 * float(np.arctan(camera.height_px / 2 / camera.intrinsics[1, 1])),
@@ -102,42 +109,42 @@ class FitPage(Served):
                 scale=0.05,
                 thickness=1e-3,
                 image=image,
-                wxyz=turn,
+                wxyz=rotation,
                 position=camera.centre,
             )
         while not self._closed.wait(_POLL_S):
             self.refresh()
 
     def refresh(self) -> None:
-        """Take up stages that were written since; whoever looks at the last one goes along."""
+        """Read new stages; select the last one if the previously last one was selected."""
         with self._lock:
-            fresh = [file for file in sorted(self._folder.glob("[0-9]*.ply")) if file.stem not in self._meshes]
-            if not fresh:
+            new = [file for file in sorted(self._folder.glob("[0-9]*.ply")) if file.stem not in self._meshes]
+            if not new:
                 return
             follows = not self._meshes or self._stage.value == self.stages[-1]
             if not self._meshes:
-                self._look_at(read_scan(fresh[0]).vertices)
-            self._meshes |= {file.stem: read_scan(file) for file in fresh}
-            self._stage.options = tuple(self.stages)  # what was chosen stays; the first ones replace "waiting"
+                self._look_at(read_scan(new[0]).vertices)
+            self._meshes |= {file.stem: read_scan(file) for file in new}
+            self._stage.options = tuple(self.stages)  # the selection is kept; the first stages replace "waiting"
             if follows:
                 self._stage.value = self.stages[-1]
 
     def _look_at(self, head: Float[np.ndarray, "V 3"]) -> None:
-        """From where the cameras are, on average, with their up as up."""
+        """Place the viewer at the mean direction of the cameras, with their mean up direction."""
         cameras = [view.camera for view in self._capture.views]
-        up, middle = -np.mean([c.T_cam_world[1, :3] for c in cameras], axis=0), head.mean(0)
-        front = np.mean([_towards(camera, middle) for camera in cameras], axis=0)
+        up, center = -np.mean([c.T_cam_world[1, :3] for c in cameras], axis=0), head.mean(0)
+        front = np.mean([_direction(camera, center) for camera in cameras], axis=0)
         front /= max(np.linalg.norm(front), 1e-9)
         self._server.scene.set_up_direction(up / np.linalg.norm(up))
         self._server.scene.add_light_directional("/key", intensity=1.6, position=front + up)
         camera = self._server.initial_camera
-        camera.position, camera.look_at, camera.fov = middle + 0.8 * front, middle, float(np.radians(38))
+        camera.position, camera.look_at, camera.fov = center + 0.8 * front, center, float(np.radians(38))
         for client in self._server.get_clients().values():
             client.camera.up_direction = up
-            client.camera.position, client.camera.look_at = middle + 0.8 * front, middle
+            client.camera.position, client.camera.look_at = center + 0.8 * front, center
 
     def _show(self) -> None:
-        """The chosen stage in the chosen colours."""
+        """Show the selected stage in the selected colours."""
         with self._lock:
             name = self._stage.value
             if name not in self._meshes:
@@ -150,15 +157,15 @@ class FitPage(Served):
                 limit = scale_limit_mm(distance[self._outside])
                 self._bar.content = panels.colour_bar(limit, self._colours.value)
                 colours = scale_colours(distance / limit)
-            self._server.scene.add_glb("/head", still_head(mesh.vertices, mesh.triangles, colours))
+            self._server.scene.add_glb("/head", static_glb(mesh.vertices, mesh.triangles, colours))
             sheet = cv2.imread(str(self._folder / f"{name}.png"))
             if sheet is not None:
                 self._sheet.image = sheet[..., ::-1]
 
     @cached_property
     def _from_scan(self) -> Callable[[Float[np.ndarray, "P 3"]], Float[np.ndarray, "P"]]:
-        """Distances of points from the scan, metres; a point cloud has no surface, so from its points."""
-        assert self._scan is not None  # else there is no such choice
+        """Distances of points from the scan, metres; from its points if it is a point cloud."""
+        assert self._scan is not None  # otherwise the choice is not offered
         if len(self._scan.triangles):
             surface = Searched(self._scan.vertices, self._scan.triangles)
             return lambda points: surface.closest(points)[0]
@@ -167,7 +174,7 @@ class FitPage(Served):
 
     def _distance_mm(self, name: str) -> Float[np.ndarray, "V"] | None:
         mesh, kind = self._meshes[name], self._colours.value
-        if kind == MOVED:
+        if kind == MOTION:
             earlier = self.stages[max(self.stages.index(name) - 1, 0)]
             return np.linalg.norm(mesh.vertices - self._meshes[earlier].vertices, axis=1) * MM_PER_M
         if kind == TO_SCAN:
@@ -175,7 +182,7 @@ class FitPage(Served):
         return None
 
 
-def _towards(camera: Camera, point: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3"]:
-    """The unit direction from a point to a camera."""
-    away = camera.centre - point
-    return np.asarray(away / np.linalg.norm(away))
+def _direction(camera: Camera, point: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3"]:
+    """Return the unit vector from a point to a camera."""
+    offset = camera.centre - point
+    return np.asarray(offset / np.linalg.norm(offset))

@@ -1,5 +1,7 @@
-"""Coloured heads as GLB files, still or swinging between -3 and +3 standard deviations: the browser animates these by
-itself, so that a slow line carries them once and nothing while they move."""
+"""Coloured heads as GLB files, static or animated between -3 and +3 standard deviations.
+
+The browser runs the animation by itself: a slow connection transfers the file once and nothing afterwards.
+"""
 
 import json
 import struct
@@ -12,43 +14,47 @@ from jaxtyping import Float, Int
 from registration.frames import srgb_to_linear
 from registration.geometry.topology import vertex_normals
 
-SWING = 3.0  # standard deviations either way
-_SECONDS = 4.0  # a period
-_KEYS = 33
+AMPLITUDE_SIGMAS = 3.0  # of the animation, in standard deviations to either side
+_PERIOD_S = 4.0
+_KEYFRAMES = 33
 _FLOAT, _UINT = 5126, 5125
 _ARRAY, _ELEMENTS = 34962, 34963
 
 
-def still_head(
+def static_glb(
     points: Float[np.ndarray, "P 3"], triangles: Int[np.ndarray, "F 3"], colours: Float[np.ndarray, "P 3"]
 ) -> bytes:
-    """A GLB. Metres; colours are sRGB in [0, 255]."""
+    """Return a mesh as GLB; positions in metres, colours sRGB in [0, 255]."""
     normals = vertex_normals(torch.from_numpy(points), torch.from_numpy(triangles.astype(np.int64))).numpy()
     return _glb({"POSITION": points, "NORMAL": normals, "COLOR_0": _linear(colours)}, triangles)
 
 
-def swinging_head(
+def animated_glb(
     points: Float[np.ndarray, "P 3"],
     motion: Float[np.ndarray, "P 3"],
     triangles: Int[np.ndarray, "F 3"],
     colours: Float[np.ndarray, "P 3"],
 ) -> bytes:
-    """A GLB with one morph target, `SWING` times the motion, and an endless animation of its weight.
+    """Return a mesh as GLB with one morph target and an endless animation of its weight.
 
-    Metres; colours are sRGB in [0, 255].
+    Args:
+        points: vertices, metres.
+        motion: displacement of one standard deviation, metres; the target is `AMPLITUDE_SIGMAS` times as large.
+        triangles: vertex indices.
+        colours: sRGB in [0, 255].
     """
     faces = torch.from_numpy(triangles.astype(np.int64))
-    ends = [points + side * SWING * motion for side in (-1, 0, 1)]
+    ends = [points + side * AMPLITUDE_SIGMAS * motion for side in (-1, 0, 1)]
     low, rest, high = (vertex_normals(torch.from_numpy(end), faces).numpy() for end in ends)
-    times = np.linspace(0, _SECONDS, _KEYS)
+    times = np.linspace(0, _PERIOD_S, _KEYFRAMES)
     arrays = {
         "POSITION": points,
         "NORMAL": rest,
         "COLOR_0": _linear(colours),
-        "motion": SWING * motion,
-        "turned": (high - low) / 2,
+        "motion": AMPLITUDE_SIGMAS * motion,
+        "normal_change": (high - low) / 2,
         "times": times,
-        "weights": np.sin(2 * np.pi * times / _SECONDS),
+        "weights": np.sin(2 * np.pi * times / _PERIOD_S),
     }
     return _glb(arrays, triangles)
 
@@ -58,7 +64,8 @@ def _linear(colours: Float[np.ndarray, "P 3"]) -> np.ndarray:
 
 
 def _glb(arrays: dict[str, np.ndarray], triangles: Int[np.ndarray, "F 3"]) -> bytes:
-    """Arrays by what they are called in the format; of a head that swings also motion, turned, times and weights."""
+    """Return the file. `arrays`: vertex attributes by their glTF names; an animated head also has motion,
+    normal_change, times and weights."""
     blobs = {name: np.ascontiguousarray(array, "<f4") for name, array in arrays.items()}
     blobs["faces"] = np.ascontiguousarray(triangles, "<u4").reshape(-1)
     number = {name: k for k, name in enumerate(blobs)}
@@ -70,7 +77,7 @@ def _glb(arrays: dict[str, np.ndarray], triangles: Int[np.ndarray, "F 3"]) -> by
         kind = "VEC3" if array.ndim == 2 else "SCALAR"
         accessor = {"bufferView": number[name], "count": len(array), "type": kind}
         accessor["componentType"] = _UINT if name == "faces" else _FLOAT
-        if name in ("POSITION", "motion", "times"):  # the format asks for these
+        if name in ("POSITION", "motion", "times"):  # glTF requires these
             accessor |= {"min": np.atleast_1d(array.min(0)).tolist(), "max": np.atleast_1d(array.max(0)).tolist()}
         accessors.append(accessor)
         offset += array.nbytes
@@ -92,7 +99,7 @@ def _glb(arrays: dict[str, np.ndarray], triangles: Int[np.ndarray, "F 3"]) -> by
         "accessors": accessors,
     }
     if "motion" in number:
-        primitive["targets"] = [{"POSITION": number["motion"], "NORMAL": number["turned"]}]
+        primitive["targets"] = [{"POSITION": number["motion"], "NORMAL": number["normal_change"]}]
         scene["meshes"][0]["weights"] = [0]
         sampler = {"input": number["times"], "output": number["weights"], "interpolation": "LINEAR"}
         channel = {"sampler": 0, "target": {"node": 0, "path": "weights"}}

@@ -1,5 +1,4 @@
-"""`gnmreg stabilize review`: a page in the browser on which a person decides about components [GNM,
-Head Expression]."""
+"""`gnmreg stabilize review`: a page in the browser for decisions about components [GNM, Head Expression]."""
 
 import threading
 from pathlib import Path
@@ -18,11 +17,11 @@ from registration.stabilize.decisions import ACTIONS
 from workflows.records.decisions import read_decisions
 from workflows.steps.stabilize import LOG, stabilize_run
 from workflows.web import panels
-from workflows.web.glb import SWING, swinging_head
-from workflows.web.review_state import Review
-from workflows.web.server import Served
+from workflows.web.glb import AMPLITUDE_SIGMAS, animated_glb
+from workflows.web.review_state import ReviewState
+from workflows.web.server import PageServer
 
-_APART = 0.15  # metres, each head from the middle
+_OFFSET_M = 0.15  # of each head from the centre
 
 
 def review(
@@ -34,11 +33,11 @@ def review(
     skip_failed: bool = False,
     port: int = 8080,
     progress: Progress | None = None,
-) -> "Page":
-    """Stabilize the run where it is not yet, and serve the page; returns at once.
+) -> "ReviewPage":
+    """Stabilize the run where necessary, start the page's server and return it.
 
     Raises:
-        InputError: as `stabilize_run`; the log at `decisions` is another dataset's; the port cannot be had.
+        InputError: as `stabilize_run`; the log at `decisions` belongs to another dataset; the port is in use.
     """
     outcome = stabilize_run(
         run, model_path=model_path, out=out, skip_failed=skip_failed, whatever_decided=True, progress=progress
@@ -46,13 +45,13 @@ def review(
     log = Path(run) / LOG if decisions is None else Path(decisions)
     saved = read_decisions(log, outcome.dataset) if log.is_file() else []
     head = Head.of(gnm_npz.read(model_path))
-    return Page(Review(disk.read_components(outcome.out), head, log, outcome.dataset, saved), port)
+    return ReviewPage(ReviewState(disk.read_components(outcome.out), head, log, outcome.dataset, saved), port)
 
 
-class Page(Served):
-    """The page of one review; everyone who opens it sees, and decides about, the same."""
+class ReviewPage(PageServer):
+    """The page of one review; all browsers share one state."""
 
-    def __init__(self, review: Review, port: int):
+    def __init__(self, review: ReviewState, port: int):
         self.review = review
         self._lock = threading.Lock()
         self._parts = {part.region: part for part in review.stored.components if len(part.energy)}
@@ -60,15 +59,15 @@ class Page(Served):
             raise InputError(
                 "There is nothing to review",
                 where="displacements of all samples",
-                expected="expressions that move",
-                got="none moves anything",
+                expected="expressions that differ from the neutral",
+                got="no displacement",
                 fix="check that the expressions are not copies of the neutral",
             )
         data = review.head.data
         shells = np.logical_or(*regions.eyeball_shells(data))
-        self._shown = np.flatnonzero(regions.exterior(data) | shells)
+        self._vertices = np.flatnonzero(regions.exterior(data) | shells)
         number = np.full(len(review.head.points), -1)
-        number[self._shown] = np.arange(len(self._shown))
+        number[self._vertices] = np.arange(len(self._vertices))
         faces = number[data.triangles]
         self._faces = faces[(faces >= 0).all(1)]
         super().__init__(port, "Stabilization")
@@ -84,7 +83,7 @@ class Page(Served):
         return int(self._number.value) - 1
 
     def _build(self) -> None:
-        """The scene and all controls, empty."""
+        """Create the scene and the controls."""
         server, gui = self._server, self._server.gui
         server.scene.set_up_direction("+y")
         server.scene.add_light_directional("/key", intensity=1.6, position=(-0.5, 0.7, 1.0))
@@ -92,7 +91,7 @@ class Page(Served):
         server.initial_camera.look_at = (0.0, 0.0, 0.0)
         server.initial_camera.fov = np.radians(38)
         samples, subjects = len(self.review.stored.labels), len(set(self.review.stored.subjects))
-        gui.add_markdown(f"### Does the head move?\n{samples} expressions of {subjects} subjects")
+        gui.add_markdown(f"### Head motion in expressions\n{samples} expressions of {subjects} subjects")
         names = tuple(region.replace("_", " ") for region in self._parts)
         # viser's setters have types of their own that type checkers take for read-only properties.
         self._region: Any = gui.add_dropdown("Region", names)
@@ -103,19 +102,19 @@ class Page(Served):
         self._reason: Any = gui.add_text("Reason", "")
         self._error = gui.add_html("")
         undo, save = gui.add_button("Undo"), gui.add_button("Save decisions")
-        self._said = gui.add_markdown("")
+        self._message = gui.add_markdown("")
         self._bar, self._histogram, self._strongest = (gui.add_html("") for _ in range(3))
-        for text, x in (("before", -_APART), ("after", _APART)):
+        for text, x in (("before", -_OFFSET_M), ("after", _OFFSET_M)):
             server.scene.add_label(f"/{text} label", text, position=(x, -0.185, 0.0))
-        self._region.on_update(lambda _: self._turn_to(1))
+        self._region.on_update(lambda _: self._select(1))
         self._number.on_update(lambda _: self._show())
-        steps.on_click(lambda _: self._turn_to(self._component + 1 + (1 if steps.value == "next" else -1)))
+        steps.on_click(lambda _: self._select(self._component + 1 + (1 if steps.value == "next" else -1)))
         self._action.on_click(lambda _: self._decide())
         undo.on_click(lambda _: self._undo())
         save.on_click(lambda _: self._save())
-        self._turn_to(1)
+        self._select(1)
 
-    def _turn_to(self, number: int) -> None:
+    def _select(self, number: int) -> None:
         count = len(self._part.energy)
         self._number.max = max(count, 2)
         self._number.value = int(np.clip(number, 1, count))
@@ -131,23 +130,23 @@ class Page(Served):
         with self._lock:
             last = self.review.undo()
         if last is None:
-            self._said.content = "Nothing to undo that is not saved."
+            self._message.content = "There is no unsaved decision to undo."
             return
         self._region.value = last.region.replace("_", " ")
-        self._turn_to(last.component + 1)
-        self._said.content = "Undone."
+        self._select(last.component + 1)
+        self._message.content = "Undone."
 
     def _save(self) -> None:
         with self._lock:
             try:
                 count = self.review.save()
-                self._said.content = f"{count} decisions saved in `{self.review.log}`."
+                self._message.content = f"{count} decisions saved in `{self.review.log}`."
             except (InputError, OSError) as error:
-                self._said.content = f"Not saved: {error}"
+                self._message.content = f"Not saved: {error}"
         self._show()
 
     def _show(self) -> None:
-        """Everything as it is now."""
+        """Show the current state."""
         with self._lock:
             part, k = self._part, min(self._component, len(self._part.energy) - 1)
             review = self.review
@@ -155,12 +154,12 @@ class Page(Served):
             self._error.content = panels.error(review.change, review.unsaved)
             self._histogram.content = panels.histogram(part.coefficients[:, k], review.stored.labels)
             self._strongest.content = panels.strongest(part, k, review.stored)
-            before, after = (motion[self._shown] for motion in review.motions(part.region, k))
-            reach = 1e3 * SWING * np.linalg.norm(before, axis=1)
-            limit = scale_limit_mm(reach)
+            before, after = (motion[self._vertices] for motion in review.motions(part.region, k))
+            size_mm = 1e3 * AMPLITUDE_SIGMAS * np.linalg.norm(before, axis=1)
+            limit = scale_limit_mm(size_mm)
             self._bar.content = panels.colour_bar(limit, "Displacement at 3 σ")
-            points = review.head.points[self._shown]
-            for name, motion, x in (("before", before, -_APART), ("after", after, _APART)):
-                colours = scale_colours(1e3 * SWING * np.linalg.norm(motion, axis=1) / limit)
-                glb = swinging_head(points, motion, self._faces, colours)
+            points = review.head.points[self._vertices]
+            for name, motion, x in (("before", before, -_OFFSET_M), ("after", after, _OFFSET_M)):
+                colours = scale_colours(1e3 * AMPLITUDE_SIGMAS * np.linalg.norm(motion, axis=1) / limit)
+                glb = animated_glb(points, motion, self._faces, colours)
                 self._server.scene.add_glb(f"/{name}", glb, position=(x, 0.0, 0.0))

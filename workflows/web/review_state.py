@@ -1,4 +1,4 @@
-"""The state behind the review page: what is decided, undone, saved. Knows no browser."""
+"""The state of a review: decisions that are made, undone and saved; independent of the browser."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -21,8 +21,8 @@ from registration.stabilize.stabilized_folder import StoredComponents
 from workflows.records.decisions import append_decisions
 
 
-class Review:
-    """Decisions about a stabilized set's components, in the order they are made."""
+class ReviewState:
+    """Decisions about a stabilized set's components, in order."""
 
     def __init__(self, stored: StoredComponents, head: Head, log: Path, dataset: str, saved: Sequence[Decision] = ()):
         self.stored, self.head, self.log, self.dataset = stored, head, log, dataset
@@ -31,17 +31,18 @@ class Review:
         self._update()
 
     def action(self, region: str, component: int) -> Action:
+        """Return the current action for a component."""
         return self._actions[region, component]
 
     def decide(self, region: str, component: int, action: Action, reason: str) -> None:
-        """Raises InputError for a component or an action that there is not."""
-        made = [*self.decisions, Decision(region=region, component=component, action=action, reason=reason)]
-        decided_actions(self.stored.components, made)
-        self.decisions = made
+        """Append a decision. Raises InputError for a component or an action that does not exist."""
+        decisions = [*self.decisions, Decision(region=region, component=component, action=action, reason=reason)]
+        decided_actions(self.stored.components, decisions)
+        self.decisions = decisions
         self._update()
 
     def undo(self) -> Decision | None:
-        """Take the last decision back that is not saved, and return it; what is saved stays in the log."""
+        """Remove the last decision that is not saved and return it; None if all are saved."""
         if not self.unsaved:
             return None
         last = self.decisions.pop()
@@ -49,26 +50,31 @@ class Review:
         return last
 
     def save(self) -> int:
-        """Append what is not in the log yet; returns how many. Raises InputError if the log is another dataset's."""
-        fresh = self.decisions[self._saved :]
-        if fresh:
-            append_decisions(self.log, self.dataset, fresh)
+        """Append the new decisions to the log and return their number.
+
+        Raises:
+            InputError: the log belongs to another dataset.
+        """
+        new = self.decisions[self._saved :]
+        if new:
+            append_decisions(self.log, self.dataset, new)
         self._saved = len(self.decisions)
-        return len(fresh)
+        return len(new)
 
     @property
     def unsaved(self) -> int:
+        """Number of decisions that are not in the log."""
         return len(self.decisions) - self._saved
 
     def motions(self, region: str, component: int) -> tuple[Float[np.ndarray, "V 3"], Float[np.ndarray, "V 3"]]:
-        """What the whole head does along with a coefficient of one, metres: before, and after what is decided now."""
+        """Return the head's displacement at one standard deviation, metres: before and after the current decisions."""
         before = self.stored.along[region][component].astype(np.float64)
         part = next(part for part in self.stored.components if part.region == region)
         weight = part.coefficients[:, component] / len(self.stored.labels)
-        taken = np.tensordot(weight @ self.corrections.twists, motion_fields(self.head.points), 1)
+        removed = np.tensordot(weight @ self.corrections.twists, motion_fields(self.head.points), 1)
         for coefficients, field in self.corrections.dropped:
-            taken = taken + (weight @ coefficients) * field
-        return before, before - taken
+            removed = removed + (weight @ coefficients) * field
+        return before, before - removed
 
     def _update(self) -> None:
         self._actions = decided_actions(self.stored.components, self.decisions)

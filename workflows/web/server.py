@@ -1,4 +1,4 @@
-"""Pages that viser serves from this machine alone, over one port; they ask nobody else for anything."""
+"""Pages that viser serves on the loopback interface, over one port; they request nothing from other hosts."""
 
 import socket
 import time
@@ -10,14 +10,18 @@ from registration.errors import InputError
 _HOST = "127.0.0.1"
 
 
-class Served:
-    """A page with our colours and light, empty as yet."""
+class PageServer:
+    """An empty page with the project's colours and light."""
 
     def __init__(self, port: int, title: str):
-        """`port` 0 takes a free one.
+        """Start the server.
 
-        Raises InputError if the port cannot be had: viser would look for the next free one, but a tunnel leads to the
-        one that was asked for.
+        Args:
+            port: port on the loopback interface; 0: any free one.
+            title: of the browser's tab.
+
+        Raises:
+            InputError: the port is in use. viser would take the next free one, but a tunnel leads to this one.
         """
         with socket.socket() as probe:
             probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
@@ -38,16 +42,16 @@ class Served:
         gui.configure_theme(brand_color=(31, 122, 116), show_logo=False, show_share_button=False, control_width="large")
         gui.main_panel.dock_right()
         scene.configure_default_lights(False)
-        scene.configure_environment_map(None)  # colours mean millimetres: light must not wash them out
+        scene.configure_environment_map(None)  # colours encode millimetres: reflections would change them
         scene.add_light_ambient("/ambient", intensity=1.7)
 
     @property
     def url(self) -> str:
-        """Where to open it."""
+        """The page's URL."""
         return f"http://{_HOST}:{self.port}"
 
     def wait(self) -> None:
-        """Until Ctrl-C."""
+        """Block until Ctrl-C, then close."""
         try:
             while True:
                 time.sleep(1)
@@ -55,4 +59,5 @@ class Served:
             self.close()
 
     def close(self) -> None:
+        """Stop the server."""
         self._server.stop()

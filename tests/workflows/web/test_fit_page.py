@@ -14,7 +14,7 @@ from registration.types import Capture
 from tests.registration.capture import small
 from tests.registration.report.test_pictures import a_view
 from tests.workflows.browser import CHROMIUM, FLAGS, needs_browser
-from workflows.web.fit_page import MOVED, PLAIN, TO_SCAN, FitPage
+from workflows.web.fit_page import MOTION, PLAIN, TO_SCAN, FitPage
 
 OUTSIDE = np.ones(len(small.ball().vertices), bool)
 
@@ -62,7 +62,7 @@ def test_colours_are_millimetres(page: FitPage, tmp_path: Path) -> None:
     off_mm = 20 * small.RADIUS_M
     for colours, wanted in (
         (TO_SCAN, {"00_start": off_mm, "01_pose": 0.0}),
-        (MOVED, {"00_start": 0.0, "01_pose": off_mm}),
+        (MOTION, {"00_start": 0.0, "01_pose": off_mm}),
     ):
         page._colours.value = colours
         for name, distance in wanted.items():
@@ -75,7 +75,7 @@ def test_colours_are_millimetres(page: FitPage, tmp_path: Path) -> None:
 def test_without_a_scan_there_is_no_distance_to_it(capture: Capture, tmp_path: Path) -> None:
     page = FitPage(tmp_path / "stages", replace(capture, scan=None), OUTSIDE)
     try:
-        assert page._colours.options == (MOVED, PLAIN)
+        assert page._colours.options == (MOTION, PLAIN)
     finally:
         page.close()
 

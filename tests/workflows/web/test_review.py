@@ -17,9 +17,9 @@ from tests.workflows.browser import CHROMIUM, FLAGS, needs_browser
 from workflows.records.decisions import read_decisions
 from workflows.records.run import read_run
 from workflows.steps.stabilize import stabilize_run
-from workflows.web.glb import swinging_head
-from workflows.web.review import Page, review
-from workflows.web.review_state import Review
+from workflows.web.glb import animated_glb
+from workflows.web.review import ReviewPage, review
+from workflows.web.review_state import ReviewState
 
 NAMES = ("smile", "jaw_open", "brows_up")
 
@@ -32,7 +32,7 @@ def run(anatomy, model, tmp_path_factory) -> Path:  # noqa: F811
 
 
 @pytest.fixture
-def page(run, model_file) -> Iterator[Page]:  # noqa: F811
+def page(run, model_file) -> Iterator[ReviewPage]:  # noqa: F811
     (run / "decisions.jsonl").unlink(missing_ok=True)
     served = review(run, model_path=model_file, port=0)
     yield served
@@ -90,7 +90,7 @@ def test_a_person_steps_subtracts_undoes_and_saves(page, run, model, model_file,
 
 
 def test_a_review_goes_on_from_its_log(page, run, model_file):  # noqa: F811
-    before: Review = page.review
+    before: ReviewState = page.review
     before.decide("nose", 0, "subtract", "moves as one")
     before.decide("mouth", 0, "drop", "")
     assert before.undo().region == "mouth" and before.unsaved == 1  # type: ignore[union-attr]
@@ -117,12 +117,12 @@ def test_looking_again_leaves_what_was_decided(page, run, model_file):  # noqa: 
     assert disk.read_manifest(decided.out) == written and len(written["decisions"]) == 1
 
 
-def test_a_taken_port_is_told(page, run, model_file):  # noqa: F811
+def test_a_port_in_use_is_refused(page, run, model_file):  # noqa: F811
     with pytest.raises(InputError, match="cannot be served"):
         review(run, model_path=model_file, port=page.port)
 
 
-def test_a_swinging_head_is_a_glb():
+def test_an_animated_head_is_a_glb():
     """Read back by trimesh, an independent reader; it knows no morph targets."""
     import io
 
@@ -130,7 +130,7 @@ def test_a_swinging_head_is_a_glb():
 
     rng = np.random.default_rng(0)
     sphere = trimesh.creation.icosphere(subdivisions=2)
-    blob = swinging_head(
+    blob = animated_glb(
         sphere.vertices, rng.normal(size=sphere.vertices.shape), sphere.faces, 255 * (sphere.vertices > 0)
     )
     assert len(blob) % 4 == 0 and int.from_bytes(blob[8:12], "little") == len(blob)
