@@ -122,7 +122,7 @@ def test_the_folder_holds_figures_distances_and_a_page_of_its_own(out, model):
     page = (out / "index.html").read_text()
     assert 'src="http' not in page and 'href="http' not in page
     assert page.count("<svg") == 2 and page.count("<img") == 7  # three sides of two models; the dialog's
-    for text in ("own", "weak", "lower face", "40 to 49", "one subject", "flexing"):
+    for text in ("own", "weak", "lower face", "40-49", "one subject", "flexing"):
         assert text in page
     assert sorted(path.name for path in out.iterdir()) == ["index.html", "manifest.json", "vertices.npz"]
     assert not list(out.parent.glob(".*.tmp"))
