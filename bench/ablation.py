@@ -22,8 +22,8 @@ from registration.evaluate.audit import BEYOND
 from registration.evaluate.evaluation import evaluate
 from registration.fit.recipes import Recipe, Stage, draft
 from registration.options import RegisterOptions
+from registration.pipeline import register
 from registration.progress import shown
-from registration.register import register
 from registration.storage.registration_folder import load_registration
 from registration.types import Registration
 

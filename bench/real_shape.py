@@ -39,8 +39,8 @@ from registration.evaluate.face import face_ball, seen
 from registration.model import gnm_npz, regions
 from registration.model.gnm import GNM
 from registration.model.gnm_npz import GNMData
+from registration.pipeline import register
 from registration.progress import shown
-from registration.register import register
 from registration.types import Capture, Registration
 
 _SURE = 0.1  # confidence from which on a vertex was seen

@@ -30,8 +30,8 @@ def register(
         force: Register again although the folder holds the result of the same input.
         fit: How the capture is registered.
     """
+    from registration.pipeline import register
     from registration.progress import shown
-    from registration.register import register
 
     with shown() as progress:
         result = register(capture, model, out, fit, neutral=neutral, force=force, progress=progress)

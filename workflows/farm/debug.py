@@ -59,7 +59,7 @@ class Debugged:
 
 
 def _register(arguments: Mapping[str, Any], out: Path, progress: Progress, port: int | None) -> Debugged:
-    from registration.register import register
+    from registration.pipeline import register
 
     place = str(arguments["capture"])
     if is_remote(place):

@@ -8,8 +8,8 @@ from registration.fit.recipes import named_recipe
 from registration.inputs import input_hash, read_schemes
 from registration.model import gnm_npz
 from registration.options import RegisterOptions
+from registration.pipeline import register
 from registration.progress import Progress
-from registration.register import register
 from registration.render.backend import Variant
 from registration.storage import hashing
 from registration.storage.registration_folder import read_manifest

@@ -16,8 +16,8 @@ from registration.fit.recipes import load_recipe, named_recipe
 from registration.inputs import input_hash, read_schemes
 from registration.model import gnm_npz
 from registration.options import RegisterOptions
+from registration.pipeline import register
 from registration.progress import Named, Progress, Silent
-from registration.register import register
 from registration.storage import hashing
 from registration.storage.files import atomic_write_text
 from registration.storage.registration_folder import read_manifest, update_figures

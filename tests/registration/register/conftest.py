@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from registration.options import RegisterOptions
-from registration.register import register
+from registration.pipeline import register
 from registration.storage.registration_folder import load_registration
 from registration.types import Registration
 from tests.registration.register.synthetic import MODEL, Truth, make

@@ -19,7 +19,7 @@ from registration.model import gnm_npz
 from registration.model.atlas import texture_atlas
 from registration.model.gnm import GNM
 from registration.options import RegisterOptions
-from registration.register import register
+from registration.pipeline import register
 from registration.render import backend
 from registration.storage.registration_folder import save_registration
 from registration.types import Registration

@@ -9,7 +9,7 @@ from coregister.first_model import build, makehuman
 from coregister.synthetic.subject import capture
 from registration.errors import InputError
 from registration.model import gnm_npz, regions
-from registration.register import register
+from registration.pipeline import register
 from registration.storage.registration_folder import read_manifest
 from registration.types import Registration
 

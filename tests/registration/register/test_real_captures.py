@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from registration.register import register
+from registration.pipeline import register
 from tests.conftest import SHARED, needs_shared
 
 pytestmark = [pytest.mark.slow, needs_shared]

@@ -14,7 +14,7 @@ from registration.model.gnm import GNM
 from registration.model.gnm_npz import read
 from registration.model.regions import group, neck_other
 from registration.options import RegisterOptions
-from registration.register import register
+from registration.pipeline import register
 from registration.render import backend
 from registration.storage.registration_folder import FILES, load_registration
 from registration.types import Parameters, Registration

@@ -5,7 +5,7 @@ import torch
 
 from registration.fit.problem import FitTrace
 from registration.fit.view_weights import ViewErrors
-from registration.register import _status
+from registration.pipeline import _status
 
 NAN = torch.full((2,), torch.nan)
 CALM = ViewErrors(names=("a", "b"), outline_px=NAN, landmark_px=NAN, brightness=torch.zeros(2))

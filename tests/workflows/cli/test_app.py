@@ -9,9 +9,9 @@ from typing import get_args
 
 import pytest
 
-import registration.register
 import workflows.cli
 import workflows.steps.subject
+from registration import pipeline
 from registration.fit.recipes import RECIPES
 from registration.options import RegisterOptions
 from tests.conftest import FIXTURES
@@ -268,7 +268,7 @@ def test_register_passes_every_argument_on(
         heard.update(settings, capture=capture, model=model, out=out, options=options)
         return SimpleNamespace(status=status, reason="because")
 
-    monkeypatch.setattr(registration.register, "register", listen)
+    monkeypatch.setattr(pipeline, "register", listen)
     flags = "--recipe studio --views 7 --seed 3 --neutral N --deterministic --force --variant cuda --landmarks 68=a 5=b"
     assert main(["register", "C", "--model", "M.npz", "--out", "O", *flags.split()]) == code
     heard.pop("progress").note("told")

@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-import registration.register
+from registration import pipeline
 from registration.errors import InputError
 from registration.options import RegisterOptions
 from registration.progress import Silent
@@ -39,7 +39,7 @@ def calls(monkeypatch: pytest.MonkeyPatch) -> list[dict[str, Any]]:
         made.append({"capture": capture, "model": model, "out": out, "options": options, **settings})
         return a_registration(status="failed", reason="so it is")
 
-    monkeypatch.setattr(registration.register, "register", register)
+    monkeypatch.setattr(pipeline, "register", register)
     return made
 
 
@@ -85,7 +85,7 @@ def test_a_page_ends_with_the_registration_that_was_refused(monkeypatch: pytest.
         raise InputError("no", where="here", expected="a", got="b", fix="c")
 
     ports: list[int] = []
-    monkeypatch.setattr(registration.register, "register", refuse)
+    monkeypatch.setattr(pipeline, "register", refuse)
     monkeypatch.setattr(Silent, "note", lambda self, text: ports.append(int(text.split(":")[2].split(" ")[0])))
     capture = small.make(tmp_path / "capture")
     with pytest.raises(InputError, match="no"):

@@ -16,7 +16,7 @@ from registration.errors import InputError
 from registration.evaluate.evaluation import evaluate_folder
 from registration.fit.recipes import RECIPES, Recipe, draft
 from registration.options import RegisterOptions
-from registration.register import register
+from registration.pipeline import register
 from registration.render import backend
 from registration.storage.registration_folder import AXES, load_registration, read_manifest
 from tests.registration.register import synthetic
