@@ -1,0 +1,1 @@
+"""Build a model from registrations and the previous model."""

@@ -1,0 +1,1 @@
+"""Synthetic subjects, their expressions, and captures of them."""

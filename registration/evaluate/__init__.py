@@ -1,0 +1,1 @@
+"""Measure registrations: distances from scan and ground truth, penetration of parts."""

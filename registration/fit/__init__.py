@@ -1,0 +1,1 @@
+"""The fitting problem of one capture: recipes, initial guess, variables, optimizer, appearance, view weights."""

@@ -1,0 +1,1 @@
+"""Mathematics of meshes and point sets, without knowledge of heads."""

@@ -1,0 +1,1 @@
+"""Loss functions: image, landmark, regularization, self-intersection, SSIM in uv space."""

@@ -1,0 +1,1 @@
+"""The differentiable renderer; the only room that imports Mitsuba and Dr.Jit."""

@@ -1,0 +1,1 @@
+"""Remove the head's rigid motion from a subject's expressions."""

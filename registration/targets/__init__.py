@@ -1,0 +1,1 @@
+"""What the losses compare a rendering with: lists of pixels at several resolutions."""

@@ -1,0 +1,1 @@
+"""The command line `gnmreg`: parse arguments, call the library, print."""

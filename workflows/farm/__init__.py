@@ -1,0 +1,1 @@
+"""Flows (the order of jobs), batches, a farm on one machine, debugging of a job."""

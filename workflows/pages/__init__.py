@@ -1,0 +1,1 @@
+"""Static HTML pages of subjects, stabilizations, models, evaluations and coregistrations."""

@@ -1,0 +1,1 @@
+"""What workflows keep on disk: subjects, datasets, runs, held-out subjects, the store."""

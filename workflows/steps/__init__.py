@@ -1,0 +1,1 @@
+"""What a worker runs: register, stabilize, build, evaluate, synthesize."""

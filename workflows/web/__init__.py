@@ -1,0 +1,1 @@
+"""Interactive pages: the stabilization review, and a fit in 3D."""

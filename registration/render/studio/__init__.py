@@ -1,0 +1,1 @@
+"""Lit, path-traced synthetic photographs of heads."""
