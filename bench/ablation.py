@@ -17,7 +17,7 @@ from typing import Any
 from rich.console import Console
 from rich.table import Table
 
-from registration.capture.native import read
+from registration.capture.native import read_capture
 from registration.evaluate.audit import BEYOND
 from registration.evaluate.evaluation import evaluate
 from registration.fit.recipes import Recipe, Stage, draft
@@ -99,9 +99,9 @@ def main() -> None:
             )
             found = evaluate(
                 made,
-                read(options.expression),
+                read_capture(options.expression),
                 neutral=load_registration(whole),
-                neutral_capture=read(options.neutral),
+                neutral_capture=read_capture(options.neutral),
             )
             expression_table.add_row(name, *_row(made, found.figures["drift"]["face"]))
     for table in (neutral_table, expression_table):

@@ -31,7 +31,7 @@ from coregister.next_model.build import build_model
 from coregister.next_model.identity import IdentitySettings
 from coregister.next_model.recipes import true_meshes
 from coregister.next_model.training_data import TrainingMesh, TrainingSubject, unpose
-from registration.capture.native import read
+from registration.capture.native import read_capture
 from registration.capture.scan import read_scan
 from registration.errors import InputError
 from registration.evaluate.evaluation import CLOUD_TOLERANCE
@@ -52,7 +52,7 @@ def registered(captures: Sequence[Path], model: Path, out: Path) -> list[tuple[C
     found = []
     with shown() as progress:
         for number, path in enumerate(captures):
-            capture = read(path)
+            capture = read_capture(path)
             progress.at(number, len(captures), capture.subject)
             one = register(path, model, out / "registrations" / capture.subject, progress=progress)
             found.append((capture, one))

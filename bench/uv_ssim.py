@@ -24,7 +24,7 @@ from rich.table import Table
 from bench.support import sliding
 from bench.support.sliding import OnSurface, Problem, Term
 from coregister.first_model.build import bootstrap
-from registration.capture.native import read
+from registration.capture.native import read_capture
 from registration.frames import MM_PER_M
 from registration.losses import image
 from registration.model import gnm_npz
@@ -147,7 +147,7 @@ def captured(data: GNMData, neutral: Path, expression: Path, head_px: int, size_
     device, corner_uvs = backend.activate(), texture_atlas(data)
     batches, truths = [], []
     for folder in (neutral, expression):
-        capture = read(folder)
+        capture = read_capture(folder)
         level = build_pyramid(capture, class_map(capture.classes), finest_head_px=head_px, levels=1)[0]
         batches.append(level.select(range(len(level.names)), device))
         truths.append(np.load(capture.ground_truth)["vertices"].astype(np.float64))

@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from registration.capture.doctor import validate
-from registration.capture.native import read
+from registration.capture.native import read_capture
 from registration.capture.triangulation import triangulate
+from registration.capture.validation import validate_capture
 from registration.errors import InputError
 from registration.fit.initialization import MIN_LANDMARKS, select_spread_views
 from registration.fit.recipes import Recipe, expression_recipe, load_recipe
@@ -66,8 +66,8 @@ def read_inputs(
         InputError: something cannot be used.
     """
     recipe = load_recipe(options.recipe)
-    capture = read(capture_path)
-    validate(capture)
+    capture = read_capture(capture_path)
+    validate_capture(capture)
     selected = _select_views(capture, options.views)
     data = gnm_npz.read(model_path)
     _check_model(data)

@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from coregister.synthetic.hair_and_shirt import HAIR_M, hair, shirt
-from registration.capture.native_writer import write
+from registration.capture import native_writer
 from registration.capture.scan import Scan
 from registration.errors import InputError
 from registration.model.atlas import texture_atlas
@@ -95,13 +95,10 @@ def write_capture(
         background=studio.background,
         seed=studio.seed,
     )
-    return write(
+    return native_writer.write_capture(
         root,
         views,
-        subject=subject,
-        expression=expression,
-        classes=LABELS,
-        tags=tags,
+        native_writer.CaptureDescription(subject=subject, expression=expression, classes=LABELS, tags=tags or {}),
         scan=_scan(data, head, surfaces, cameras),
         truth=vertices,
         bits=studio.bits,

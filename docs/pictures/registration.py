@@ -84,7 +84,7 @@ def main() -> None:
     parser.add_argument("registration", type=Path)
     parser.add_argument("--view", default="cam11")
     arguments = parser.parse_args()
-    capture, registration = native.read(arguments.capture), load_registration(arguments.registration)
+    capture, registration = native.read_capture(arguments.capture), load_registration(arguments.registration)
     view = next(v for v in capture.views if v.name == arguments.view)
     raw = read_scan(capture.scan)
     drawn = panels(view, registration, Surface(vertices=raw.vertices, triangles=raw.triangles))

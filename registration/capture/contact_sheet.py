@@ -1,7 +1,6 @@
-"""The contact sheet of a capture: every undistorted image with what is known about it drawn over it."""
+"""The contact sheet of a capture: every undistorted image with its mask outline, scan and landmarks."""
 
 import math
-import secrets
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -15,15 +14,16 @@ from registration.capture.pixels import read_view, undistort_landmarks
 from registration.capture.scan import Scan
 from registration.capture.triangulation import MIN_CONFIDENCE, inlier_limit_px, residuals
 from registration.frames import linear_to_srgb
+from registration.storage.files import atomic_file
 from registration.types import Camera, Capture, View
 
 TILE_WIDTH_PX = 320
 CAPTION_PX = 40
-SCAN_POINTS = 60_000  # looked at for visibility; a tenth of them is drawn
+SCAN_POINTS = 60_000  # tested for visibility; a tenth of them is drawn
 JAW = 17  # the first points of the 68 scheme: joined by a line, so that a wrong order shows
 VISIBLE_M = 0.008  # a point this much behind the nearest one in its neighbourhood is hidden
 _BACKGROUND, _INK, _FAINT = (24, 24, 28), (235, 235, 235), (165, 165, 170)
-_SCAN, _MASK, _USED, _UNUSED, _SOLVED, _WRONG = (
+_SCAN, _MASK, _USED, _UNUSED, _TRIANGULATED, _OUTLIER = (
     (60, 200, 255),
     (255, 210, 60),
     (70, 255, 90),
@@ -33,7 +33,7 @@ _SCAN, _MASK, _USED, _UNUSED, _SOLVED, _WRONG = (
 )
 
 
-def draw(
+def draw_contact_sheet(
     capture: Capture,
     captions: Mapping[str, str],
     scheme: str | None,
@@ -41,12 +41,18 @@ def draw(
     scan: Scan | None,
     path: Path,
 ) -> None:
-    """Write the sheet as PNG, beside `path` and then renamed.
+    """Write the sheet as a PNG file.
 
-    `captions` has a line for each view's name; `points` (m, world) are the triangulated landmarks of `scheme`.
+    Args:
+        capture: the capture.
+        captions: view's name -> a line below its image.
+        scheme: the landmark scheme that is drawn; None: none.
+        points: the triangulated landmarks of `scheme`, metres, world.
+        scan: drawn as points, if there is one.
+        path: the file; its folder is created.
     """
     cloud = np.zeros((0, 3))
-    if scan is not None:  # evenly picked
+    if scan is not None:  # evenly sampled
         cloud = scan.vertices[np.unique(np.linspace(0, len(scan.vertices) - 1, SCAN_POINTS).astype(int))]
     aspect = float(np.median([view.camera.height_px / view.camera.width_px for view in capture.views]))
     tile = (TILE_WIDTH_PX, round(TILE_WIDTH_PX * aspect))
@@ -57,20 +63,16 @@ def draw(
     _write_heading(page, capture, scan is not None, scheme)
     pen = ImageDraw.Draw(page)
     for number, view in enumerate(capture.views):
-        picture = _picture(view, capture, tile, scheme, points, cloud)
+        image = _draw_tile(view, capture, tile, scheme, points, cloud)
         x, y = 8 + number % columns * cell[0], 72 + number // columns * cell[1]
-        page.paste(Image.fromarray(picture), (x + (tile[0] - picture.shape[1]) // 2, y + tile[1] - picture.shape[0]))
+        page.paste(Image.fromarray(image), (x + (tile[0] - image.shape[1]) // 2, y + tile[1] - image.shape[0]))
         pen.text((x, y + tile[1] + 3), view.name, _INK, _font(14))
         size = f"{view.camera.width_px} x {view.camera.height_px}"
         pen.text((x + tile[0], y + tile[1] + 5), size, _FAINT, _font(12), anchor="ra")
         pen.text((x, y + tile[1] + 20), captions[view.name], _FAINT, _font(12))
     path.parent.mkdir(parents=True, exist_ok=True)
-    fresh = path.with_name(f".{path.name}.{secrets.token_hex(4)}.tmp")
-    try:
-        page.save(fresh, "PNG")
-        fresh.replace(path)
-    finally:
-        fresh.unlink(missing_ok=True)
+    with atomic_file(path) as temporary:
+        page.save(temporary, "PNG")
 
 
 def _font(size: int) -> ImageFont.FreeTypeFont | ImageFont.ImageFont:
@@ -86,8 +88,8 @@ def _write_heading(page: Image.Image, capture: Capture, scan: bool, scheme: str 
         entries += [
             (_USED, f"landmarks {scheme}"),
             (_UNUSED, f"confidence up to {MIN_CONFIDENCE}: unused"),
-            (_SOLVED, "triangulated"),
-            (_WRONG, "contradicted by other views"),
+            (_TRIANGULATED, "triangulated"),
+            (_OUTLIER, "contradict other views"),
         ]
     x = 8.0
     for colour, text in entries:
@@ -96,7 +98,7 @@ def _write_heading(page: Image.Image, capture: Capture, scan: bool, scheme: str 
         x += 18 + pen.textlength(text, _font(14)) + 22
 
 
-def _picture(
+def _draw_tile(
     view: View,
     capture: Capture,
     tile: tuple[int, int],
@@ -104,37 +106,37 @@ def _picture(
     points: Float[np.ndarray, "L 3"],
     cloud: Float[np.ndarray, "P 3"],
 ) -> UInt8[np.ndarray, "h w 3"]:
-    """One tile, at most `tile` (width, height) px."""
+    """The image of one view, at most `tile` (width, height) px."""
     full = view.camera
     reduction = max(full.width_px / tile[0], full.height_px / tile[1])
-    plain = replace(view, normals=None, segmentation=None)
-    decoded = read_view(plain, capture, downsample=max(1, math.floor(reduction)))
+    reduced = replace(view, normals=None, segmentation=None)
+    decoded = read_view(reduced, capture, downsample=max(1, math.floor(reduction)))
     scale = min(tile[0] / decoded.camera.width_px, tile[1] / decoded.camera.height_px)
     camera = decoded.camera.scaled(
         max(1, round(scale * decoded.camera.width_px)), max(1, round(scale * decoded.camera.height_px))
     )
     size = (camera.width_px, camera.height_px)
     resized = cv2.resize(decoded.rgb, size, interpolation=cv2.INTER_AREA if scale < 1 else cv2.INTER_CUBIC)
-    picture = np.round(255 * linear_to_srgb(resized)).astype(np.uint8)
+    image = np.round(255 * linear_to_srgb(resized)).astype(np.uint8)
     if decoded.mask is not None:
         inside = (cv2.resize(decoded.mask, size, interpolation=cv2.INTER_LINEAR) > 0.5).astype(np.uint8)
         contours, _ = cv2.findContours(inside, cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)
-        cv2.drawContours(picture, contours, -1, _MASK, 1, cv2.LINE_AA)
-    _draw_scan(picture, camera, cloud)
+        cv2.drawContours(image, contours, -1, _MASK, 1, cv2.LINE_AA)
+    _draw_scan(image, camera, cloud)
     if scheme is not None and scheme in view.landmarks:
-        _draw_landmarks(picture, camera, view, scheme, points)
-    return picture
+        _draw_landmarks(image, camera, view, scheme, points)
+    return image
 
 
 def _draw_scan(
-    picture: UInt8[np.ndarray, "h w 3"],
+    image: UInt8[np.ndarray, "h w 3"],
     camera: Camera,
     cloud: Float[np.ndarray, "P 3"],
 ) -> None:
     """Every tenth scan point that is not behind others."""
     if not len(cloud):
         return
-    height, width = picture.shape[:2]
+    height, width = image.shape[:2]
     xy, depth = camera.project(cloud)
     inside = (depth > 0) & (xy >= 0).all(-1) & (xy[:, 0] < width) & (xy[:, 1] < height)
     cells = np.floor(xy[inside] / 4).astype(int)
@@ -145,32 +147,32 @@ def _draw_scan(
     visible[inside] = depth[inside] < nearest[cells[:, 1], cells[:, 0]] + VISIBLE_M
     shown = np.flatnonzero(visible)
     for x, y in xy[shown[:: max(1, min(10, len(shown) // 500))]]:
-        cv2.circle(picture, _subpixel(x, y), 10, _SCAN, -1, cv2.LINE_AA, shift=4)
+        cv2.circle(image, _subpixel(x, y), 10, _SCAN, -1, cv2.LINE_AA, shift=4)
 
 
 def _draw_landmarks(
-    picture: UInt8[np.ndarray, "h w 3"], camera: Camera, view: View, scheme: str, points: Float[np.ndarray, "L 3"]
+    image: UInt8[np.ndarray, "h w 3"], camera: Camera, view: View, scheme: str, points: Float[np.ndarray, "L 3"]
 ) -> None:
-    """Found landmarks, their triangulated counterparts, and a line between the two where they disagree."""
+    """Detected landmarks, their triangulated counterparts, and for outliers a line between the two."""
     landmarks = undistort_landmarks(view, scheme)
-    found = landmarks[:, :2] * np.diag(camera.intrinsics)[:2] / np.diag(view.camera.intrinsics)[:2]
-    solved, _ = camera.project(points)
-    wrong = residuals(view, scheme, points) > inlier_limit_px(view.camera)
+    detected = landmarks[:, :2] * np.diag(camera.intrinsics)[:2] / np.diag(view.camera.intrinsics)[:2]
+    projected, _ = camera.project(points)
+    outlier = residuals(view, scheme, points) > inlier_limit_px(view.camera)
     jaw = [index for index in range(JAW if scheme == "68" else 0) if landmarks[index, 2] > MIN_CONFIDENCE]
     for first, second in zip(jaw, jaw[1:], strict=False):
-        cv2.line(picture, _subpixel(*found[first]), _subpixel(*found[second]), _USED, 1, cv2.LINE_AA, shift=4)
+        cv2.line(image, _subpixel(*detected[first]), _subpixel(*detected[second]), _USED, 1, cv2.LINE_AA, shift=4)
     for index in range(len(landmarks)):
-        used = landmarks[index, 2] > MIN_CONFIDENCE
-        if np.isfinite(solved[index]).all() and used:
-            x, y = solved[index]
+        used, center = landmarks[index, 2] > MIN_CONFIDENCE, _subpixel(*detected[index])
+        if np.isfinite(projected[index]).all() and used:
+            x, y = projected[index]
             for a, b in ((_subpixel(x - 4, y), _subpixel(x + 4, y)), (_subpixel(x, y - 4), _subpixel(x, y + 4))):
-                cv2.line(picture, a, b, _SOLVED, 1, cv2.LINE_AA, shift=4)
-        colour = (_WRONG if wrong[index] else _USED) if used else _UNUSED
-        if wrong[index]:
-            cv2.line(picture, _subpixel(*found[index]), _subpixel(*solved[index]), _WRONG, 1, cv2.LINE_AA, shift=4)
-        cv2.circle(picture, _subpixel(*found[index]), 28, colour, -1 if used else 1, cv2.LINE_AA, shift=4)
+                cv2.line(image, a, b, _TRIANGULATED, 1, cv2.LINE_AA, shift=4)
+        colour = (_OUTLIER if outlier[index] else _USED) if used else _UNUSED
+        if outlier[index]:
+            cv2.line(image, center, _subpixel(*projected[index]), _OUTLIER, 1, cv2.LINE_AA, shift=4)
+        cv2.circle(image, center, 28, colour, -1 if used else 1, cv2.LINE_AA, shift=4)
 
 
 def _subpixel(x: float, y: float) -> tuple[int, int]:
-    """Our pixel coordinates to OpenCV's with 4 fractional bits; far outside is brought near, where nothing shows."""
+    """Convert pixel coordinates to OpenCV's with 4 fractional bits, clipped far outside the image to avoid overflow."""
     return round(float(np.clip(x - 0.5, -1e4, 1e4)) * 16), round(float(np.clip(y - 0.5, -1e4, 1e4)) * 16)

@@ -1,40 +1,31 @@
-"""The native capture folder, read: `capture.toml`, a COLMAP model, and image files beside it (docs/formats.md)."""
+"""Read native capture folders: `capture.toml`, a COLMAP model, and image files (docs/formats.md)."""
 
 import json
-import math
 import re
 import tomllib
-from collections.abc import Callable
 from pathlib import Path, PurePosixPath
 from typing import Any
 
 import numpy as np
-import pycolmap
 from jaxtyping import Float
 
+from registration.capture.colmap import read_cameras
 from registration.capture.headers import require_size
 from registration.errors import InputError
 from registration.types import Camera, Capture, View
 
 _RESERVED = ("subject", "expression", "units", "segmentation")
-_NOT_FINITE = re.compile(r"(?<![\w.])[-+]?(nan|inf(inity)?)(?![\w.])", re.IGNORECASE)
-# COLMAP's parameters -> (fx, fy, cx, cy, OpenCV distortion in the order k1 k2 p1 p2 k3 k4 k5 k6)
-_MODELS: dict[str, Callable[..., tuple[float, ...]]] = {
-    "SIMPLE_PINHOLE": lambda f, cx, cy: (f, f, cx, cy),
-    "PINHOLE": lambda fx, fy, cx, cy: (fx, fy, cx, cy),
-    "SIMPLE_RADIAL": lambda f, cx, cy, k1: (f, f, cx, cy, k1, 0.0, 0.0, 0.0),
-    "RADIAL": lambda f, cx, cy, k1, k2: (f, f, cx, cy, k1, k2, 0.0, 0.0),
-    "OPENCV": lambda *parameters: parameters,
-    "FULL_OPENCV": lambda *parameters: parameters,
-}
 
 
-def read(root: Path) -> Capture:
-    """Read a native capture folder; of images only the headers. Views come in natural order of their names.
+def read_capture(root: Path) -> Capture:
+    """Read a native capture folder; of images only the headers. Views are in natural order of their names.
 
-    Raises InputError for a broken `capture.toml`, COLMAP model or landmark file, an unsupported camera model, a
-    singular or non-finite pose, a missing image, an image of another size than its camera's, and a symbolic link that
-    leads out of the folder: a capture may come from anyone, and must not make us read what is not in it.
+    A capture may come from an untrusted source: symbolic links that lead out of its folder are refused.
+
+    Raises:
+        InputError: `capture.toml`, the COLMAP model or a landmark file is damaged, a camera model is not supported, a
+            pose is singular or not finite, an image is missing or of another size than its camera's, or a link leads
+            out of the folder.
     """
     root = Path(root)
     if not root.is_dir():
@@ -65,90 +56,8 @@ def read(root: Path) -> Capture:
 
 
 def natural_key(name: str) -> list[tuple[int, int, str]]:
-    """Sort key that puts cam2 before cam10."""
+    """Return a sort key that puts cam2 before cam10."""
     return [(0, int(part), "") if part.isdecimal() else (1, 0, part) for part in re.split(r"(\d+)", name) if part]
-
-
-def read_cameras(sparse: Path) -> dict[str, Camera]:
-    """The cameras of a COLMAP model (text or binary) by image name. Raises InputError as `read` does."""
-    if not sparse.is_dir():
-        raise InputError(
-            "The COLMAP model is missing",
-            where=sparse,
-            expected="cameras, images and points3D as .txt or .bin",
-            got="no such folder",
-            fix="store the calibration there; architecture: docs/formats.md",
-        )
-    try:
-        model = pycolmap.Reconstruction(str(sparse))
-    except (ValueError, IndexError, RuntimeError) as error:
-        raise _unreadable_model(sparse, error) from None
-    cameras: dict[str, Camera] = {}
-    for image in sorted(model.images.values(), key=lambda image: image.name):
-        if image.name in cameras:
-            raise InputError(
-                "Two images of the COLMAP model have one name",
-                where=sparse,
-                expected="unique names",
-                got=image.name,
-                fix="rename one of them",
-            )
-        where = f"{sparse}: image {image.name}"
-        cameras[image.name] = _camera(image.camera, _pose(image, where), where)
-    return cameras
-
-
-def _camera(source: pycolmap.Camera, T_cam_world: Float[np.ndarray, "4 4"], where: str) -> Camera:
-    if source.model_name not in _MODELS:
-        raise InputError(
-            "The camera model is not supported",
-            where=where,
-            expected=", ".join(_MODELS),
-            got=source.model_name,
-            fix="undistort the images with COLMAP's image_undistorter, or calibrate with a supported model",
-        )
-    fx, fy, cx, cy, *distortion = _MODELS[source.model_name](*map(float, source.params))
-    if not all(map(math.isfinite, (fx, fy, cx, cy, *distortion))) or fx <= 0 or fy <= 0:
-        raise InputError(
-            "The intrinsics are singular or not finite",
-            where=where,
-            expected="finite numbers, focal lengths > 0",
-            got=source.params_to_string(),
-            fix="calibrate the camera again",
-        )
-    if not (0 < source.width < 2**16 and 0 < source.height < 2**16):
-        raise InputError(
-            "The camera's image size is absurd",
-            where=where,
-            expected="1 to 65535 px a side",
-            got=f"{source.width} x {source.height}",
-            fix="write the image's size into the COLMAP model",
-        )
-    return Camera(
-        width_px=source.width,
-        height_px=source.height,
-        intrinsics=np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]]),
-        T_cam_world=T_cam_world,
-        distortion=tuple(distortion) if any(distortion) else (),
-    )
-
-
-def _pose(image: pycolmap.Image, where: str) -> Float[np.ndarray, "4 4"]:
-    pose = image.cam_from_world() if image.has_pose else None
-    quaternion = np.zeros(4) if pose is None else np.array(pose.rotation.quat)
-    T_cam_world = np.eye(4)
-    if pose is not None:
-        T_cam_world[:3] = pose.matrix()
-    # pycolmap turns a zero quaternion into the identity without a word: only the quaternion itself tells.
-    if not np.isfinite(T_cam_world).all() or not np.linalg.norm(quaternion) > 1e-6:
-        raise InputError(
-            "The pose is singular or not finite",
-            where=where,
-            expected="a unit quaternion and a finite translation",
-            got="no pose" if pose is None else f"quaternion xyzw {quaternion}, translation {pose.translation}",
-            fix="calibrate the camera again, or remove its image from the COLMAP model",
-        )
-    return T_cam_world
 
 
 def _read_view(root: Path, file_name: str, camera: Camera) -> View:
@@ -180,7 +89,7 @@ def _optional(root: Path, path: Path) -> Path | None:
 
 
 def _inside(root: Path, path: Path) -> Path:
-    """The path itself, if it stays within the capture when symbolic links are followed."""
+    """Return the path if it stays within the capture when symbolic links are followed. Raises InputError."""
     if not (target := path.resolve()).is_relative_to(root.resolve()):
         raise InputError(
             "A link leads out of the capture",
@@ -199,7 +108,7 @@ def _check_names(root: Path, views: tuple[View, ...]) -> None:
             raise InputError(
                 "Two images differ in their suffix only",
                 where=root / "images",
-                expected="names that stay unique without it: masks and landmarks are found by them",
+                expected="names that stay unique without it: they also name masks and landmarks",
                 got=f"{first.image.name} and {second.image.name}",
                 fix="rename one of them",
             )
@@ -212,12 +121,19 @@ def _check_names(root: Path, views: tuple[View, ...]) -> None:
                     where=root / "landmarks" / f"{view.name}.json",
                     expected=f'{count} points in scheme "{scheme}", as for {name}',
                     got=f"{len(points)} points",
-                    fix="give every view the whole scheme, with confidence 0 where a point is not seen",
+                    fix="give every view the whole scheme, with confidence 0 where a point is not visible",
                 )
 
 
 def read_landmarks(path: Path) -> dict[str, Float[np.ndarray, "L 3"]]:
-    """Landmark schemes of one view: scheme -> (x_px, y_px, confidence) rows, distorted pixels."""
+    """Read the landmark schemes of one view.
+
+    Returns:
+        Scheme -> rows (x_px, y_px, confidence), in pixels of the distorted image.
+
+    Raises:
+        InputError: the file is malformed.
+    """
 
     def refuse(expected: str, got: object) -> InputError:
         return InputError(
@@ -271,27 +187,3 @@ def _read_settings(path: Path) -> dict[str, Any]:
     if len(set(classes)) != len(classes):
         raise refuse("A segmentation class is named twice", "unique names", ", ".join(classes))
     return settings
-
-
-def _unreadable_model(sparse: Path, error: Exception) -> InputError:
-    """COLMAP's own messages name neither line nor reason, so look for the usual one: a number that is none."""
-    for path in (sparse / "cameras.txt", sparse / "images.txt"):
-        lines = path.read_text("utf-8", "replace").splitlines() if path.is_file() else []
-        for number, line in enumerate(lines, 1):
-            if not line.startswith("#") and _NOT_FINITE.search(line):
-                return InputError(
-                    "The intrinsics are singular or not finite"
-                    if path.stem == "cameras"
-                    else "The pose is singular or not finite",
-                    where=f"{path}, line {number}",
-                    expected="finite numbers",
-                    got=line[:120],
-                    fix="calibrate the camera again, or remove its image from the COLMAP model",
-                )
-    return InputError(
-        "The COLMAP model cannot be read",
-        where=sparse,
-        expected="cameras, images and points3D as .txt or .bin, as COLMAP writes them",
-        got=error,
-        fix="export the model again with COLMAP's model_converter",
-    )

@@ -41,7 +41,7 @@ def read_view(view: View, capture: Capture, *, downsample: int = 1) -> ViewPixel
         )
     strips = list(_strips(camera, downsample))
     valid = _valid(camera, strips)
-    rgb = _resample(read_colour(view.image, camera), _to_linear, strips, valid)
+    rgb = _resample(read_image(view.image, camera), _to_linear, strips, valid)
     mask = None if view.mask is None else _resample(read_mask(view.mask, camera), _to_share, strips, valid)
     normals = (
         None
@@ -83,7 +83,7 @@ def undistort_landmarks(view: View, scheme: str) -> Float[np.ndarray, "L 3"]:
     return landmarks
 
 
-def read_colour(path: Path, camera: Camera) -> np.ndarray:
+def read_image(path: Path, camera: Camera) -> np.ndarray:
     """An image as (H, W, 3) uint8 or uint16 sRGB, still distorted. Gray is repeated, alpha and EXIF turns ignored."""
     pixels = _imread(path, "image", camera, _COLOUR)
     if pixels.dtype not in (np.uint8, np.uint16):

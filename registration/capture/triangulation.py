@@ -128,7 +128,7 @@ def inlier_limit_px(camera: Camera) -> float:
     return INLIER_SHARE * float(np.sqrt(camera.width_px * camera.height_px))
 
 
-def jaw_disorder(points: Float[np.ndarray, "68 3"]) -> list[int]:
+def reversed_jaw_points(points: Float[np.ndarray, "68 3"]) -> list[int]:
     """Jaw points (0 to 16 of the 68 scheme) that do not follow their neighbours around the face.
 
     Seen from the front, the jaw runs from the subject's right ear (0) over the chin (8) to the left ear (16): the

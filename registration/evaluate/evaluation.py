@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float
 
-from registration.capture.native import read
+from registration.capture.native import read_capture
 from registration.capture.scan import Scan, read_scan, read_truth
 from registration.errors import InputError
 from registration.evaluate.console_table import print_figures
@@ -102,12 +102,12 @@ def evaluate_folder(
     Raises:
         InputError: as `evaluate`, or a folder cannot be read.
     """
-    registration, capture = load_registration(registration_dir), read(capture_dir)
+    registration, capture = load_registration(registration_dir), read_capture(capture_dir)
     evaluation = evaluate(
         registration,
         capture,
         neutral=load_registration(neutral_dir) if neutral_dir else None,
-        neutral_capture=read(neutral_capture_dir) if neutral_capture_dir else None,
+        neutral_capture=read_capture(neutral_capture_dir) if neutral_capture_dir else None,
     )
     update_figures(registration_dir, evaluation.figures)
     print_figures(evaluation.figures, title=f"{capture.subject} {capture.expression}: {registration.status}")

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from registration.capture.native import read
+from registration.capture.native import read_capture
 from registration.capture.scan import read_truth
 from registration.model import gnm_npz
 from registration.model.gnm_npz import GNMData
@@ -70,7 +70,7 @@ class Finds:
         self.made: list[Path] = []
 
     def __call__(self, capture: Path, model: Path, out: Path, options: RegisterOptions, **_: object) -> Registration:
-        data, moment = gnm_npz.read(model), read(capture)
+        data, moment = gnm_npz.read(model), read_capture(capture)
         inputs = {"capture": hash_capture(moment), "model": gnm_npz.content_hash(data)}
         config = {"recipe": options.recipe, "views": options.views, "seed": options.seed}
         if (same := find_existing(out, input_hash(inputs, config))) is not None:

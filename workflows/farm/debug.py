@@ -88,11 +88,11 @@ def _register(arguments: Mapping[str, Any], out: Path, progress: Progress, port:
 
 
 def _page(stages: Path, capture: Path, model: Path, port: int, progress: Progress) -> "FitPage":
-    from registration.capture.native import read
+    from registration.capture.native import read_capture
     from registration.model import gnm_npz, regions
     from workflows.web.fit_page import FitPage
 
-    page = FitPage(stages, read(capture), regions.exterior(gnm_npz.read(model)), port)
+    page = FitPage(stages, read_capture(capture), regions.exterior(gnm_npz.read(model)), port)
     progress.note(f"open {page.url} in a browser")
     return page
 

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from coregister.evaluate.evaluation import NEUTRAL, HeldOutSubject
-from registration.capture.native import natural_key, read
+from registration.capture.native import natural_key, read_capture
 from registration.capture.scan import read_scan
 from registration.errors import InputError
 from registration.evaluate.evaluation import CLOUD_TOLERANCE
@@ -60,7 +60,7 @@ def read_held_out(source: Path, captures: Path | None = None) -> HeldOutSet:
         if captures is not None:
             folder = Path(captures) / file.parent.name
             one = _with_captures(one, folder, registration, name)
-            inputs[f"capture {one.subject}"] = hash_capture(read(folder / name))
+            inputs[f"capture {one.subject}"] = hash_capture(read_capture(folder / name))
         subjects.append(one)
         topologies.append(registration.triangles)
     if other := [s.subject for s, t in zip(subjects, topologies, strict=True) if not np.array_equal(t, topologies[0])]:
@@ -151,10 +151,10 @@ def _stabilized(folder: Path) -> dict[str, dict[str, Any]]:
 
 def _with_captures(one: HeldOutSubject, folder: Path, registration: Registration, neutral: str) -> HeldOutSubject:
     """Tags and scan of the neutral's capture, and the categories of expressions whose captures tell one."""
-    capture = read(folder / neutral)
+    capture = read_capture(folder / neutral)
     told = {}
     for place in sorted(path.parent for path in folder.glob("*/capture.toml")):
-        other = read(place)
+        other = read_capture(place)
         told[other.expression] = str(other.tags.get(_CATEGORY, other.expression))
     scan: Float[np.ndarray, "P 3"] | None = None
     if capture.scan is not None:

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any, Literal
 
-from registration.capture.native import natural_key, read
+from registration.capture.native import natural_key, read_capture
 from registration.errors import InputError
 from registration.storage.files import atomic_write_text, read_json_of_kind
 from registration.storage.hashing import to_jsonable
@@ -80,7 +80,7 @@ def read_captures(folder: Path, neutral: str | None = None) -> Captures:
     broken: dict[str, InputError] = {}
     for path in _capture_folders(folder):
         try:
-            captures[path.name] = read(path)
+            captures[path.name] = read_capture(path)
         except InputError as error:
             broken[path.name] = error
     if neutral in broken:

@@ -3,7 +3,7 @@
 from pathlib import Path
 from typing import Any
 
-from registration.capture.native import read
+from registration.capture.native import read_capture
 from registration.fit.recipes import named_recipe
 from registration.inputs import input_hash, read_schemes
 from registration.model import gnm_npz
@@ -44,7 +44,7 @@ def register_stored(
     data = gnm_npz.read(file)
     schemes = read_schemes(file, data, options.landmark_files)
     with fetch_capture(capture) as folder:
-        wanted = input_hash(read(folder), data, schemes, None, options)
+        wanted = input_hash(read_capture(folder), data, schemes, None, options)
 
         def make(attempt: Path) -> dict[str, Any]:
             result = register(folder, file, attempt / REGISTRATION, options, progress=progress)

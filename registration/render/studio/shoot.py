@@ -14,7 +14,7 @@ import mitsuba as mi
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
-from registration.capture.native_writer import PlainView
+from registration.capture.native_writer import ViewArrays
 from registration.render.studio.light import Sky, bake
 from registration.render.studio.scene import Hit, StudioScene, StudioSurface, subdivided
 from registration.types import Camera
@@ -54,7 +54,7 @@ def shoot(
     landmarks: Mapping[str, Float[np.ndarray, "L 3"]] | None = None,
     background: tuple[float, float, float] = (0.2, 0.2, 0.2),
     seed: int = 0,
-) -> list[PlainView]:
+) -> list[ViewArrays]:
     """Pictures, masks, normals, labels and landmarks of every camera, in their distorted pixels; `cam00`, `cam01` ...
 
     RGB is linear; the mask is the surfaces' share of a pixel; normals (camera frame) and labels (1 + class, 0 for the
@@ -71,7 +71,7 @@ def shoot(
         rng = np.random.default_rng([seed, 3, number])
         picture = _draw(scene, light, camera, background, quality.pixel_samples, seed * len(cameras) + number)
         views.append(
-            PlainView(
+            ViewArrays(
                 name=f"cam{number:02d}",
                 camera=camera,
                 rgb=_expose(picture.rgb, sensor, rng),

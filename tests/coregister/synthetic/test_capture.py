@@ -12,8 +12,8 @@ from scipy.spatial.transform import Rotation
 from coregister.synthetic import capture as synth
 from coregister.synthetic.capture import LABELS, Studio, write_capture
 from registration.capture import native, triangulation
-from registration.capture.doctor import check
-from registration.capture.pixels import read_colour, read_labels, read_mask, read_normals
+from registration.capture.doctor import check_capture
+from registration.capture.pixels import read_image, read_labels, read_mask, read_normals
 from registration.capture.scan import read_scan, read_truth
 from registration.errors import InputError
 from registration.geometry.closest_point import closest_points
@@ -64,12 +64,13 @@ def make(root: Path, studio: Studio) -> Path:
 
 @pytest.fixture(scope="module", params=[False, True], ids=["pinhole", "lens"])
 def capture(request, tmp_path_factory):
-    return native.read(make(tmp_path_factory.mktemp("synth") / "tiny", replace(SMALL, distortion=request.param)))
+    root = make(tmp_path_factory.mktemp("synth") / "tiny", replace(SMALL, distortion=request.param))
+    return native.read_capture(root)
 
 
 @pytest.fixture(scope="module")
 def worn(tmp_path_factory):
-    return native.read(make(tmp_path_factory.mktemp("synth") / "worn", WORN))
+    return native.read_capture(make(tmp_path_factory.mktemp("synth") / "worn", WORN))
 
 
 def pixels_of(camera, points: np.ndarray) -> np.ndarray:
@@ -88,7 +89,7 @@ def at(image: np.ndarray, xy: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def test_the_doctor_finds_nothing(capture) -> None:
-    report = check(capture.root)
+    report = check_capture(capture.root)
     assert report.warnings == ()
     assert (capture.subject, capture.expression, capture.tags["age"]) == ("tiny", "smile", 30)
     assert capture.classes == LABELS and len(capture.views) == SMALL.cameras
@@ -97,7 +98,7 @@ def test_the_doctor_finds_nothing(capture) -> None:
 
 
 def test_a_worn_capture_passes_too(worn) -> None:
-    assert check(worn.root).warnings == ()
+    assert check_capture(worn.root).warnings == ()
 
 
 def test_the_scan_lies_in_the_masks(capture) -> None:
@@ -239,8 +240,8 @@ def test_one_studio_makes_one_capture(tmp_path) -> None:
 
 
 def test_sixteen_bits(tmp_path) -> None:
-    capture = native.read(make(tmp_path / "deep", replace(SMALL, cameras=2, size_px=(48, 64), bits=16)))
-    assert read_colour(capture.views[0].image, capture.views[0].camera).dtype == np.uint16
+    capture = native.read_capture(make(tmp_path / "deep", replace(SMALL, cameras=2, size_px=(48, 64), bits=16)))
+    assert read_image(capture.views[0].image, capture.views[0].camera).dtype == np.uint16
 
 
 @pytest.mark.parametrize(

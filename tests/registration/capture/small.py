@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float
 
-from registration.capture.native_writer import PlainView, write
+from registration.capture.native_writer import CaptureDescription, ViewArrays, write_capture
 from registration.capture.scan import Scan
 from registration.types import Camera
 
@@ -62,7 +62,7 @@ def distorted(cam: Camera, points: Float[np.ndarray, "P 3"]) -> Float[np.ndarray
     return cv2.projectPoints(points, rotation, cam.T_cam_world[:3, 3], cam.intrinsics, coefficients)[0][:, 0]
 
 
-def picture(name: str, cam: Camera) -> PlainView:
+def picture(name: str, cam: Camera) -> ViewArrays:
     """What the camera sees, distortion included; landmarks on the far side have confidence 0.2."""
     y, x = np.mgrid[: cam.height_px, : cam.width_px] + 0.5
     grid = np.stack([x, y], -1).reshape(-1, 1, 2)
@@ -83,7 +83,7 @@ def picture(name: str, cam: Camera) -> PlainView:
     points = landmarks_68()
     facing = ((cam.centre - points) * points).sum(-1) > 0
     landmarks = np.column_stack([distorted(cam, points), np.where(facing, 1.0, 0.2)])
-    return PlainView(
+    return ViewArrays(
         name=name,
         camera=cam,
         rgb=rgb.reshape(*shape, 3),
@@ -102,6 +102,11 @@ def ball(scale: float = 1.0) -> Scan:
     return Scan(vertices=np.array(mesh.vertices), triangles=np.array(mesh.faces, np.int64))
 
 
+def data_lines(path: Path) -> list[str]:
+    """The lines of a file of a COLMAP text model, without comments."""
+    return [line for line in path.read_text().splitlines() if not line.startswith("#")]
+
+
 TURNS = (-1.0, -0.4, 0.1, 0.5, 1.1)
 
 
@@ -109,13 +114,15 @@ def make(root: Path, *, distortion: tuple[float, ...] = (), drop: tuple[str, ...
     """Write a capture of five views, cam0 to cam4; `drop` names optional parts of the views to leave out."""
     views = [picture(f"cam{i}", camera(turn, distortion=distortion)) for i, turn in enumerate(TURNS)]
     views = [replace(view, **{part: {} if part == "landmarks" else None for part in drop}) for view in views]
-    return write(
+    return write_capture(
         root,
         views,
-        subject="ball",
-        expression="neutral",
-        classes=CLASSES,
-        tags={"age": 30, "notes": 'with "quotes"', "lists": [1.5, 2.5], "real": False},
+        CaptureDescription(
+            subject="ball",
+            expression="neutral",
+            classes=CLASSES,
+            tags={"age": 30, "notes": 'with "quotes"', "lists": [1.5, 2.5], "real": False},
+        ),
         points=landmarks_68(),
         scan=ball(),
         truth=landmarks_68(),

@@ -13,9 +13,9 @@ import pycolmap
 import pytest
 from PIL import Image
 
-from registration.capture.doctor import check
+from registration.capture.doctor import check_capture
 from registration.errors import InputError
-from tests.registration.capture.small import make
+from tests.registration.capture.small import data_lines, make
 
 Spoil = Callable[[Path], None]
 BAD: dict[str, tuple[Spoil, str, str, str, str]] = {}  # name -> how to spoil, what, where (its end), got, fix
@@ -98,8 +98,8 @@ def to_binary(root: Path) -> None:
 @bad("The camera model is not supported", where="image cam3.png", got="OPENCV_FISHEYE", fix="image_undistorter")
 def fisheye(root: Path) -> None:
     path = root / "sparse" / "cameras.txt"
-    lines = path.read_text().splitlines()
-    lines[4] = lines[4].replace("PINHOLE", "OPENCV_FISHEYE") + " 0.1 0.1 0.1 0.1"
+    lines = data_lines(path)
+    lines[3] = lines[3].replace("PINHOLE", "OPENCV_FISHEYE") + " 0.1 0.1 0.1 0.1"
     path.write_text("\n".join(lines))
 
 
@@ -108,7 +108,7 @@ def zero_quaternion(root: Path) -> None:
     replace_pose(root, "0 0 0 0 0 0 0.45")
 
 
-@bad("The pose is singular or not finite", where="images.txt, line 2", got="nan", fix="calibrate")
+@bad("The pose is singular or not finite", where="images.txt, line 1", got="nan", fix="calibrate")
 def pose_not_finite(root: Path) -> None:
     replace_pose(root, "1 0 0 0 0 nan 0.45")
 
@@ -125,23 +125,23 @@ def pose_not_finite_in_a_binary_model(root: Path) -> None:
 
 def replace_pose(root: Path, pose: str) -> None:
     path = root / "sparse" / "images.txt"
-    lines = path.read_text().splitlines()
-    lines[1] = f"1 {pose} 1 cam0.png"
+    lines = data_lines(path)
+    lines[0] = f"1 {pose} 1 cam0.png"
     path.write_text("\n".join(lines))
 
 
 @bad("The intrinsics are singular or not finite", where="image cam0.png", got="0", fix="calibrate")
 def no_focal_length(root: Path) -> None:
     path = root / "sparse" / "cameras.txt"
-    path.write_text(path.read_text().replace("120 160 240.0", "120 160 0.0"))
+    path.write_text(path.read_text().replace("120 160 240 ", "120 160 0 "))
 
 
-@bad("The intrinsics are singular or not finite", where="cameras.txt, line 2", got="nan", fix="calibrate")
+@bad("The intrinsics are singular or not finite", where="cameras.txt, line 4", got="nan", fix="calibrate")
 def intrinsics_not_finite(root: Path) -> None:
-    edit(root / "sparse" / "cameras.txt", "120 160 240.0", "120 160 nan", 1)
+    edit(root / "sparse" / "cameras.txt", "120 160 240 ", "120 160 nan ", 1)
 
 
-@bad("eye corners are too near or too far", where="sparse", got="90 m", fix="0.001")
+@bad("eye corners are too close or too far", where="sparse", got="90 m", fix="0.001")
 def model_in_millimetres(root: Path) -> None:
     path = root / "sparse" / "images.txt"
     lines = path.read_text().splitlines()
@@ -156,7 +156,7 @@ def model_in_millimetres(root: Path) -> None:
 @bad("There are too few views", where="capture", got="1", fix="add calibrated images")
 def one_view(root: Path) -> None:
     path = root / "sparse" / "images.txt"
-    path.write_text("\n".join(path.read_text().splitlines()[:2]) + "\n\n")
+    path.write_text(data_lines(path)[0] + "\n\n")
 
 
 @bad("The image is missing", where="images/cam2.png", got="no such file", fix="add the file")
@@ -329,7 +329,7 @@ def test_bad_input(good: Path, tmp_path: Path, name: str) -> None:
     spoil(root)
     before = state(tmp_path)
     with pytest.raises(InputError) as caught:
-        check(root, sheet=tmp_path / "sheet.png")
+        check_capture(root, sheet=tmp_path / "sheet.png")
     error = caught.value
     assert what in error.what and got in error.got and fix in error.fix
     assert error.where.endswith(where) and str(root) in error.where

@@ -10,9 +10,10 @@ import numpy as np
 import pytest
 
 from registration.capture import native
-from registration.capture.degrade import PRESETS, Preset, spoil
-from registration.capture.doctor import check
-from registration.capture.native_writer import write
+from registration.capture.degradation import PRESETS, DegradationPreset
+from registration.capture.degrade import degrade
+from registration.capture.doctor import check_capture
+from registration.capture.native_writer import CaptureDescription, write_capture
 from registration.capture.scan import read_scan
 from registration.errors import InputError
 from registration.types import Capture, View
@@ -39,23 +40,24 @@ def source(tmp_path_factory: pytest.TempPathFactory) -> Path:
     root = tmp_path_factory.mktemp("source") / "capture"
     tags = {"age": 30, "notes": 'with "quotes"'}
     scan, truth = ball(), landmarks_68()
-    write(root, views, subject="ball", expression="e", classes=CLASSES, tags=tags, points=truth, scan=scan, truth=truth)
+    description = CaptureDescription(subject="ball", expression="e", classes=CLASSES, tags=tags)
+    write_capture(root, views, description, points=truth, scan=scan, truth=truth)
     return root
 
 
 @pytest.fixture(scope="module", params=["studio", "harsh"])
 def spoiled(request: pytest.FixtureRequest, source: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return spoil(source, tmp_path_factory.mktemp(request.param) / "capture", preset=PRESETS[request.param], seed=5)
+    return degrade(source, tmp_path_factory.mktemp(request.param) / "capture", preset=PRESETS[request.param], seed=5)
 
 
 def amount(root: Path) -> int:
     """How many times the figures of "studio" the copy should have."""
-    return 2 if "preset harsh" in native.read(root).tags["spoiled"] else 1
+    return 2 if "preset harsh" in native.read_capture(root).tags["spoiled"] else 1
 
 
 def pairs(source: Path, target: Path) -> list[tuple[View, View]]:
-    before = {view.name: view for view in native.read(source).views}
-    return [(before[view.name], view) for view in native.read(target).views]
+    before = {view.name: view for view in native.read_capture(source).views}
+    return [(before[view.name], view) for view in native.read_capture(target).views]
 
 
 def load(path: Path | None) -> np.ndarray:
@@ -112,7 +114,7 @@ def test_cameras_are_off_by_what_the_preset_says(source: Path, spoiled: Path) ->
 def test_landmarks_tell_where_the_subject_is_without_a_scan(tmp_path: Path) -> None:
     bare = make(tmp_path / "bare")
     (bare / "scan.ply").unlink()
-    spoil(bare, tmp_path / "out", preset=Preset(name="cameras", camera_rms_px=1.0))
+    degrade(bare, tmp_path / "out", preset=DegradationPreset(name="cameras", camera_rms_px=1.0))
     for before, after in pairs(bare, tmp_path / "out"):
         moved = after.camera.project(landmarks_68())[0] - before.camera.project(landmarks_68())[0]
         assert np.sqrt((moved**2).sum(-1).mean()) == pytest.approx(1.0, rel=0.02)
@@ -217,15 +219,15 @@ def test_light_has_another_gain_and_noise(source: Path, spoiled: Path) -> None:
 
 
 def test_views_are_dropped_whole(source: Path, spoiled: Path) -> None:
-    kept = {view.name for view in native.read(spoiled).views}
-    all_names = {view.name for view in native.read(source).views}
+    kept = {view.name for view in native.read_capture(spoiled).views}
+    all_names = {view.name for view in native.read_capture(source).views}
     assert kept < all_names and len(kept) == len(all_names) - (1 if amount(spoiled) == 1 else 3)
     normals = {str(path.relative_to(spoiled / "normals").with_suffix("")) for path in spoiled.glob("normals/**/*.png")}
     for folder in FOLDERS:
         names = {str(path.relative_to(spoiled / folder).with_suffix("")) for path in (spoiled / folder).rglob("*.*")}
         assert names == (normals if folder == "normals" else kept)
     assert len(kept) - len(normals) == (0 if amount(spoiled) == 1 else 1)
-    told = native.read(spoiled).tags["spoiled"]
+    told = native.read_capture(spoiled).tags["spoiled"]
     assert all(name in told for name in all_names - kept)
 
 
@@ -236,7 +238,7 @@ def test_the_truth_and_the_tags_stay_and_the_copy_is_sound(source: Path, spoiled
     settings = tomllib.loads(new["capture.toml"].decode())
     assert settings.pop("spoiled").startswith("preset ")
     assert settings == tomllib.loads(old["capture.toml"].decode())
-    report = check(spoiled)
+    report = check_capture(spoiled)
     assert report.eye_distance_mm == pytest.approx(90, abs=4)
     assert [path.name for path in spoiled.parent.iterdir()] == ["capture"]
 
@@ -244,7 +246,7 @@ def test_the_truth_and_the_tags_stay_and_the_copy_is_sound(source: Path, spoiled
 @pytest.mark.parametrize("bits", [8, 16])
 def test_none_changes_nothing(bits: int, tmp_path: Path) -> None:
     source = make(tmp_path / "source", distortion=DISTORTIONS["FULL_OPENCV"], bits=bits)
-    spoil(source, tmp_path / "copy", preset=PRESETS["none"], seed=3)
+    degrade(source, tmp_path / "copy", preset=PRESETS["none"], seed=3)
     found = pairs(source, tmp_path / "copy")
     assert len(found) == 5
     for before, after in found:
@@ -265,7 +267,7 @@ def test_none_changes_nothing(bits: int, tmp_path: Path) -> None:
 
 def test_deep_images_stay_deep(tmp_path: Path) -> None:
     source = make(tmp_path / "source", bits=16)
-    spoil(source, tmp_path / "copy", preset=PRESETS["studio"])
+    degrade(source, tmp_path / "copy", preset=PRESETS["studio"])
     for before, after in pairs(source, tmp_path / "copy"):
         new = load(after.image)
         assert new.dtype == np.uint16 and (new % 257 != 0).any()
@@ -275,7 +277,7 @@ def test_deep_images_stay_deep(tmp_path: Path) -> None:
 def test_one_seed_is_one_copy(tmp_path: Path) -> None:
     source = make(tmp_path / "source")
     copies = [
-        files(spoil(source, tmp_path / f"copy{i}", preset=PRESETS["studio"], seed=seed))
+        files(degrade(source, tmp_path / f"copy{i}", preset=PRESETS["studio"], seed=seed))
         for i, seed in enumerate((7, 7, 8))
     ]
     assert copies[0] == copies[1]
@@ -288,11 +290,13 @@ def test_a_view_can_be_broken(tmp_path: Path) -> None:
     source = make(tmp_path / "source")
     ramp = np.arange(100, 220, dtype=np.uint8)[:, None]  # over the image's width; beyond 167 it will be clipped
     cv2.imwrite(str(source / "images" / "cam2.png"), np.tile(ramp, (160, 1, 3)))
-    breaks = {"cam0": ["shifted"], "cam1": ["black"], "cam2": ["exposure"], "cam3": ["black", "shifted"]}
-    spoil(source, tmp_path / "copy", preset=PRESETS["none"], breaks=breaks)
-    found = dict(zip((view.name for view in native.read(source).views), pairs(source, tmp_path / "copy"), strict=True))
+    faults = {"cam0": ["shifted"], "cam1": ["black"], "cam2": ["exposure"], "cam3": ["black", "shifted"]}
+    degrade(source, tmp_path / "copy", preset=PRESETS["none"], faults=faults)
+    found = dict(
+        zip((view.name for view in native.read_capture(source).views), pairs(source, tmp_path / "copy"), strict=True)
+    )
     for name, (before, after) in found.items():
-        shift = 30 if "shifted" in breaks.get(name, []) else 0
+        shift = 30 if "shifted" in faults.get(name, []) else 0
         np.testing.assert_allclose(after.landmarks["68"], before.landmarks["68"] + [shift, 0, 0], atol=1e-9)
         np.testing.assert_allclose(after.camera.T_cam_world, before.camera.T_cam_world, rtol=0, atol=1e-14)
         for old, new in (
@@ -315,57 +319,57 @@ def test_a_view_can_be_broken(tmp_path: Path) -> None:
 def test_a_broken_view_stays_and_leaves_the_others_alone(tmp_path: Path) -> None:
     source = make(tmp_path / "source")
     names = [f"cam{i}" for i in range(5)]
-    plain = files(spoil(source, tmp_path / "plain", preset=PRESETS["studio"], seed=2))
+    plain = files(degrade(source, tmp_path / "plain", preset=PRESETS["studio"], seed=2))
     dropped = next(name for name in names if f"images/{name}.png" not in plain)
     first = next(name for name in names if name != dropped)
     broken = files(
-        spoil(source, tmp_path / "broken", preset=PRESETS["studio"], seed=2, breaks={first: ["exposure", "shifted"]})
+        degrade(source, tmp_path / "broken", preset=PRESETS["studio"], seed=2, faults={first: ["exposure", "shifted"]})
     )
     changed = {name for name in plain if plain[name] != broken.get(name)}
     assert changed == {"capture.toml", *(f"{folder}/{first}.png" for folder in FOLDERS[:4]), f"landmarks/{first}.json"}
-    other = files(spoil(source, tmp_path / "other", preset=PRESETS["studio"], seed=2, breaks={dropped: ["black"]}))
+    other = files(degrade(source, tmp_path / "other", preset=PRESETS["studio"], seed=2, faults={dropped: ["black"]}))
     assert f"images/{dropped}.png" in other
     assert sum(f"images/{name}.png" in other for name in names) == 4
 
 
 @pytest.mark.parametrize(
-    "options, what, told",
+    "options, what, got",
     [
-        ({"breaks": {"cam9": ["black"]}}, "no such view", "cam9"),
-        ({"breaks": {"cam1": ["black", "bent"]}}, "cannot be broken like this", "bent"),
-        ({"preset": Preset(name="few", dropped_views=4)}, "Too few views", "5 views"),
+        ({"faults": {"cam9": ["black"]}}, "no such view", "cam9"),
+        ({"faults": {"cam1": ["black", "bent"]}}, "no such fault", "bent"),
+        ({"preset": DegradationPreset(name="few", dropped_views=4)}, "Too few views", "5 views"),
         (
-            {"preset": PRESETS["harsh"], "breaks": dict.fromkeys(("cam0", "cam1", "cam2"), ["black"])},
+            {"preset": PRESETS["harsh"], "faults": dict.fromkeys(("cam0", "cam1", "cam2"), ["black"])},
             "Too few views",
-            "3 of them to be broken",
+            "3 of them with faults",
         ),
         ({"seed": -1}, "seed is out of range", "-1"),
     ],
 )
-def test_bad_wishes_are_told_before_anything_is_written(options: dict, what: str, told: str, tmp_path: Path) -> None:
+def test_bad_wishes_are_told_before_anything_is_written(options: dict, what: str, got: str, tmp_path: Path) -> None:
     source = make(tmp_path / "source")
     with pytest.raises(InputError) as error:
-        spoil(source, tmp_path / "out" / "copy", **{"preset": PRESETS["studio"], **options})
-    assert what in error.value.what and told in str(error.value)
+        degrade(source, tmp_path / "out" / "copy", **{"preset": PRESETS["studio"], **options})
+    assert what in error.value.what and got in str(error.value)
     assert list(tmp_path.iterdir()) == [source]
 
 
 def test_bad_captures_are_told_before_anything_is_written(tmp_path: Path) -> None:
     source = make(tmp_path / "source")
-    copy = spoil(source, tmp_path / "copy", preset=PRESETS["studio"])
+    copy = degrade(source, tmp_path / "copy", preset=PRESETS["studio"])
     before = files(tmp_path)
 
     def refused(root: Path, target: str, what: str) -> None:
         with pytest.raises(InputError, match=what):
-            spoil(root, tmp_path / target, preset=PRESETS["studio"])
+            degrade(root, tmp_path / target, preset=PRESETS["studio"])
 
     refused(source, "copy", "exists already")
-    refused(copy, "again", "is a spoiled one")
+    refused(copy, "again", "degraded already")
     refused(tmp_path / "nowhere", "again", "capture folder is missing")
     assert files(tmp_path) == before
     shutil.rmtree(source / "landmarks")
     (source / "scan.ply").unlink()
-    refused(source, "again", "where the subject is")
+    refused(source, "again", "position of the subject is unknown")
     cv2.imwrite(str(source / "masks" / "cam2.png"), np.zeros((160, 120), np.uint8))
     refused(source, "again", "mask is empty")
     assert not (tmp_path / "again").exists()
@@ -377,10 +381,10 @@ def test_bad_captures_are_told_before_anything_is_written(tmp_path: Path) -> Non
 @pytest.mark.parametrize("preset", ["studio", "harsh"])
 def test_spoiled_heads_are_sound_captures(name: str, preset: str, tmp_path: Path) -> None:
     source = SHARED / "data" / "captures" / name
-    report = check(spoil(source, tmp_path / "copy", preset=PRESETS[preset], seed=1))
+    report = check_capture(degrade(source, tmp_path / "copy", preset=PRESETS[preset], seed=1))
     capture: Capture = report.capture
     assert len(capture.views) == 22 - PRESETS[preset].dropped_views
-    assert report.eye_distance_mm == pytest.approx(check(source).eye_distance_mm, abs=5)
+    assert report.eye_distance_mm == pytest.approx(check_capture(source).eye_distance_mm, abs=5)
     points = read_scan(source / "scan.ply").vertices
     for before, after in pairs(source, tmp_path / "copy"):
         moved = after.camera.project(points)[0] - before.camera.project(points)[0]

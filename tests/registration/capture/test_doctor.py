@@ -10,19 +10,30 @@ import pytest
 
 from registration.capture import native
 from registration.capture.contact_sheet import CAPTION_PX, TILE_WIDTH_PX
-from registration.capture.doctor import NO_TOPOLOGY, check, validate
-from registration.capture.native_writer import write
+from registration.capture.doctor import NO_TOPOLOGY, check_capture
+from registration.capture.native_writer import CaptureDescription, write_capture
 from registration.capture.scan import Scan
+from registration.capture.validation import validate_capture
 from registration.errors import InputError
 from registration.storage.mesh import write_ply
 from tests.conftest import SHARED, needs_shared
-from tests.registration.capture.small import CLASSES, DISTORTIONS, TURNS, ball, camera, landmarks_68, make, picture
+from tests.registration.capture.small import (
+    CLASSES,
+    DISTORTIONS,
+    TURNS,
+    ball,
+    camera,
+    data_lines,
+    landmarks_68,
+    make,
+    picture,
+)
 
 GREEN, MAGENTA, RED, YELLOW, BLUE = (70, 255, 90), (255, 90, 220), (255, 50, 40), (255, 210, 60), (60, 200, 255)
 
 
 def test_the_report_of_a_good_capture(tmp_path: Path) -> None:
-    report = check(make(tmp_path / "capture", distortion=DISTORTIONS["OPENCV"]))
+    report = check_capture(make(tmp_path / "capture", distortion=DISTORTIONS["OPENCV"]))
     assert report.warnings == ()
     assert report.schemes == {"68": (68, 68)}
     assert report.eye_distance_mm == pytest.approx(90, abs=1e-6)
@@ -51,7 +62,7 @@ def test_the_report_says_when_the_topology_of_the_scan_is_not_checked(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setitem(sys.modules, "pymeshlab", None)
-    assert f"scan's topology: {NO_TOPOLOGY}" in str(check(make(tmp_path / "capture")))
+    assert f"scan's topology: {NO_TOPOLOGY}" in str(check_capture(make(tmp_path / "capture")))
 
 
 def spoil_landmarks(root: Path, name: str, change: Callable[[np.ndarray], None]) -> None:
@@ -67,8 +78,8 @@ def test_landmarks_that_other_views_contradict_are_named(tmp_path: Path) -> None
 
     root = make(tmp_path / "capture")
     spoil_landmarks(root, "cam2", move)
-    report = check(root)
-    assert report.warnings == ("cam2: landmarks that other views contradict: 36, 37",)
+    report = check_capture(root)
+    assert report.warnings == ("cam2: landmarks that contradict the other views: 36, 37",)
     assert [view.outliers for view in report.views] == [(), (), (36, 37), (), ()]
     assert report.eye_distance_mm == pytest.approx(90, abs=1e-6)
 
@@ -80,7 +91,7 @@ def test_a_jaw_in_the_wrong_order_is_told(tmp_path: Path) -> None:
     root = make(tmp_path / "capture")
     for number in range(len(TURNS)):
         spoil_landmarks(root, f"cam{number}", turn)
-    assert [warning for warning in check(root).warnings if "2, 3, 4, 5, 6 go backwards" in warning]
+    assert [warning for warning in check_capture(root).warnings if "2, 3, 4, 5, 6 go backwards" in warning]
 
 
 def test_landmarks_seen_once_are_told(tmp_path: Path) -> None:
@@ -90,16 +101,16 @@ def test_landmarks_seen_once_are_told(tmp_path: Path) -> None:
     root = make(tmp_path / "capture")
     for number in range(1, len(TURNS)):
         spoil_landmarks(root, f"cam{number}", hide)
-    report = check(root)
+    report = check_capture(root)
     assert report.schemes == {"68": (68, 66)} and report.eye_distance_mm is None
-    assert report.warnings == ("landmarks 68: no two views agree on 45, 50",)
+    assert report.warnings == ("landmarks 68: not triangulated, no two views agree: 45, 50",)
 
 
 def test_missing_parts_are_told(tmp_path: Path) -> None:
     root = make(tmp_path / "capture", drop=("normals", "landmarks"))
     (root / "masks" / "cam1.png").unlink()
     (root / "scan.ply").unlink()
-    report = check(root, sheet=tmp_path / "sheet.png")
+    report = check_capture(root, sheet=tmp_path / "sheet.png")
     assert report.warnings == (
         "1 of 5 views without a mask: cam1",
         "5 of 5 views without normals: cam0, cam1, cam2, cam3, cam4",
@@ -115,8 +126,10 @@ def test_several_schemes_of_several_lengths(tmp_path: Path) -> None:
     for number, turn in enumerate(TURNS):
         view = picture(f"cam{number}", camera(turn))
         views.append(replace(view, landmarks={"5": view.landmarks["68"][:5], **view.landmarks}))
-    root = write(tmp_path / "capture", views, subject="s", expression="e", classes=CLASSES, scan=ball())
-    report = check(root)
+    root = write_capture(
+        tmp_path / "capture", views, CaptureDescription(subject="s", expression="e", classes=CLASSES), scan=ball()
+    )
+    report = check_capture(root)
     assert report.schemes == {"5": (5, 5), "68": (68, 68)} and report.eye_distance_mm == pytest.approx(90)
 
 
@@ -124,18 +137,19 @@ def test_several_schemes_of_several_lengths(tmp_path: Path) -> None:
 def test_a_scan_in_other_units_is_told(tmp_path: Path, scale: float) -> None:
     root = make(tmp_path / "capture")
     write_ply(root / "scan.ply", ball(scale).vertices, ball().triangles)
-    (warning,) = check(root).warnings
-    assert "another frame or unit" in warning
+    (warning,) = check_capture(root).warnings
+    assert "check its frame and unit" in warning
 
 
 def test_distortion_that_folds_is_told(tmp_path: Path) -> None:
     root = make(tmp_path / "capture")
     path = root / "sparse" / "cameras.txt"
-    lines = path.read_text().splitlines()
-    words = lines[2].split()
-    lines[2] = " ".join([words[0], "OPENCV", *words[2:], "-6 0 0 0"])
+    lines = data_lines(path)
+    words = lines[1].split()
+    lines[1] = " ".join([words[0], "OPENCV", *words[2:], "-6 0 0 0"])
     path.write_text("\n".join(lines) + "\n")
-    assert "cam1: the distortion folds the image over itself; are its coefficients right?" in check(root).warnings
+    warning = "cam1: the distortion folds the image over itself; check its coefficients"
+    assert warning in check_capture(root).warnings
 
 
 def test_cheap_checks_of_all_views_come_before_any_decoding(tmp_path: Path) -> None:
@@ -143,18 +157,18 @@ def test_cheap_checks_of_all_views_come_before_any_decoding(tmp_path: Path) -> N
     cv2.imwrite(str(root / "masks" / "cam0.png"), np.zeros((160, 120), np.uint8))
     (root / "images" / "cam4.png").write_bytes((root / "images" / "cam4.png").read_bytes()[:-20])
     with pytest.raises(InputError, match="The image is truncated"):
-        check(root)
+        check_capture(root)
 
 
 def test_png_files_with_bytes_behind_their_end_are_whole(tmp_path: Path) -> None:
     root = make(tmp_path / "capture")
     for path in (root / "images").iterdir():
         path.write_bytes(path.read_bytes() + b"appended by a camera")
-    assert check(root).warnings == ()
+    assert check_capture(root).warnings == ()
 
 
 def test_captures_from_other_readers_are_checked_too(tmp_path: Path) -> None:
-    capture = native.read(make(tmp_path / "capture"))
+    capture = native.read_capture(make(tmp_path / "capture"))
     first = capture.views[0]
     for name, value, what in (
         ("T_cam_world", np.diag([1.0, 1.0, 0.0, 1.0]), "The pose is singular"),
@@ -165,7 +179,7 @@ def test_captures_from_other_readers_are_checked_too(tmp_path: Path) -> None:
     ):
         broken = replace(first, camera=replace(first.camera, **{name: value}))
         with pytest.raises(InputError, match=what):
-            validate(replace(capture, views=(broken, *capture.views[1:])))
+            validate_capture(replace(capture, views=(broken, *capture.views[1:])))
 
 
 def near(pixels: np.ndarray, x: float, y: float, colour: tuple[int, int, int], reach_px: int = 2) -> bool:
@@ -183,7 +197,7 @@ def test_the_sheet_shows_everything_where_it_is(tmp_path: Path) -> None:
 
     root = make(tmp_path / "capture", distortion=DISTORTIONS["OPENCV"])
     spoil_landmarks(root, "cam0", move)
-    report = check(root, sheet=tmp_path / "new" / "sheet.png")
+    report = check_capture(root, sheet=tmp_path / "new" / "sheet.png")
     assert list((tmp_path / "new").iterdir()) == [tmp_path / "new" / "sheet.png"] and report.sheet is not None
     sheet = cv2.imread(str(report.sheet))[..., ::-1]
     height = round(TILE_WIDTH_PX * 160 / 120)
@@ -211,7 +225,7 @@ def test_a_point_cloud_is_drawn_too(tmp_path: Path) -> None:
     root = make(tmp_path / "capture")
     cloud: Scan = replace(ball(), triangles=np.zeros((0, 3), np.int64))
     write_ply(root / "scan.ply", cloud.vertices, cloud.triangles)
-    report = check(root, sheet=tmp_path / "sheet.png")
+    report = check_capture(root, sheet=tmp_path / "sheet.png")
     assert report.scan is not None and len(report.scan.triangles) == 0
     sheet = cv2.imread(str(tmp_path / "sheet.png"))[..., ::-1]
     assert (np.abs(sheet.astype(int) - BLUE).max(-1) < 30).sum() > 1000
@@ -219,17 +233,17 @@ def test_a_point_cloud_is_drawn_too(tmp_path: Path) -> None:
 
 def test_hidden_scan_points_are_not_drawn(tmp_path: Path) -> None:
     root = make(tmp_path / "capture")
-    check(root, sheet=tmp_path / "sheet.png")
+    check_capture(root, sheet=tmp_path / "sheet.png")
     with_core = np.concatenate([ball().vertices, 0.5 * ball().vertices])
     write_ply(root / "scan.ply", with_core, ball().triangles)
-    check(root, sheet=tmp_path / "again.png")
+    check_capture(root, sheet=tmp_path / "again.png")
     assert (tmp_path / "sheet.png").read_bytes() == (tmp_path / "again.png").read_bytes()
 
 
 @needs_shared
 def test_shared_captures_pass(tmp_path: Path) -> None:
     captures = SHARED / "data" / "captures"
-    report = check(captures / "ict_dev" / "neutral", sheet=tmp_path / "sheet.png")
+    report = check_capture(captures / "ict_dev" / "neutral", sheet=tmp_path / "sheet.png")
     assert report.warnings == () and report.eye_distance_mm == pytest.approx(92, abs=1)
-    (warning,) = check(captures / "gnm_identity_a" / "neutral").warnings
+    (warning,) = check_capture(captures / "gnm_identity_a" / "neutral").warnings
     assert "2, 3, 4, 5, 6 go backwards" in warning

@@ -9,7 +9,7 @@ import pycolmap
 import pytest
 
 from registration.capture import native
-from registration.capture.native_writer import PlainView, write
+from registration.capture.native_writer import CaptureDescription, ViewArrays, write_capture
 from registration.capture.scan import read_scan, read_truth
 from registration.errors import InputError
 from tests.conftest import SHARED, needs_shared
@@ -17,7 +17,7 @@ from tests.registration.capture.small import CLASSES, DISTORTIONS, TURNS, ball, 
 
 
 def test_round_trip(tmp_path: Path) -> None:
-    capture = native.read(make(tmp_path / "capture", distortion=DISTORTIONS["OPENCV"]))
+    capture = native.read_capture(make(tmp_path / "capture", distortion=DISTORTIONS["OPENCV"]))
     assert (capture.subject, capture.expression, capture.classes) == ("ball", "neutral", CLASSES)
     assert capture.tags == {"age": 30, "notes": 'with "quotes"', "lists": [1.5, 2.5], "real": False}
     assert [view.name for view in capture.views] == [f"cam{i}" for i in range(len(TURNS))]
@@ -38,7 +38,7 @@ def test_round_trip(tmp_path: Path) -> None:
 def test_a_binary_model_reads_as_its_text(tmp_path: Path, rigs: bool) -> None:
     """Also as older versions of COLMAP wrote it, without rigs and frames."""
     root = make(tmp_path / "capture", distortion=DISTORTIONS["FULL_OPENCV"])
-    text = native.read(root)
+    text = native.read_capture(root)
     model = pycolmap.Reconstruction(str(root / "sparse"))
     shutil.rmtree(root / "sparse")
     (root / "sparse").mkdir()
@@ -46,7 +46,7 @@ def test_a_binary_model_reads_as_its_text(tmp_path: Path, rigs: bool) -> None:
     for name in () if rigs else ("rigs.bin", "frames.bin"):
         (root / "sparse" / name).unlink()
     assert {path.suffix for path in (root / "sparse").iterdir()} == {".bin"}
-    for a, b in zip(text.views, native.read(root).views, strict=True):
+    for a, b in zip(text.views, native.read_capture(root).views, strict=True):
         assert (a.name, a.camera.distortion) == (b.name, b.camera.distortion)
         np.testing.assert_array_equal(a.camera.intrinsics, b.camera.intrinsics)
         np.testing.assert_allclose(a.camera.T_cam_world, b.camera.T_cam_world, atol=1e-14)
@@ -68,7 +68,7 @@ def test_every_camera_model_projects_as_in_colmap(tmp_path: Path, model: str, pa
     (root / "sparse" / "cameras.txt").write_text(
         "".join(f"{i} {model} 120 160 {parameters}\n" for i in range(1, 1 + len(TURNS)))
     )
-    ours = native.read(root).views[0].camera
+    ours = native.read_capture(root).views[0].camera
     points = np.random.default_rng(0).uniform([-0.1, -0.12, 0.9], [0.1, 0.12, 1.1], (50, 3))
     theirs = pycolmap.Camera.create_from_model_name(1, model, 600, 120, 160)
     theirs.params = np.array(parameters.split(), float)
@@ -82,13 +82,13 @@ def test_every_camera_model_projects_as_in_colmap(tmp_path: Path, model: str, pa
 def test_names_hold_subfolders_other_suffixes_and_natural_order(tmp_path: Path) -> None:
     names = ["right/cam10", "right/cam2", "left/cam1"]
     views = [picture(name, camera(turn)) for name, turn in zip(names, TURNS, strict=False)]
-    root = write(tmp_path / "capture", views, subject="s", expression="e", classes=CLASSES)
+    root = write_capture(tmp_path / "capture", views, CaptureDescription(subject="s", expression="e", classes=CLASSES))
     image = root / "images" / "right" / "cam2.png"
     cv2.imwrite(str(image.with_suffix(".jpg")), cv2.imread(str(image)))
     image.unlink()
     listing = root / "sparse" / "images.txt"
     listing.write_text(listing.read_text().replace("right/cam2.png", "right/cam2.jpg"))
-    capture = native.read(root)
+    capture = native.read_capture(root)
     assert [view.name for view in capture.views] == ["left/cam1", "right/cam2", "right/cam10"]
     assert capture.views[1].image == root / "images" / "right" / "cam2.jpg"
     assert capture.views[1].mask == root / "masks" / "right" / "cam2.png"
@@ -102,7 +102,7 @@ def test_what_is_optional_may_be_missing(tmp_path: Path) -> None:
     shutil.rmtree(root / "landmarks")
     (root / "scan.ply").unlink()
     (root / "ground_truth.npz").unlink()
-    capture = native.read(root)
+    capture = native.read_capture(root)
     assert [view.mask is None for view in capture.views] == [False, True, False, False, False]
     assert all(view.normals is None and not view.landmarks for view in capture.views)
     assert capture.scan is None and capture.ground_truth is None
@@ -114,7 +114,7 @@ def test_names_that_leave_the_folder_are_refused(tmp_path: Path, name: str) -> N
     listing = root / "sparse" / "images.txt"
     listing.write_text(listing.read_text().replace("cam0.png", name))
     with pytest.raises(InputError, match="An image name cannot be used") as caught:
-        native.read(root)
+        native.read_capture(root)
     assert caught.value.got == name
 
 
@@ -123,7 +123,7 @@ def test_schemes_must_have_one_length(tmp_path: Path) -> None:
     path = root / "landmarks" / "cam3.json"
     path.write_text(json.dumps({"68": [[1, 2, 1.0]]}))
     with pytest.raises(InputError, match="two lengths") as caught:
-        native.read(root)
+        native.read_capture(root)
     assert caught.value.where == str(path)
 
 
@@ -131,7 +131,7 @@ def test_the_writer_leaves_nothing_behind_when_it_fails(tmp_path: Path) -> None:
     good = picture("cam0", camera())
     bad = replace(good, name="cam1", camera=camera(width_px=60))
     with pytest.raises(ValueError, match="images of cam1"):
-        write(tmp_path / "capture", [good, bad], subject="s", expression="e")
+        write_capture(tmp_path / "capture", [good, bad], CaptureDescription(subject="s", expression="e"))
     assert not list(tmp_path.iterdir())
 
 
@@ -145,8 +145,8 @@ def test_the_writer_never_replaces(tmp_path: Path) -> None:
 
 def test_srgb_integers_are_written_as_they_are(tmp_path: Path) -> None:
     rgb = np.random.default_rng(0).integers(0, 2**16, (160, 120, 3), dtype=np.uint16)
-    view = PlainView(name="a", camera=camera(), rgb=rgb)
-    root = write(tmp_path / "capture", [view], subject="s", expression="e")
+    view = ViewArrays(name="a", camera=camera(), rgb=rgb)
+    root = write_capture(tmp_path / "capture", [view], CaptureDescription(subject="s", expression="e"))
     np.testing.assert_array_equal(cv2.imread(str(root / "images" / "a.png"), cv2.IMREAD_UNCHANGED)[..., ::-1], rgb)
 
 
@@ -155,7 +155,7 @@ def test_shared_captures_read() -> None:
     folders = sorted(path.parent for path in (SHARED / "data" / "captures").glob("*/*/capture.toml"))
     assert folders
     for folder in folders:
-        capture = native.read(folder)
+        capture = native.read_capture(folder)
         if folder.parent.name == "real_two_view":  # photographs and a scan, nothing extracted from them
             assert len(capture.views) == 2 and capture.scan and not capture.classes
             assert not any(view.mask or view.normals or view.segmentation or view.landmarks for view in capture.views)

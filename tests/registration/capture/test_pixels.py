@@ -9,7 +9,7 @@ import pytest
 from PIL import Image
 
 from registration.capture import native, pixels
-from registration.capture.native_writer import PlainView, write
+from registration.capture.native_writer import CaptureDescription, ViewArrays, write_capture
 from registration.capture.pixels import read_view, undistort_landmarks
 from registration.errors import InputError
 from registration.frames import srgb_to_linear
@@ -18,8 +18,9 @@ from tests.conftest import SHARED, needs_shared
 from tests.registration.capture.small import CLASSES, DISTORTIONS, camera, landmarks_68, make, picture
 
 
-def one_view(root: Path, view: PlainView, bits: int = 16) -> Capture:
-    return native.read(write(root, [view], subject="s", expression="e", classes=CLASSES, bits=bits))
+def one_view(root: Path, view: ViewArrays, bits: int = 16) -> Capture:
+    description = CaptureDescription(subject="s", expression="e", classes=CLASSES)
+    return native.read_capture(write_capture(root, [view], description, bits=bits))
 
 
 def place(share: np.ndarray) -> np.ndarray:
@@ -91,7 +92,7 @@ def test_a_point_lands_where_the_reduced_camera_projects_it(
 def test_reduction_keeps_the_mean_of_light_not_of_srgb(tmp_path: Path, dtype: type) -> None:
     top = np.iinfo(dtype).max
     rgb = np.random.default_rng(0).integers(0, top, (160, 120, 3), endpoint=True, dtype=dtype)
-    capture = one_view(tmp_path / "capture", PlainView(name="a", camera=camera(), rgb=rgb))
+    capture = one_view(tmp_path / "capture", ViewArrays(name="a", camera=camera(), rgb=rgb))
     full = read_view(capture.views[0], capture)
     np.testing.assert_allclose(full.rgb, srgb_to_linear(rgb / top), atol=1e-6)
     assert full.mask is None and full.normals is None and full.label_shares is None
@@ -127,7 +128,7 @@ def test_pixels_without_a_source_are_told_and_weigh_nothing(tmp_path: Path) -> N
     """A pincushion image has no source for the corners; a constant image stays constant up to the border."""
     cam = camera(distortion=(3.0, 0.0, 0.0, 0.0))
     shape = (cam.height_px, cam.width_px)
-    view = PlainView(
+    view = ViewArrays(
         name="a",
         camera=cam,
         rgb=np.full((*shape, 3), 200, np.uint8),
@@ -213,7 +214,7 @@ def test_exif_turns_are_ignored_because_the_calibration_ignores_them(tmp_path: P
 
 
 def test_damage_in_the_middle_of_a_file_is_an_error(tmp_path: Path) -> None:
-    capture = native.read(make(tmp_path / "capture"))
+    capture = native.read_capture(make(tmp_path / "capture"))
     path = capture.views[2].image
     content = bytearray(path.read_bytes())
     content[len(content) // 2 : len(content) // 2 + 64] = bytes(64)
@@ -225,7 +226,7 @@ def test_damage_in_the_middle_of_a_file_is_an_error(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("downsample", [0, 121])
 def test_factors_that_leave_no_pixel_are_refused(tmp_path: Path, downsample: int) -> None:
-    capture = native.read(make(tmp_path / "capture"))
+    capture = native.read_capture(make(tmp_path / "capture"))
     with pytest.raises(InputError, match="cannot be reduced by this factor"):
         read_view(capture.views[0], capture, downsample=downsample)
 
@@ -234,7 +235,7 @@ MEASURE = """
 import resource, sys
 from pathlib import Path
 from registration.capture import native, pixels
-capture = native.read(Path(sys.argv[1]))
+capture = native.read_capture(Path(sys.argv[1]))
 before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
 pixels.read_view(capture.views[0], capture, downsample=8)
 print((resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) / 1024)
@@ -246,7 +247,7 @@ print((resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) / 1024)
 def test_a_25_megapixel_view_needs_less_than_a_gigabyte(tmp_path: Path, distortion: tuple[float, ...]) -> None:
     small = picture("a", camera(width_px=512, height_px=768))
     cam: Camera = replace(small.camera.scaled(4096, 6144), distortion=distortion)
-    big = PlainView(
+    big = ViewArrays(
         name="a",
         camera=cam,
         rgb=np.tile(np.random.default_rng(0).integers(0, 65536, (768, 512, 3), dtype=np.uint16), (8, 8, 1)),
@@ -262,7 +263,7 @@ def test_a_25_megapixel_view_needs_less_than_a_gigabyte(tmp_path: Path, distorti
 
 @needs_shared
 def test_a_shared_view_at_half_size() -> None:
-    capture = native.read(SHARED / "data" / "captures" / "ict_dev" / "neutral")
+    capture = native.read_capture(SHARED / "data" / "captures" / "ict_dev" / "neutral")
     view = read_view(capture.views[2], capture, downsample=2)
     assert view.rgb.shape == (360, 240, 3) and view.rgb.min() >= 0 and view.rgb.max() <= 1
     assert view.mask is not None and view.normals is not None and view.label_shares is not None

@@ -7,7 +7,7 @@ import pytest
 
 from registration.capture import native
 from registration.capture.doctor import eye_distance
-from registration.capture.triangulation import jaw_disorder, residuals, triangulate
+from registration.capture.triangulation import residuals, reversed_jaw_points, triangulate
 from registration.types import Camera, Capture, View
 from tests.conftest import SHARED, needs_shared
 from tests.registration.capture.small import DISTORTIONS, TURNS, camera, distorted, landmarks_68
@@ -96,25 +96,25 @@ def test_views_without_the_scheme_are_passed_over() -> None:
 
 def test_jaw_order() -> None:
     points = landmarks_68()
-    assert jaw_disorder(points) == []
+    assert reversed_jaw_points(points) == []
     turned = points.copy()
     turned[2:7] = turned[2:7][::-1]
-    assert jaw_disorder(turned) == [2, 3, 4, 5, 6]
+    assert reversed_jaw_points(turned) == [2, 3, 4, 5, 6]
     mirrored = points.copy()
     mirrored[:17] = mirrored[:17][::-1]
-    assert jaw_disorder(mirrored) == list(range(17))
+    assert reversed_jaw_points(mirrored) == list(range(17))
     points[[4, 9]] = np.nan
-    assert jaw_disorder(points) == []
+    assert reversed_jaw_points(points) == []
     points[27] = np.nan
-    assert jaw_disorder(points) == []
+    assert reversed_jaw_points(points) == []
 
 
 @needs_shared
 def test_shared_landmarks() -> None:
     captures = SHARED / "data" / "captures"
     for name, disorder in (("gnm_identity_a/neutral", [2, 3, 4, 5, 6]), ("ict_dev/jaw_open", [])):
-        points, used, residual = triangulate(native.read(captures / name), "68")
+        points, used, residual = triangulate(native.read_capture(captures / name), "68")
         distance = eye_distance(points)
         assert distance is not None and 0.085 < distance < 0.095
         assert used.min() >= 9 and residual.max() < 0.01
-        assert jaw_disorder(points) == disorder
+        assert reversed_jaw_points(points) == disorder

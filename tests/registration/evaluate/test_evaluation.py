@@ -9,7 +9,7 @@ import pytest
 import trimesh
 from rich.console import Console
 
-from registration.capture.native import read
+from registration.capture.native import read_capture
 from registration.capture.scan import read_scan, read_truth
 from registration.errors import InputError
 from registration.evaluate.console_table import print_figures
@@ -197,7 +197,7 @@ def truth_registration(capture: Capture) -> Registration:
 @needs_shared
 def test_the_truth_has_no_error_and_figures_are_stored(tmp_path, capsys):
     root = SHARED / "data/captures/gnm_identity_a/neutral"
-    save_registration(truth_registration(read(root)), tmp_path / "r", report_html="kept")
+    save_registration(truth_registration(read_capture(root)), tmp_path / "r", report_html="kept")
     found = evaluate_folder(tmp_path / "r", root)
     stored = load_registration(tmp_path / "r").figures
     assert stored["vertex_error"]["face"]["mean_mm"] == 0 and stored["scan_to_mesh"]["face"]["p95_mm"] < 1e-6
@@ -210,7 +210,7 @@ def test_the_truth_has_no_error_and_figures_are_stored(tmp_path, capsys):
 @needs_shared
 @pytest.mark.slow
 def test_truths_of_two_expressions_do_not_drift():
-    neutral, happy = (read(SHARED / f"data/captures/gnm_identity_a/{name}") for name in ("neutral", "happy"))
+    neutral, happy = (read_capture(SHARED / f"data/captures/gnm_identity_a/{name}") for name in ("neutral", "happy"))
     found = evaluate(
         truth_registration(happy), happy, neutral=truth_registration(neutral), neutral_capture=neutral
     ).figures
@@ -220,7 +220,7 @@ def test_truths_of_two_expressions_do_not_drift():
 @needs_shared
 @pytest.mark.slow
 def test_another_topology_has_drift_but_no_vertex_error():
-    neutral, smile = (read(SHARED / f"data/captures/ict_dev/{name}") for name in ("neutral", "smile"))
+    neutral, smile = (read_capture(SHARED / f"data/captures/ict_dev/{name}") for name in ("neutral", "smile"))
     meshes = [read_scan(capture.scan) for capture in (neutral, smile)]
     start, end = (a_registration(m.vertices, m.triangles, landmarks={}) for m in meshes)
     figures = evaluate(end, smile, neutral=start, neutral_capture=neutral).figures

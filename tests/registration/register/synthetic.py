@@ -14,7 +14,7 @@ from jaxtyping import Float
 from scipy.ndimage import gaussian_filter
 from scipy.spatial.transform import Rotation
 
-from registration.capture.native_writer import PlainView, write
+from registration.capture.native_writer import CaptureDescription, ViewArrays, write_capture
 from registration.capture.scan import Scan
 from registration.geometry.rasterizer import visible
 from registration.geometry.topology import vertex_normals
@@ -79,12 +79,10 @@ def make(root: Path, expression: str = "neutral") -> Truth:
         seen = visible(points, vertices, data.triangles, camera, 2e-3)
         landmarks = np.column_stack([camera.project(points)[0], np.where(seen, 1.0, 0.2)])
         views.append(_view(f"cam{number}", camera, picture, GAINS[number], landmarks))
-    write(
+    write_capture(
         root,
         views,
-        subject="tiny",
-        expression=expression,
-        classes=LABELS,
+        CaptureDescription(subject="tiny", expression=expression, classes=LABELS),
         scan=_scan(data, vertices),
         truth=vertices,
         bits=16,
@@ -154,14 +152,14 @@ def _texture(size: int = 512) -> torch.Tensor:
     return torch.tensor(texture.clip(0.02, 0.85), dtype=torch.float32)
 
 
-def _view(name: str, camera: Camera, picture: np.ndarray, gain: float, landmarks: np.ndarray) -> PlainView:
+def _view(name: str, camera: Camera, picture: np.ndarray, gain: float, landmarks: np.ndarray) -> ViewArrays:
     rgb, world, mask, classes = np.split(picture, [3, 6, 7], -1)
     mask = mask[..., 0]
     normals = world @ camera.T_cam_world[:3, :3].T
     length = np.linalg.norm(normals, axis=-1, keepdims=True)
     normals = np.where(length > 0.1, normals / np.maximum(length, 0.1), 0)
     labels = np.where(mask > 0.5, 1 + classes.argmax(-1), 0).astype(np.uint8)
-    return PlainView(
+    return ViewArrays(
         name=name,
         camera=camera,
         rgb=gain * rgb,

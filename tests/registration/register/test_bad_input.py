@@ -94,7 +94,7 @@ def units_declared_as_millimetres(request: Request) -> None:
     edit(request.capture / "capture.toml", '"m"', '"mm"')
 
 
-@bad("eye corners are too near or too far apart", where="sparse", got="95.", fix="0.001")
+@bad("eye corners are too close or too far apart", where="sparse", got="95.", fix="0.001")
 def capture_in_millimetres(request: Request) -> None:
     for number in range(1, 9):
         edit_line(

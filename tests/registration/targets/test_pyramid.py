@@ -8,8 +8,8 @@ import pytest
 import torch
 from scipy.ndimage import distance_transform_edt
 
-from registration.capture.native import read
-from registration.capture.native_writer import PlainView, write
+from registration.capture.native import read_capture
+from registration.capture.native_writer import CaptureDescription, ViewArrays, write_capture
 from registration.targets.classes import class_map
 from registration.targets.pyramid import build_pyramid
 from registration.types import Targets
@@ -28,15 +28,15 @@ def labels_of(direction: np.ndarray) -> np.ndarray:
     return np.where((x - 0.35) ** 2 + (y - 0.1) ** 2 + np.minimum(z, 0) < 0.04, 4, labels)
 
 
-def picture(name: str, turn: float, distortion: tuple[float, ...] = ()) -> PlainView:
+def picture(name: str, turn: float, distortion: tuple[float, ...] = ()) -> ViewArrays:
     view = small.picture(name, small.camera(turn, distortion=distortion))
     world = view.normals @ view.camera.T_cam_world[:3, :3]
     return replace(view, labels=np.where(view.mask, labels_of(world), 0).astype(np.uint8))
 
 
-def capture_of(root: Path, views: list[PlainView]):
-    write(root, views, subject="ball", expression="neutral", classes=CLASSES)
-    return read(root)
+def capture_of(root: Path, views: list[ViewArrays]):
+    write_capture(root, views, CaptureDescription(subject="ball", expression="neutral", classes=CLASSES))
+    return read_capture(root)
 
 
 @pytest.fixture(scope="module")
@@ -236,8 +236,8 @@ def test_a_capture_of_images_alone(tmp_path):
         replace(picture(f"cam{i}", turn), mask=None, normals=None, labels=None, landmarks={})
         for i, turn in enumerate(small.TURNS)
     ]
-    write(tmp_path / "ball", views, subject="ball", expression="neutral")
-    targets = build_pyramid(read(tmp_path / "ball"), class_map(()), finest_head_px=999, levels=1)[0]
+    write_capture(tmp_path / "ball", views, CaptureDescription(subject="ball", expression="neutral"))
+    targets = build_pyramid(read_capture(tmp_path / "ball"), class_map(()), finest_head_px=999, levels=1)[0]
     assert targets.px_per_head == 160 and targets.landmarks == {} and targets.class_names == ("skin",)
     assert (targets.mask_weight == 0).all() and (targets.class_weight == 0).all() and (targets.rgb_weight > 0).any()
 

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from registration.capture.native import read
+from registration.capture.native import read_capture
 from registration.errors import InputError
 from registration.report.stage_snapshots import write_stage
 from registration.types import Capture
@@ -27,7 +27,7 @@ def stage(folder: Path, name: str, scale: float) -> None:
 
 @pytest.fixture
 def capture(tmp_path: Path) -> Capture:
-    return read(small.make(tmp_path / "capture"))
+    return read_capture(small.make(tmp_path / "capture"))
 
 
 @pytest.fixture

@@ -1,0 +1,147 @@
+"""Checks of a capture before anything is computed: cameras, image files, landmarks and units."""
+
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+
+from registration.capture import headers, pixels, triangulation
+from registration.capture.scan import read_scan, read_truth
+from registration.errors import InputError
+from registration.types import Capture, View
+
+EYE_DISTANCE_M = (0.05, 0.15)  # between the outer corners; adults have 0.08 to 0.1
+OUTER_EYES = (36, 45)  # of the 68 scheme
+MAX_DECODED_PIXELS = 2**22  # images and normal maps up to this size are decoded whole
+
+
+def validate_capture(capture: Capture) -> None:
+    """Check a capture before it is registered: the headers of all views first, then contents.
+
+    Masks and label maps are decoded whole. Images and normal maps of more than `MAX_DECODED_PIXELS` are only checked
+    for truncation; other damage is reported when the views are decoded for the fit.
+
+    Raises:
+        InputError: fewer than two views, a singular or non-finite camera, a missing or damaged file, a size that is not
+            the camera's, landmarks or a scan that cannot be used, or a world that is not in metres.
+    """
+    if len(capture.views) < 2:
+        raise InputError(
+            "There are too few views",
+            where=capture.root,
+            expected="at least 2 views",
+            got=len(capture.views),
+            fix="add calibrated images; in images.txt of COLMAP every image takes two lines, the second may be empty",
+        )
+    for view in capture.views:
+        _check_camera(capture, view)
+        _check_headers(capture, view)
+    _check_landmarks(capture)
+    if capture.scan is not None:
+        read_scan(capture.scan)
+    if capture.ground_truth is not None:
+        read_truth(capture.ground_truth)
+    for view in capture.views:
+        _check_pixels(capture, view)
+
+
+def _check_camera(capture: Capture, view: View) -> None:
+    camera = view.camera
+    K, rotation = camera.intrinsics, camera.T_cam_world[:3, :3]
+    if not (np.isfinite(K).all() and np.isfinite(camera.distortion).all() and K[0, 0] > 0 and K[1, 1] > 0):
+        raise InputError(
+            "The intrinsics are singular or not finite",
+            where=f"{capture.root}: view {view.name}",
+            expected="finite numbers, focal lengths > 0",
+            got=np.array2string(K),
+            fix="calibrate the camera again",
+        )
+    rigid = np.isfinite(camera.T_cam_world).all() and np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-4)
+    if not (rigid and np.linalg.det(rotation) > 0):
+        raise InputError(
+            "The pose is singular or not finite",
+            where=f"{capture.root}: view {view.name}",
+            expected="a rotation and a finite translation",
+            got=np.array2string(camera.T_cam_world),
+            fix="calibrate the camera again, or remove its view",
+        )
+
+
+def _check_headers(capture: Capture, view: View) -> None:
+    for path, role in _files(view):
+        header = headers.require_size(path, role, view.camera.width_px, view.camera.height_px)
+        headers.require_complete(path, role)
+        if role == "normal map" and header.png_bits != 16:
+            raise InputError(
+                "The normal map has too few bits",
+                where=path,
+                expected="16 bit RGB PNG, n = 2 v / 65535 - 1",
+                got="no PNG" if header.png_bits is None else f"{header.png_bits} bits",
+                fix="write it with 16 bits",
+            )
+    if view.segmentation is not None and not capture.classes:
+        raise InputError(
+            "The label maps have no class names",
+            where=capture.root / "capture.toml",
+            expected='[segmentation] classes = ["background", ...]',
+            got="nothing",
+            fix="name every label index",
+        )
+
+
+def _files(view: View) -> list[tuple[Path, str]]:
+    files = ((view.image, "image"), (view.mask, "mask"), (view.normals, "normal map"), (view.segmentation, "label map"))
+    return [(path, role) for path, role in files if path is not None]
+
+
+def _check_landmarks(capture: Capture) -> None:
+    counts = {len(view.landmarks["68"]) for view in capture.views if "68" in view.landmarks}
+    if counts - {68}:
+        raise InputError(
+            'The landmark scheme "68" has another length',
+            where=capture.root / "landmarks",
+            expected="68 points",
+            got=", ".join(map(str, sorted(counts))),
+            fix="give another scheme another name",
+        )
+    points = triangulation.triangulate(capture, "68")[0]
+    distance = eye_distance(points)
+    if distance is not None and not EYE_DISTANCE_M[0] <= distance <= EYE_DISTANCE_M[1]:
+        factor = 10.0 ** round(np.log10(0.09 / max(distance, 1e-12)))
+        hint = f"scale the COLMAP model and the scan by about {factor:g}" if factor != 1 else "check the calibration"
+        raise InputError(
+            "The outer eye corners are too close or too far apart: check that the units are metres",
+            where=capture.root / "sparse",
+            expected=f"{EYE_DISTANCE_M[0]} to {EYE_DISTANCE_M[1]} m between the triangulated landmarks 36 and 45",
+            got=f"{distance:.4g} m",
+            fix=hint,
+        )
+
+
+def eye_distance(points: Float[np.ndarray, "L 3"]) -> float | None:
+    """Return the distance (m) between the outer eye corners; None for another scheme than 68 or a NaN corner."""
+    if len(points) != 68:
+        return None
+    right, left = points[list(OUTER_EYES)]
+    distance = float(np.linalg.norm(right - left))
+    return distance if np.isfinite(distance) else None
+
+
+def _check_pixels(capture: Capture, view: View) -> None:
+    camera = view.camera
+    if view.mask is not None:
+        brightest = int(pixels.read_mask(view.mask, camera).max())
+        if brightest < 128:
+            raise InputError(
+                "The mask is empty",
+                where=view.mask,
+                expected="255 where the subject is",
+                got=f"no pixel above {brightest}",
+                fix="write 255 for the subject" if brightest else "draw the mask, or remove this view or its mask",
+            )
+    if view.segmentation is not None:
+        pixels.read_labels(view.segmentation, camera, capture.classes)
+    if camera.width_px * camera.height_px <= MAX_DECODED_PIXELS:
+        pixels.read_image(view.image, camera)
+        if view.normals is not None:
+            pixels.read_normals(view.normals, camera)
