@@ -43,7 +43,7 @@ def _tiles(evaluation: ModelEvaluation) -> list[tuple[str, str, str]]:
             tiles.append((f"{random:.2f}", "mm", f"{name}: specificity, {components} components"))
     for gain in evaluation.gains:
         if gain.components == components:
-            tiles.append((f"{100 * gain.gain.mean:.0f}", "%", f"{gain.model}: nearer than the first"))
+            tiles.append((f"{100 * gain.gain.mean:.0f}", "%", f"{gain.model}: reduction against the first model"))
     return tiles
 
 

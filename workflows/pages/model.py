@@ -46,7 +46,7 @@ def _tiles(manifest: Mapping[str, Any]) -> list[tuple[str, str, str]]:
         (str(len(manifest["subjects"])), "", "subjects"),
         (str(expressions), "", "expressions"),
         (str(identity["components"]), "", f"identity components, {kept} of the variance"),
-        (str(len(manifest["rejected"])), "", "registrations left out"),
+        (str(len(manifest["rejected"])), "", "registrations excluded as outliers"),
         (f"{manifest['figures']['drift_mm']:.2f}", "mm", "drift of the template's skull"),
     ]
 

@@ -24,9 +24,9 @@ def write_stabilize_page(
     figures = manifest["figures"]
     tiles = (
         (f"{figures['samples']}", "", f"expressions of {len(manifest['subjects'])} subjects"),
-        (f"{figures['residual_median_mm']:.2f}", "mm", "skin on the skull from the neutral, median"),
-        (f"{figures['regional_turn_deg']:.2f}", "°", "turned by the second stage, rms"),
-        (f"{figures['regional_rms_mm']:.2f}", "mm", "moved by the second stage, rms"),
+        (f"{figures['residual_median_mm']:.2f}", "mm", "median residual of the skin that follows the skull"),
+        (f"{figures['regional_turn_deg']:.2f}", "°", "rotation by the second stage, rms"),
+        (f"{figures['regional_rms_mm']:.2f}", "mm", "displacement by the second stage, rms"),
     )
     still_mm = manifest["config"].automatic.still_mm
     shown = [_subject(subject, head, still_mm) for subject in islice(subjects, _MAX_SUBJECTS)]

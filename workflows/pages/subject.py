@@ -1,4 +1,4 @@
-"""The HTML page of a subject: a row for each capture; self-contained but for the links to the reports beside it."""
+"""The HTML page of a subject: one row for each capture, with links to the reports beside it."""
 
 from collections.abc import Mapping
 
@@ -19,28 +19,28 @@ _OVERSAMPLING = 2
 
 
 def thumbnail(registration: Registration) -> str | None:
-    """The registered head in its texture, from the front, as a data URI; None if its vertices are not finite."""
+    """Return an image of the textured head from the front as a data URI; None if its vertices are not finite."""
     if not np.isfinite(registration.vertices).all():
         return None
-    turn = axis_angle_to_matrix(torch.from_numpy(registration.rotations[0].astype(np.float64))).numpy()
-    head = registration.vertices @ turn  # to the model's frame: +Y up, +Z out of the face
+    R_world_head = axis_angle_to_matrix(torch.from_numpy(registration.rotations[0].astype(np.float64))).numpy()
+    head = registration.vertices @ R_world_head  # to the model's frame: +Y up, +Z out of the face
     camera = _front(head, _OVERSAMPLING * _WIDTH_PX, _OVERSAMPLING * _HEIGHT_PX)
     face, barycentric = rasterize(head, registration.triangles, camera)
-    shown = face >= 0
-    uv = np.einsum("pk,pkc->pc", barycentric[shown], registration.corner_uvs[face[shown]])
+    covered = face >= 0
+    uv = np.einsum("pk,pkc->pc", barycentric[covered], registration.corner_uvs[face[covered]])
     size = len(registration.texture)
-    column, line = (np.clip((uv * (1, -1) + (0, 1)) * size, 0, size - 1)).astype(np.int64).T
-    picture = np.empty((*face.shape, 3), np.float32)
-    picture[:] = PAPER
-    picture[shown] = 255 * linear_to_srgb(registration.texture[line, column])
-    small = cv2.resize(picture, (_WIDTH_PX, _HEIGHT_PX), interpolation=cv2.INTER_AREA)
+    column, row = (np.clip((uv * (1, -1) + (0, 1)) * size, 0, size - 1)).astype(np.int64).T
+    image = np.empty((*face.shape, 3), np.float32)
+    image[:] = PAPER
+    image[covered] = 255 * linear_to_srgb(registration.texture[row, column])
+    small = cv2.resize(image, (_WIDTH_PX, _HEIGHT_PX), interpolation=cv2.INTER_AREA)
     return data_uri(np.clip(small + 0.5, 0, 255).astype(np.uint8))
 
 
 def _front(head: Float[np.ndarray, "V 3"], width_px: int, height_px: int) -> Camera:
-    """A camera two metres before a head (model frame) that fills its picture."""
+    """Return a camera two metres in front of a head (model frame) that fills the image."""
     low, high = head.min(0), head.max(0)
-    distance = 2.0
+    distance = 2.0  # metres
     focal = 0.96 * distance * min(np.array([width_px, height_px]) / (high - low)[:2])
     pose = np.diag([1.0, -1.0, -1.0, 1.0])
     pose[:3, 3] = -pose[:3, :3] @ ((low + high) / 2) + (0, 0, distance)

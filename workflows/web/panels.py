@@ -22,11 +22,11 @@ def about(part: Components, k: int, action: str, head: Head) -> str:
     moves = part.rigid_rms_mm(head)[k]
     rows = (
         ("energy of the region", f"{100 * part.energy[k]:.1f} %"),
-        ("S · rigid, all in all", f"{part.score[k]:.2f}"),
-        ("S1 · share of energy that is rigid", f"{part.rigid_share[k]:.2f}"),
-        ("S2 · size of the rigid part", f"{part.rigid_size[k]:.2f}"),
-        ("S3 · free of the label", f"{part.free_of_label[k]:.2f}"),
-        ("S5 · shared by nose and neck", f"{part.shared[k]:.2f}"),
+        ("rigid score", f"{part.score[k]:.2f}"),
+        ("rigid fit, R²", f"{part.rigid_share[k]:.2f}"),
+        ("size of the rigid motion", f"{part.rigid_size[k]:.2f}"),
+        ("label independence", f"{part.free_of_label[k]:.2f}"),
+        ("motion shared by nose and neck", f"{part.shared[k]:.2f}"),
         ("rigid motion, one σ", f"{turn:.2f}° \N{NO-BREAK SPACE} {moves:.2f} mm"),
     )
     return _panel("about", rows=rows, flagged=bool(part.flagged[k]), action=action)
@@ -40,9 +40,9 @@ def colour_bar(limit_mm: float, title: str) -> str:
 def error(change: Change, undecided: int) -> str:
     """How the rebuilt set differs from the one that it was built from, with the current decisions."""
     rows = (
-        ("rebuilt set differs by, rms", f"{change.rms_mm:.3f} mm"),
-        ("the sample that changes most", f"{change.most_mm:.2f} mm"),
-        ("heads turned by, rms", f"{change.turn_deg:.3f}°"),
+        ("difference after reconstruction, rms", f"{change.rms_mm:.3f} mm"),
+        ("largest difference of a sample", f"{change.most_mm:.2f} mm"),
+        ("rotation of heads, rms", f"{change.turn_deg:.3f}°"),
         ("decisions not saved", f"{undecided}"),
     )
     return _panel("error", rows=rows)

@@ -53,7 +53,7 @@ def test_a_person_steps_subtracts_undoes_and_saves(page, run, model, model_file,
         see(tab.get_by_text("6 expressions of 2 subjects")).to_be_visible(timeout=60_000)
         tab.set_default_timeout(15_000)
         see(tab.get_by_text("Coefficients by expression")).to_be_attached()
-        see(tab.get_by_text("The ten samples it moves most")).to_be_attached()
+        see(tab.get_by_text("The ten samples with the largest coefficients")).to_be_attached()
         see(tab.locator("canvas").first).to_be_visible()
 
         first = tab.get_by_text("energy of the region").locator("..").inner_text()
