@@ -76,7 +76,7 @@ class Named:
 
 @contextmanager
 def shown() -> Iterator[Progress]:
-    """A bar on stderr if that is a terminal, else lines."""
+    """Return a context with a progress bar on stderr if that is a terminal, else lines."""
     if not sys.stderr.isatty():
         yield _Lines()
         return

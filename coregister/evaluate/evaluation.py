@@ -156,6 +156,9 @@ def evaluate(
         settings: of the evaluation.
         progress: notified for every model and subject.
 
+    Returns:
+        Metrics of every model, in millimetres, with confidence intervals.
+
     Raises:
         InputError: as `check`, before anything is computed.
     """

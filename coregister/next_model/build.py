@@ -62,6 +62,9 @@ def build_model(
         recipe: all settings; None: `recipes.few_registrations()`, as `gnmreg coregister` uses.
         categories: every permitted label of an expression -> its category; None: any label.
 
+    Returns:
+        The model, in the topology of the previous one, and its provenance.
+
     Raises:
         InputError: as `validate_training_set`; more components requested than the samples span; a previous model
             without the official vertex groups.

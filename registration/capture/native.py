@@ -22,6 +22,9 @@ def read_capture(root: Path) -> Capture:
 
     A capture may come from an untrusted source: symbolic links that lead out of its folder are refused.
 
+    Args:
+        root: the folder, with capture.toml, sparse/ and images/ (docs/formats.md).
+
     Raises:
         InputError: `capture.toml`, the COLMAP model or a landmark file is damaged, a camera model is not supported, a
             pose is singular or not finite, an image is missing or of another size than its camera's, or a link leads

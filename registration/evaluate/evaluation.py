@@ -44,8 +44,15 @@ def evaluate(
 ) -> Evaluation:
     """Compare a registration with its capture's scan and, where they can be compared, with true vertices.
 
-    `regions` (name -> which vertices) split the mesh-to-scan figure. Drift needs both the neutral registration and
-    its capture.
+    Args:
+        registration: of the capture.
+        capture: with a scan.
+        neutral: registration of the subject's neutral, for drift.
+        neutral_capture: its capture; needed with `neutral`.
+        regions: name -> vertices that the mesh-to-scan distances are also computed for.
+
+    Returns:
+        Figures in millimetres, and the distances behind them.
 
     Raises:
         InputError: the capture has no scan, the face cannot be found, one of the neutral's parts is missing, or

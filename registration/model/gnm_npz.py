@@ -87,6 +87,9 @@ SCHEMA = NpzSchema(
 def read(path: Path) -> GNMData:
     """Read the model in an NPZ file. Nothing is unpickled.
 
+    Args:
+        path: a file of the official schema.
+
     Raises:
         InputError: the file cannot be read, or a field is missing, has a wrong type or shape, holds values that are not
             finite, or indices out of range. The message names the field.

@@ -138,7 +138,13 @@ def save_registration(registration: Registration, out: Path, report_html: str | 
 
 
 def load_registration(path: Path) -> Registration:
-    """Read a folder of `save_registration`. The texture comes back as linear float32.
+    """Read a registration folder.
+
+    Args:
+        path: the folder that `save_registration` wrote.
+
+    Returns:
+        The registration; its texture is linear float32.
 
     Raises:
         InputError: no folder of ours, another schema version, a field that is missing, of a wrong shape, not finite or
