@@ -28,7 +28,7 @@ from workflows.engine.reader import QueueReader
 from workflows.engine.serialization import JobFailed
 from workflows.farm.coregistration import begin
 from workflows.farm.flows import coregister
-from workflows.farm.local import Ended, LocalFarm
+from workflows.farm.local import LocalFarm, LocalRunResult
 from workflows.farm.plan import make_plan
 from workflows.pages import model
 from workflows.records.dataset import read_dataset, split
@@ -350,13 +350,13 @@ def test_the_command(dataset, finds, tmp_path, capsys, monkeypatch):
     assert main([*arguments, "--folder", str(tmp_path)]) == 2
     assert "There is no queue" in capsys.readouterr().err and not out.exists()
 
-    def run(farm: LocalFarm, name: str, progress) -> Ended:
+    def run(farm: LocalFarm, name: str, progress) -> LocalRunResult:
         spec = QueueReader(farm.url).rows([name])[name].spec
         try:
             asyncio.run(coregister(Inline(name, really(roots), []), **spec["arguments"]))
         except JobFailed as error:
-            return Ended(counts={}, reason=str(error))
-        return Ended(counts={})
+            return LocalRunResult(counts={}, reason=str(error))
+        return LocalRunResult(counts={})
 
     monkeypatch.setattr(workflows.farm.coregistration, "run_until_done", run)
     local = [*arguments, "--local", "--iterations", "1", "--held-out", "0.4"]

@@ -1,4 +1,4 @@
-"""A farm on one machine: a coordinator and workers as processes of this command, which ends them."""
+"""A farm on one machine: a coordinator and workers as child processes of this command, which terminates them."""
 
 import os
 import signal
@@ -17,77 +17,78 @@ from workflows.engine.reader import CANCELLED, DONE, FAILED, RUNNING, WAITING, Q
 from workflows.processes import cores_per_worker, terminate_with_parent
 
 POLL_S = 1.0
-RETRY_S = 2.0  # after which a process that died is started again
-REFUSED = 2  # the exit code of a command that was given something unusable
+RETRY_S = 2.0  # before a process that died is restarted
+REFUSED = 2  # exit code of a command with unusable arguments
 
 
 @dataclass(frozen=True, kw_only=True)
 class LocalFarm:
-    """What is to be started."""
+    """The processes to start."""
 
     url: str
-    folder: Path  # its logs go below
-    roots: tuple[str, ...]
+    folder: Path  # of the logs
+    roots: tuple[str, ...]  # folders and URLs that jobs may use
     workers: int = 1
     gpus: tuple[int, ...] = ()  # one worker each, instead of `workers`
     environment: Mapping[str, str] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, kw_only=True)
-class Ended:
-    """What became of a run."""
+class LocalRunResult:
+    """How a run ended."""
 
     counts: Mapping[str, int]  # state -> jobs
-    reason: str = ""  # why its driver failed, if it did
+    reason: str = ""  # of the driver's failure
 
 
-def run_until_done(farm: LocalFarm, run: str, progress: Progress) -> Ended:
-    """Start the farm, wait until a run's driver has ended, end the farm.
+def run_until_done(farm: LocalFarm, run: str, progress: Progress) -> LocalRunResult:
+    """Start the farm, wait until a run's driver has ended, stop the farm.
 
-    Whatever ends this function, Ctrl-C and kill -9 among it, ends the processes. What is left is done by the next call.
+    The processes end with this function, also on Ctrl-C and kill -9; the next call continues the run.
 
     Raises:
-        InputError: there is to be no worker, or a process refused to start.
+        InputError: no workers, or a process could not start.
     """
     if not farm.gpus and farm.workers < 1:
         raise InputError(
-            "There is no worker", where="--workers", expected="from 1", got=farm.workers, fix="ask for one or more"
+            "There are no workers", where="--workers", expected="at least 1", got=farm.workers, fix="use one or more"
         )
     processes = _Processes(farm)
     reader = QueueReader(farm.url)
     try:
         while True:
-            processes.look()
+            processes.restart()
             row = reader.rows([run]).get(run)
             counts = reader.counts(run, kind="job")
-            progress.at(ended(counts), max(sum(counts.values()), 1), _told(counts))
+            progress.at(ended(counts), max(sum(counts.values()), 1), _summary(counts))
             if row is not None and row.state in (DONE, FAILED, CANCELLED):
-                failure = row.failure
-                return Ended(counts=counts, reason=f"{failure['status']}: {failure['reason']}" if failure else "")
+                reason = f"{row.failure['status']}: {row.failure['reason']}" if row.failure else ""
+                return LocalRunResult(counts=counts, reason=reason)
             time.sleep(POLL_S)
     finally:
-        processes.end()
+        processes.terminate()
 
 
-def _told(counts: Mapping[str, int]) -> str:
+def _summary(counts: Mapping[str, int]) -> str:
     return ", ".join(f"{counts[state]} {state}" for state in (RUNNING, WAITING, DONE, FAILED) if counts.get(state))
 
 
 class _Processes:
-    """Commands that are started again when they die."""
+    """Commands that are restarted when they die."""
 
     def __init__(self, farm: LocalFarm) -> None:
-        places = [["--gpu", str(number)] for number in farm.gpus] or [[] for _ in range(farm.workers)]
+        devices = [["--gpu", str(number)] for number in farm.gpus] or [[] for _ in range(farm.workers)]
         shared = ["--folder", str(farm.folder)]
         roots = ["--root", *farm.roots] if farm.roots else []
         queues = ["--queue", "gpu", "rebuild"]
-        self._commands = [["coordinator", *shared], *(["worker", *shared, *roots, *queues, *p] for p in places)]
+        workers = [["worker", *shared, *roots, *queues, *device] for device in devices]
+        self._commands = [["coordinator", *shared], *workers]
         self._farm = farm
         self._processes: list[subprocess.Popen[bytes] | None] = [None] * len(self._commands)
-        self._since = [0.0] * len(self._commands)
+        self._started_s = [0.0] * len(self._commands)
 
-    def look(self) -> None:
-        """Start what does not run. Raises InputError for one that refuses."""
+    def restart(self) -> None:
+        """Start the commands that do not run. Raises InputError if one of them cannot start."""
         for number, process in enumerate(self._processes):
             code = process.poll() if process is not None else 0
             if process is not None and code is None:
@@ -96,16 +97,16 @@ class _Processes:
                 raise InputError(
                     "A process of the farm could not start",
                     where=" ".join(self._commands[number]),
-                    expected="a worker that takes jobs",
+                    expected="a process that takes jobs",
                     got=f"exit code {code}",
-                    fix="see what it printed above",
+                    fix="see its output above",
                 )
-            if time.monotonic() - self._since[number] > RETRY_S:
-                self._since[number] = time.monotonic()
-                self._processes[number] = self._started(number)
+            if time.monotonic() - self._started_s[number] > RETRY_S:
+                self._started_s[number] = time.monotonic()
+                self._processes[number] = self._start(number)
 
-    def end(self) -> None:
-        """SIGTERM to all, SIGKILL to those that stay."""
+    def terminate(self) -> None:
+        """Send SIGTERM to all, then SIGKILL to those that still run."""
         running = [process for process in self._processes if process is not None and process.poll() is None]
         for process in running:
             process.terminate()
@@ -116,7 +117,7 @@ class _Processes:
             process.kill()
             process.wait()
 
-    def _started(self, number: int) -> subprocess.Popen[bytes]:
+    def _start(self, number: int) -> subprocess.Popen[bytes]:
         parent = os.getpid()
         environment = {**os.environ, **self._farm.environment, ENVIRONMENT: self._farm.url}
         environment.setdefault("OMP_NUM_THREADS", cores_per_worker(len(self._commands) - 1))
@@ -125,15 +126,15 @@ class _Processes:
             env=environment,
             stdin=subprocess.DEVNULL,
             stdout=sys.stderr.fileno(),
-            start_new_session=True,  # Ctrl-C is for us; we end them
+            start_new_session=True,  # only this process receives Ctrl-C
             preexec_fn=lambda: terminate_with_parent(parent, signal.SIGTERM),
         )
 
 
-def gpus_here(asked: Sequence[int] | None) -> tuple[int, ...]:
-    """The GPUs to use: those asked for, or all that the driver names."""
-    if asked:
-        return tuple(asked)
+def gpus_here(requested: Sequence[int] | None) -> tuple[int, ...]:
+    """Return the GPUs to use: the requested ones, or all that the driver lists."""
+    if requested:
+        return tuple(requested)
     try:
         listed = subprocess.run(["nvidia-smi", "-L"], capture_output=True, text=True, check=True, timeout=30).stdout
     except (OSError, subprocess.SubprocessError):
