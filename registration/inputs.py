@@ -34,7 +34,7 @@ NOT_HASHED = {  # fields of the options that decide nothing by themselves, and w
 
 @dataclass(frozen=True, kw_only=True)
 class RegistrationInputs:
-    """All that a registration is made from, read and checked."""
+    """The inputs of a registration, read and checked."""
 
     capture: Capture  # with the selected views only
     data: gnm_npz.GNMData
@@ -54,7 +54,7 @@ class RegistrationInputs:
 def read_inputs(
     capture_path: Path, model_path: Path, options: RegisterOptions, neutral: Path | None = None
 ) -> RegistrationInputs:
-    """Read and check everything that a registration is made from; of the views only landmarks are triangulated.
+    """Read and check the inputs of a registration. Images are not decoded; landmarks are triangulated.
 
     Args:
         capture_path: a native capture folder.
@@ -146,7 +146,7 @@ def _deciding(
 
 
 def _select_views(capture: Capture, count: int | None) -> Capture:
-    """The capture with `count` views that are spread around the head; all of them for None."""
+    """The capture with only `count` views, spread around the head; with all of them for None."""
     if count is None:
         return capture
     if count < 2:
@@ -156,20 +156,20 @@ def _select_views(capture: Capture, count: int | None) -> Capture:
 
 
 def _triangulated(capture: Capture, schemes: Mapping[str, LandmarkScheme]) -> dict[str, Float[np.ndarray, "L 3"]]:
-    """Triangulated landmarks (world, metres; NaN = unseen) of every scheme that capture and model share."""
-    solved = {}
+    """Triangulated landmarks (world, metres; NaN: failed) of every scheme that capture and model share."""
+    landmarks = {}
     for name in sorted({name for view in capture.views for name in view.landmarks} & set(schemes)):
-        solved[name] = triangulate(capture, name)[0]
+        landmarks[name] = triangulate(capture, name)[0]
         expected = len(schemes[name].indices)
-        if len(solved[name]) != expected:
+        if len(landmarks[name]) != expected:
             raise InputError(
                 "Landmarks of another length than the model's scheme",
                 where=f"scheme {name} of {capture.root}",
                 expected=f"{expected} landmarks",
-                got=len(solved[name]),
+                got=len(landmarks[name]),
                 fix=f"name the scheme otherwise, or give the model's with --landmarks {name}=FILE",
             )
-    return solved
+    return landmarks
 
 
 def _check_model(data: gnm_npz.GNMData) -> None:

@@ -1,4 +1,4 @@
-"""The public entry: one capture in, one registration out."""
+"""Register one capture: read the inputs, fit, evaluate, write the folder."""
 
 import time
 from collections.abc import Collection, Mapping, Sequence
@@ -129,7 +129,7 @@ def _fit(
 
 
 def _context(inputs: RegistrationInputs, seed: int, device: torch.device, progress: Progress) -> FitContext:
-    """Decode the views; everything else of a fit is made from the inputs when it is needed."""
+    """Decode the views and collect the inputs of the fit."""
     classes, recipe, count = class_map(inputs.capture.classes), inputs.recipe, len(inputs.capture.views)
     pyramid = build_pyramid(
         inputs.capture,
@@ -278,11 +278,11 @@ def _status(
 def _evaluate(
     inputs: RegistrationInputs, problem: FitProblem, registration: Registration, progress: Progress
 ) -> tuple[Registration, str]:
-    """The registration with its metrics, against the scan too if there is one, and the report's page."""
+    """The registration with its metrics, including those against a scan, and the report's page."""
     evaluation: Evaluation | None = None
     finite = np.isfinite(registration.vertices).all()
     if finite:
-        progress.note("auditing parts that may run through one another")
+        progress.note("auditing intersections between parts")
         intersections = audit(registration.vertices, inputs.data, scale=float(registration.scale)).figures
         registration = replace(registration, figures={**registration.figures, "intersections": intersections})
     if inputs.capture.scan is not None and finite:

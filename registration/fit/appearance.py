@@ -31,7 +31,7 @@ class Appearance:
     def __init__(self, renderer: Renderer, size_px: int, views: int, device: torch.device):
         self._renderer = renderer
         self.texture: Float[Tensor, "R R 3"] = torch.full((size_px, size_px, 3), _GREY, device=device)
-        self.known = False  # whether the texture was estimated or set
+        self.has_texture = False  # whether it was estimated or set
         self._exposures = torch.zeros(views, 3, 2, device=device)  # log gain and bias
 
     @property
@@ -41,7 +41,7 @@ class Appearance:
 
     def set_texture(self, texture: Float[np.ndarray, "R R 3"]) -> None:
         """Set a texture that was estimated before (linear)."""
-        self.texture, self.known = torch.as_tensor(texture, device=self.texture.device), True
+        self.texture, self.has_texture = torch.as_tensor(texture, device=self.texture.device), True
 
     def apply_exposure(self, rendered: Rendered, batch: Targets, views: Sequence[int]) -> Rendered:
         """Return the rendering with colours as each camera records them: gain times colour plus bias."""
@@ -127,4 +127,4 @@ class Appearance:
         visible = density > _MIN_DENSITY
         mean = total / density.clamp_min(_MIN_DENSITY)[..., None]
         fill = mean[visible].mean(0) if visible.any() else torch.full_like(mean[0, 0], _GREY)
-        self.texture, self.known = torch.where(visible[..., None], mean, fill), True
+        self.texture, self.has_texture = torch.where(visible[..., None], mean, fill), True

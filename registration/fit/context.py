@@ -1,4 +1,4 @@
-"""What a fit is made of whatever its initial guess: model, targets, recipe, and what is computed from them once."""
+"""The parts of a fit that do not depend on the initial guess: model, targets, recipe, and what is derived from them."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -28,7 +28,7 @@ _REGION_RINGS = 2  # of vertices around an offset region that belong to it, so t
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class FitContext:
-    """The inputs of a fit, and what every stage needs of them."""
+    """The inputs of a fit, and what is derived from them once, when it is first needed."""
 
     data: GNMData
     model: GNM  # the same model as a function, on the device of the fit
@@ -84,7 +84,7 @@ class FitContext:
 
     @cached_property
     def self_intersection(self) -> SelfIntersectionPenalty:
-        """The penalty on parts of the head that run into one another."""
+        """The penalty on intersections between parts of the head."""
         return SelfIntersectionPenalty(self.data, self.device)
 
     @cached_property

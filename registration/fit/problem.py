@@ -1,4 +1,4 @@
-"""The fitting problem of one capture from one initial guess: its stages, and measurements of where it stands."""
+"""The fitting problem of one capture from one initial guess: its stages, and measurements of its current state."""
 
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -50,7 +50,7 @@ class _StageTrace:
 
 
 class FitProblem:
-    """Variables, texture and view weights of one fit. Everything that is the same for any initial guess is `context`.
+    """Variables, texture and view weights of one fit. What does not depend on the initial guess is in `context`.
 
     Args:
         context: model, targets and recipe.
@@ -104,7 +104,7 @@ class FitProblem:
         lengths = stage.lengths if "offsets" in names else None
         regularizer, steps = (None, None) if lengths is None else self._prepare_regularizer(lengths)
         self.variables.set_free(names, steps)
-        if stage.texture and not self.appearance.known:
+        if stage.texture and not self.appearance.has_texture:
             self.appearance.unwrap_views(self.vertices(), self._all_views(stage))
         terms = make_terms(
             StageContext(
@@ -167,7 +167,7 @@ class FitProblem:
         return blocks
 
     def _losses(self, stage: Stage, terms: Sequence[Term], step: int) -> dict[str, Tensor]:
-        """The weighted losses of one step, by name; texture and exposures are updated along the way."""
+        """The weighted losses of one step, by name. Updates texture and exposures too."""
         state = self._step_state(stage, step)
         if stage.texture:
             self.appearance.fit_exposures(state.rendered, state.batch, state.agree, state.views)

@@ -62,3 +62,24 @@ def fit_twists(
     gram = weighted @ fields.reshape(6, -1).T
     right = displacements.reshape(len(displacements), -1) @ weighted.T
     return np.asarray(right @ np.linalg.pinv(gram, rcond=1e-10, hermitian=True))
+
+
+def similarity_transform(
+    source: Float[np.ndarray, "P 3"], target: Float[np.ndarray, "P 3"], *, free_scale: bool
+) -> tuple[float, Float[np.ndarray, "3 3"], Float[np.ndarray, "3"]]:
+    """Return the similarity transform of least squares between two point sets [Umeyama 1991].
+
+    Args:
+        source: points.
+        target: the corresponding points, in the same unit.
+        free_scale: estimate the scale; else it is 1.
+
+    Returns:
+        Scale s, rotation R and translation t with target = s R source + t.
+    """
+    a, b = source.mean(0), target.mean(0)
+    u, s, vt = np.linalg.svd((target - b).T @ (source - a))
+    flip = np.diag([1, 1, np.sign(np.linalg.det(u @ vt))])
+    rotation = u @ flip @ vt
+    scale = float((s * np.diag(flip)).sum() / ((source - a) ** 2).sum()) if free_scale else 1.0
+    return scale, rotation, b - scale * rotation @ a

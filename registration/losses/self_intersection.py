@@ -40,7 +40,7 @@ OF_THE_TONGUE = ("tongue-teeth", "tongue-lips", "tongue-palate", "tongue-gums")
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _Candidates:
-    """What may touch in one pose of the head."""
+    """The vertices that may touch another part in one pose of the head."""
 
     scale: float  # size of the head relative to the template
     origin: Float[Tensor, "3"]  # of the skin, world, metres
@@ -51,7 +51,7 @@ class _Candidates:
 
 
 class SelfIntersectionPenalty:
-    """How much deeper than in the template the parts of a posed head run into one another.
+    """Penalty on parts of a posed head that intersect more deeply than in the template.
 
     Independent of the rigid pose and the scale of the head. The vertices that may touch are determined by
     `update_candidates`: before the first call with another head, and then about every ten steps.

@@ -1,4 +1,4 @@
-"""Contacts: parts of the head that run into one another (losses/self_intersection.py)."""
+"""Contacts: intersections between parts of the head (losses/self_intersection.py)."""
 
 from collections.abc import Mapping
 

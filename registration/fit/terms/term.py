@@ -1,4 +1,4 @@
-"""What a loss term of a fit is, and what it is given."""
+"""The protocol of a loss term, and its inputs."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -18,7 +18,7 @@ from registration.types import Rendered, Targets
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class StageContext:
-    """What stays the same for all steps of a stage."""
+    """The inputs that all steps of a stage share."""
 
     fit: FitContext
     stage: Stage
@@ -30,7 +30,7 @@ class StageContext:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class StepState:
-    """What is known in one step; the tensors of the mesh and the rendering are differentiable in the free variables."""
+    """One step: its views, mesh and rendering. Mesh and rendering are differentiable in the free variables."""
 
     step: int  # of the stage, from 0
     views: Sequence[int]  # the views of this step
