@@ -1,15 +1,15 @@
-"""Two rounds of coregistration from the first model: what registrations teach a model about people it has not seen.
+"""Run rounds of coregistration on a synthetic population and measure how much the model improves.
 
     python -m bench.coregistration [--out DIR] [--training 40] [--held-out 10] [--rounds 2] [--jobs 2]
 
-A synthetic population of any adult age and build, neutrals only, 8 views of 256 x 256 (`gnmreg dataset synth`), goes
-through the loop of `gnmreg coregister`. Held-out people are measured on their true meshes with the same number of
-identity components for every model, in mm, in three ways: vertex to vertex on the head's skin, as `gnmreg model
-evaluate` does; vertex to vertex on the whole outer skin by area; and surface to surface there, which is what scans see,
-for it does not ask which vertex lies where on smooth skin, and no picture tells. Specificity: of 100 random heads from
-the nearest of all true heads. `gain`: by which share of model 0's error the last model is nearer, with 20 components.
-`negative_control`: the same of a model that is built from random heads of model 0 itself, as many as there are
-subjects: what a build alone does. Run again with the same --out it goes on where it was interrupted.
+Neutrals of any adult age and build, 8 views of 256 x 256 px (`gnmreg dataset synth`), go through the loop of `gnmreg
+coregister`. Models are evaluated on the true meshes of held-out subjects with the same numbers of identity components,
+in mm, by three measures: vertex to vertex on the head's skin, as by `gnmreg model evaluate`; vertex to vertex on the
+whole exterior skin, weighted by area; and surface to surface there, which is what scans measure: it does not depend on
+the position of vertices along smooth skin, which images do not determine. Specificity: of 100 random heads from the
+nearest true head. `gain`: relative reduction of model 0's distance by the last model, with 20 components.
+`negative_control`: the same for a model that is built from as many random heads of model 0 itself: the effect of
+building alone. With the same --out an interrupted run is resumed.
 """
 
 import argparse
@@ -31,7 +31,8 @@ from coregister.next_model.training_data import NEUTRAL, TrainingMesh, TrainingS
 from coregister.stopping_rule import Rule
 from coregister.synthetic.capture import Studio
 from registration.capture.scan import read_truth
-from registration.evaluate.distances import Surface, spread
+from registration.geometry.closest_point import barycentric_points
+from registration.geometry.surface_samples import sample_surface
 from registration.geometry.topology import vertex_areas
 from registration.model import gnm_npz, regions
 from registration.model.gnm_npz import GNMData
@@ -47,21 +48,21 @@ from workflows.steps.hold_out import PEOPLE
 from workflows.steps.synthesize import Population, synth_dataset
 
 COMPONENTS = (10, 20, 40)
-AT = "20"  # what counts
+HEADLINE = "20"  # number of components of the gain
 SAMPLES = 100
 CONTROL = "control"
-POINTS = 2000  # of a true surface
+POINTS = 2000  # of each true surface
 STUDIO = Studio(cameras=8, size_px=(256, 256), texture_size=512, quality=Quality(pixel_samples=2, light_rays=32))
 
 
-def own_samples(data: GNMData, count: int, seed: int) -> list[TrainingSubject]:
-    """Random heads of a model, coefficients of unit variance, seen everywhere."""
-    drawn = np.random.default_rng(seed).standard_normal((count, len(data.vertex_identity_basis)))
-    heads = data.template_vertex_positions + np.tensordot(drawn, data.vertex_identity_basis, 1)
-    sure = np.ones(len(data.template_vertex_positions), np.float32)
+def model_samples(data: GNMData, count: int, seed: int) -> list[TrainingSubject]:
+    """Return random heads of a model, coefficients of unit variance, observed everywhere."""
+    coefficients = np.random.default_rng(seed).standard_normal((count, len(data.vertex_identity_basis)))
+    heads = data.template_vertex_positions + np.tensordot(coefficients, data.vertex_identity_basis, 1)
+    confidence = np.ones(len(data.template_vertex_positions), np.float32)
     subjects = []
     for number, head in enumerate(heads.astype(np.float32)):
-        mesh = TrainingMesh(name=NEUTRAL, label=NEUTRAL, vertices=head, confidence=sure, triangles=data.triangles)
+        mesh = TrainingMesh(name=NEUTRAL, label=NEUTRAL, vertices=head, confidence=confidence, triangles=data.triangles)
         subjects.append(TrainingSubject(name=f"sample_{number:03d}", neutral=mesh))
     return subjects
 
@@ -73,34 +74,35 @@ def surface_part(data: GNMData) -> LinearPart:
     return replace(part, weights=area / area.mean())
 
 
-def vertices_mm(data: GNMData, people: Sequence[HeldOutSubject], part: LinearPart) -> dict[str, float]:
-    """Number of components -> mean distance between the same vertices, over the people."""
+def vertices_mm(data: GNMData, subjects: Sequence[HeldOutSubject], part: LinearPart) -> dict[str, float]:
+    """Return number of components -> mean distance between corresponding vertices over the subjects."""
     counts = [k for k in COMPONENTS if k <= len(part.basis)]
-    found = [fit_correspondence(part, one.neutral[part.rows], counts) for one in people]
-    means = np.array([[part.mean(one.distance_mm) for one in fits] for fits in found]).mean(0)
+    fits = [fit_correspondence(part, subject.neutral[part.rows], counts) for subject in subjects]
+    means = np.array([[part.mean(fit.distance_mm) for fit in subject_fits] for subject_fits in fits]).mean(0)
     return dict(zip(map(str, counts), means.tolist(), strict=True))
 
 
-def surface_mm(data: GNMData, people: Sequence[HeldOutSubject], part: LinearPart) -> dict[str, float]:
-    """The same of points of the true surface, spread by area, from the model's, with the number that counts."""
-    count, outside = int(AT), identity_part(data, regions.exterior(data))
+def surface_mm(data: GNMData, subjects: Sequence[HeldOutSubject], part: LinearPart) -> dict[str, float]:
+    """Return the mean distance of points of the true surface from the model's, with HEADLINE components."""
+    count, exterior = int(HEADLINE), identity_part(data, regions.exterior(data))
     if count > len(part.basis):
         return {}
-    found = []
-    for number, one in enumerate(people):
-        start = fit_correspondence(part, one.neutral[part.rows], [count])
-        truth = Surface(vertices=one.neutral[outside.rows].astype(np.float64), triangles=outside.triangles)
-        points, _ = spread(truth, POINTS, seed=number)
-        found.append(fit_scan(outside, points, start)[0].distance_mm.mean())
-    return {AT: float(np.mean(found))}
+    distances = []
+    for number, subject in enumerate(subjects):
+        initial = fit_correspondence(part, subject.neutral[part.rows], [count])
+        vertices = subject.neutral[exterior.rows].astype(np.float64)
+        samples = sample_surface(vertices, exterior.triangles, POINTS, np.random.default_rng(number))
+        points = barycentric_points(vertices, exterior.triangles, *samples)
+        distances.append(fit_scan(exterior, points, initial)[0].distance_mm.mean())
+    return {HEADLINE: float(np.mean(distances))}
 
 
-def specific_mm(data: GNMData, truths: np.ndarray) -> float:
-    """How far random heads are from the nearest real one, with the number of components that counts."""
+def mean_specificity_mm(data: GNMData, truths: np.ndarray) -> float:
+    """Return the mean distance of random heads from the nearest true one, with HEADLINE components."""
     part = identity_part(data)
-    if int(AT) > len(part.basis):
+    if int(HEADLINE) > len(part.basis):
         return float("nan")
-    return float(specificity_mm(part, truths[:, part.rows], (int(AT),), samples=SAMPLES).mean())
+    return float(specificity_mm(part, truths[:, part.rows], (int(HEADLINE),), samples=SAMPLES).mean())
 
 
 MEASURES = {
@@ -122,10 +124,10 @@ def main() -> None:
     options = parser.parse_args()
     count = options.training + options.held_out
     first = bootstrap.bootstrap(options.out / "first" / "gnm_head_first.npz")
-    people = Population(subjects=count, seed=options.seed, held_out=options.held_out, studio=STUDIO)
-    begun = time.perf_counter()
+    population = Population(subjects=count, seed=options.seed, held_out=options.held_out, studio=STUDIO)
+    start = time.perf_counter()
     with shown() as progress:
-        synth_dataset(options.out / "dataset", people, jobs=options.jobs, progress=progress)
+        synth_dataset(options.out / "dataset", population, jobs=options.jobs, progress=progress)
         captured = time.perf_counter()
         plan = make_plan(
             options.out / "dataset",
@@ -140,33 +142,47 @@ def main() -> None:
         farm = options.out / "farm"
         url = default_url(farm)
         migrate(url)
-        told = coregister(plan, url=url, folder=farm, workers=options.jobs, progress=progress)
-    if "stopped" in told:
-        sys.exit(told["stopped"])
-    print(f"captures {count} seconds {captured - begun:.0f}; rounds {time.perf_counter() - captured:.0f}")
-    people = read_held_out(options.out / "rounds" / "held_out" / PEOPLE).subjects
-    models = {name: gnm_npz.read(Path(file)) for name, file in told["models"].items()}
-    samples = own_samples(models[FIRST], options.training, options.seed)
+        record = coregister(plan, url=url, folder=farm, workers=options.jobs, progress=progress)
+    if "stopped" in record:
+        sys.exit(record["stopped"])
+    print(f"captures {count} seconds {captured - start:.0f}; rounds {time.perf_counter() - captured:.0f}")
+    subjects = read_held_out(options.out / "rounds" / "held_out" / PEOPLE).subjects
+    models = {name: gnm_npz.read(Path(file)) for name, file in record["models"].items()}
+    names = list(models)
+    samples = model_samples(models[FIRST], options.training, options.seed)
     models[CONTROL] = build_model(samples, models[FIRST]).data
-    figures = {}
+    distances = print_distances(models, subjects)
+    for round_ in record["rounds"]:
+        rejected = [row["name"] for row in round_["build"]["rejected"]]
+        print(f"{round_['name']} {round_['decide']} rejected {rejected}")
+    truths = np.stack([read_truth(file) for file in sorted((options.out / "dataset").glob("*/*/ground_truth.npz"))])
+    for number, name in enumerate(names):
+        print(f"specificity {number} {mean_specificity_mm(models[name], truths):.3f}")
+    print_gains(distances, names)
+
+
+def print_distances(
+    models: dict[str, GNMData], subjects: Sequence[HeldOutSubject]
+) -> dict[tuple[str, str], dict[str, float]]:
+    """Print a table for each measure; return (measure, model) -> number of components -> mm."""
+    distances = {}
     for measure, (distance_mm, part_of) in MEASURES.items():
         print(f"{measure:44}" + "".join(f"{k:>9} mm" for k in COMPONENTS))
         for name, data in models.items():
-            row = figures[measure, name] = distance_mm(data, people, part_of(data))
+            row = distances[measure, name] = distance_mm(data, subjects, part_of(data))
             print(f"{name:44}" + "".join(f"{row[str(k)]:12.3f}" if str(k) in row else f"{'–':>12}" for k in COMPONENTS))
-    for one in told["rounds"]:
-        print(f"{one['name']} {one['decide']} rejected {[r['name'] for r in one['build']['rejected']]}")
-    names = list(told["models"])
-    truths = np.stack([read_truth(file) for file in sorted((options.out / "dataset").glob("*/*/ground_truth.npz"))])
-    for number, name in enumerate(names):
-        print(f"specificity {number} {specific_mm(models[name], truths):.3f}")
-    for measure in MEASURES:  # the last lines are of the last one
-        before, after = figures[measure, FIRST][AT], figures[measure, names[-1]].get(AT, np.nan)
+    return distances
+
+
+def print_gains(distances: dict[tuple[str, str], dict[str, float]], names: Sequence[str]) -> None:
+    """Print distances and gain with HEADLINE components; the last rows are those of the last measure."""
+    for measure in MEASURES:
+        first, last = distances[measure, FIRST][HEADLINE], distances[measure, names[-1]].get(HEADLINE, np.nan)
         print(f"{measure}:")
-        print(f"negative_control {1 - figures[measure, CONTROL].get(AT, np.nan) / before:.3f}")
+        print(f"negative_control {1 - distances[measure, CONTROL].get(HEADLINE, np.nan) / first:.3f}")
         for number, name in enumerate(names):
-            print(f"generalization_mm {number} {figures[measure, name].get(AT, float('nan')):.3f}")
-        print(f"gain {1 - after / before:.3f}")
+            print(f"generalization_mm {number} {distances[measure, name].get(HEADLINE, np.nan):.3f}")
+        print(f"gain {1 - last / first:.3f}")
 
 
 if __name__ == "__main__":

@@ -1,11 +1,12 @@
-"""Principal components of the lower face over many samples, in bounded memory.
+"""Measure streamed principal components of the lower face over many samples: accuracy, time and memory.
 
     python -m bench.model_building [--samples 20000] [--components 150] [--memory-gb 4]
 
-Samples are drawn as they are read, never stored: 400 smooth modes of the first model's lower-face skin whose variances
-fall by the power of 1.5, random coefficients, and noise of 0.05 mm, by seed. The way is chosen by size, as in a build.
-Truth is the modes' own covariance. The last lines give seconds, peak memory of the process, and what 150,000 samples
-would take: the time of a pass grows with the samples, the memory does not depend on them.
+Samples are generated while they are read, never stored: 400 smooth modes of the first model's lower-face skin whose
+variances decrease with the power 1.5 of their number, random coefficients, and noise of 0.05 mm. The method is chosen
+by size, as in model building. The truth is the covariance of the modes. The last rows give seconds, peak memory of the
+process, and an estimate for 150,000 samples: the time of a pass is proportional to the number of samples, the memory
+does not depend on it.
 
 Of 150,000 x 53,463 float32 (all vertices of the official mesh) the samples alone are 32 GB, their covariance 23 GB in
 float64; the lower face is 9,764 of its vertices.
@@ -29,8 +30,8 @@ BLOCK = 256
 OFFICIAL = 150_000
 
 
-class Drawn:
-    """Samples of D numbers, the same ones each time they are read."""
+class GeneratedSamples:
+    """Random samples of D numbers, equal each time they are read."""
 
     def __init__(self, count: int, modes: np.ndarray):
         self._count, self._modes = count, modes.astype(np.float32)
@@ -40,16 +41,16 @@ class Drawn:
         rng = np.random.default_rng(0)
         self.passes += 1
         for first in range(0, self._count, BLOCK):
-            begun = time.perf_counter()
+            start = time.perf_counter()
             size = min(BLOCK, self._count - first)
             block = rng.standard_normal((size, len(self._modes)), np.float32) @ self._modes
             block += NOISE_M * rng.standard_normal(block.shape, np.float32)
-            self.seconds += time.perf_counter() - begun
+            self.seconds += time.perf_counter() - start
             yield from block
 
 
-def modes_of(points: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """MODES orthogonal smooth fields, (M, 3 V), scaled to falling deviations: 10 mm rms in the first."""
+def smooth_modes(points: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """Return MODES orthogonal smooth fields, (M, 3 V), with decreasing standard deviations; the first has 10 mm rms."""
     waves = rng.normal(0, 60, (MODES, 3)), rng.uniform(0, 2 * np.pi, MODES)
     fields = np.cos(waves[0] @ points.T + waves[1][:, None])[:, :, None] * rng.normal(size=(MODES, 1, 3))
     q, _ = np.linalg.qr(fields.reshape(MODES, -1).T)
@@ -64,23 +65,23 @@ def main() -> None:
     args = parser.parse_args()
     data = gnm_npz.read(build.bootstrap())
     rows = np.flatnonzero(regional_masks(data)[REGIONS.index("lower_face_region")] > 0)
-    modes = modes_of(data.template_vertex_positions[rows].astype(np.float64), np.random.default_rng(1))
-    drawn = Drawn(args.samples, modes)
-    begun = time.perf_counter()
-    found = principal_components(drawn, centred=False, most=args.components, memory_gb=args.memory_gb)
-    seconds = time.perf_counter() - begun
+    modes = smooth_modes(data.template_vertex_positions[rows].astype(np.float64), np.random.default_rng(1))
+    samples = GeneratedSamples(args.samples, modes)
+    start = time.perf_counter()
+    principal = principal_components(samples, centred=False, most=args.components, memory_gb=args.memory_gb)
+    seconds = time.perf_counter() - start
     truth = (modes**2).sum(1) + NOISE_M**2
-    error = np.abs(found.variance / truth[: len(found.variance)] - 1)
-    chance = np.sqrt(2 / args.samples)
+    error = np.abs(principal.variance / truth[: len(principal.variance)] - 1)
+    expected = np.sqrt(2 / args.samples)
     gigabytes = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024 / 1e9
-    print(f"vertices {len(rows)} numbers {3 * len(rows)} samples {args.samples} components {len(found.variance)}")
-    print(f"method {found.method} passes {drawn.passes} of_the_seconds_drawing {drawn.seconds:.0f}")
-    print(f"variances_off {error.mean():.4f} chance {chance:.4f}")
+    print(f"vertices {len(rows)} numbers {3 * len(rows)} samples {args.samples} components {len(principal.variance)}")
+    print(f"method {principal.method} passes {samples.passes} seconds_of_generation {samples.seconds:.0f}")
+    print(f"variance_error {error.mean():.4f} expected {expected:.4f}")
     print(f"seconds {seconds:.0f}")
     print(f"peak_gb {gigabytes:.2f}")
-    more = OFFICIAL / args.samples
-    spool = OFFICIAL * 12 * len(data.template_vertex_positions) / 1e9
-    print(f"at_150000 hours {seconds * more / 3600:.2f} peak_gb {gigabytes:.2f} on_disk_gb {spool:.0f}")
+    factor = OFFICIAL / args.samples
+    disk_gb = OFFICIAL * 12 * len(data.template_vertex_positions) / 1e9
+    print(f"at_150000 hours {seconds * factor / 3600:.2f} peak_gb {gigabytes:.2f} on_disk_gb {disk_gb:.0f}")
 
 
 if __name__ == "__main__":

@@ -1,18 +1,20 @@
-"""Does a model that is rebuilt from a few real shapes come nearer to the next one? Leave-one-out over captures.
+"""Measure on real captures, leave-one-out, whether a model rebuilt from few subjects generalizes better.
 
-    python -m bench.real_shape CAPTURE... --model MODEL.npz --out OUT [--previous chosen] [--by-area] [--no-mirrored]
+    python -m bench.real_shape CAPTURE... --model MODEL.npz --out OUT [--shrinkage chosen] [--by-area] [--no-mirrored]
 
-Every neutral CAPTURE, with a scan, is registered with the `draft` recipe from MODEL into OUT/registrations; what is
-there already is not registered again. Then each subject in turn is left out: the next model is built from the others,
-as far as their registrations did not fail, and MODEL, and both models are fitted to the one left out with the same
-numbers of components, in two ways:
+Every neutral CAPTURE, with a scan, is registered with the `draft` recipe from MODEL into OUT/registrations; existing
+registrations are reused. Each subject in turn is held out: the next model is built from the other subjects' usable
+registrations and MODEL, and both models are fitted to the held-out subject with the same numbers of components, by two
+measures:
 
-scan      the scan's points of the face (as `gnmreg evaluate` takes them) from the model's surface, all coefficients and
-          the rigid motion free (`coregister.evaluate.scan_fit`): owes nothing to the registration of the one left out
-vertices  the vertices of its registration that cameras saw, on the head's skin. That registration was made with MODEL,
-          so where it saw little it looks like MODEL, in whose favour this figure is biased; and it slides as MODEL does
+scan      distance of the scan's points of the face (as `gnmreg evaluate` selects them) from the model's surface, with
+          all coefficients and the rigid motion free (`coregister.evaluate.scan_fit`): independent of the subject's
+          registration
+vertices  distance of the registration's observed vertices on the head's skin. That registration was made with MODEL:
+          where it had few observations it resembles MODEL, and its vertices slide as MODEL's do, so that this measure
+          is biased towards MODEL
 
-Tables of mm and of the ratio next / MODEL by subject; the last lines are the scan's, at `--headline` components.
+Tables of mm and of the ratio next / MODEL by subject; the last rows are the scan's, with `--headline` components.
 """
 
 import argparse
@@ -43,23 +45,25 @@ from registration.pipeline import register
 from registration.progress import shown
 from registration.types import Capture, Registration
 
-_SURE = 0.1  # confidence from which on a vertex was seen
+_MIN_CONFIDENCE = 0.1  # of observed vertices
 USABLE = ("converged", "stopped")
+MEASURES = ("scan", "vertices")
 
 
-def registered(captures: Sequence[Path], model: Path, out: Path) -> list[tuple[Capture, Registration]]:
-    """Each capture and its registration in a folder of the subject's name."""
-    found = []
+def register_all(captures: Sequence[Path], model: Path, out: Path) -> list[tuple[Capture, Registration]]:
+    """Register each capture into a folder with the subject's name."""
+    pairs = []
     with shown() as progress:
         for number, path in enumerate(captures):
             capture = read_capture(path)
             progress.at(number, len(captures), capture.subject)
-            one = register(path, model, out / "registrations" / capture.subject, progress=progress)
-            found.append((capture, one))
-    return found
+            registration = register(path, model, out / "registrations" / capture.subject, progress=progress)
+            pairs.append((capture, registration))
+    return pairs
 
 
-def subject_of(capture: Capture, registration: Registration, model: GNM) -> TrainingSubject:
+def training_subject(capture: Capture, registration: Registration, model: GNM) -> TrainingSubject:
+    """Return the unposed neutral for model building."""
     mesh = TrainingMesh(
         name=capture.subject,
         label="neutral",
@@ -71,62 +75,65 @@ def subject_of(capture: Capture, registration: Registration, model: GNM) -> Trai
 
 
 def face_points(capture: Capture, registration: Registration) -> Float[np.ndarray, "P 3"]:
-    """The scan's points on the face that two cameras see; metres, capture world."""
+    """Return the scan's points on the face that two cameras see; metres, capture world."""
     assert capture.scan is not None
     scan = read_scan(capture.scan)
     surface = scan if len(scan.triangles) else registration
-    slack = () if len(scan.triangles) else (CLOUD_TOLERANCE,)
+    tolerance = () if len(scan.triangles) else (CLOUD_TOLERANCE,)
     cameras = [view.camera for view in capture.views]
     inside = face_ball(capture, registration).holds(scan.vertices)
-    inside &= seen(scan.vertices, surface.vertices.astype(np.float64), surface.triangles, cameras, *slack)
+    inside &= seen(scan.vertices, surface.vertices.astype(np.float64), surface.triangles, cameras, *tolerance)
     return scan.vertices[inside].astype(np.float64)
 
 
 def errors_mm(
     data: GNMData, registration: Registration, points: Float[np.ndarray, "P 3"], counts: Sequence[int]
 ) -> Float[np.ndarray, "2 k"]:
-    """Mean distances of the model from the scan's points and from the registration's vertices."""
-    was_seen = identity_part(data, regions.head_skin(data) & (registration.confidence >= _SURE))
-    starts = fit_correspondence(was_seen, registration.vertices[was_seen.rows], counts)
-    scans = fit_scan(identity_part(data, regions.exterior(data)), points, starts)
-    return np.array([_means(scans), _means(starts)])
+    """Return the model's mean distances from the scan's points and from the registration's vertices."""
+    observed = regions.head_skin(data) & (registration.confidence >= _MIN_CONFIDENCE)
+    part = identity_part(data, observed)
+    vertex_fits = fit_correspondence(part, registration.vertices[part.rows], counts)
+    scan_fits = fit_scan(identity_part(data, regions.exterior(data)), points, vertex_fits)
+    return np.array([_means(scan_fits), _means(vertex_fits)])
 
 
 def _means(fits: Sequence[LinearFit]) -> list[float]:
-    return [float(one.distance_mm.mean()) for one in fits]
+    return [float(fit.distance_mm.mean()) for fit in fits]
 
 
-def left_out(
+def leave_one_out(
     pairs: Sequence[tuple[Capture, Registration]], previous: GNMData, settings: IdentitySettings, counts: Sequence[int]
 ) -> Float[np.ndarray, "N 2 2 k"]:
-    """Subject by model (previous, next) by way (scan, vertices) by number of components: mm."""
-    function = GNM(previous)
-    subjects = [subject_of(capture, one, function) for capture, one in pairs]
-    found = []
+    """Return mean distances in mm: subject, model (previous, next), measure, number of components."""
+    model = GNM(previous)
+    subjects = [training_subject(capture, registration, model) for capture, registration in pairs]
+    errors = []
     with shown() as progress:
-        for number, (capture, one) in enumerate(pairs):
+        for number, (capture, registration) in enumerate(pairs):
             progress.at(number, len(pairs), f"without {capture.subject}")
-            points = face_points(capture, one)
+            points = face_points(capture, registration)
             others = [
-                subjects[other]
-                for other, (_, registration) in enumerate(pairs)
-                if other != number and registration.status in USABLE
+                subject
+                for index, (subject, (_, other)) in enumerate(zip(subjects, pairs, strict=True))
+                if index != number and other.status in USABLE
             ]
             rebuilt = build_model(others, previous, replace(true_meshes(), identity=settings)).data
-            found.append([errors_mm(data, one, points, counts) for data in (previous, rebuilt)])
-    return np.array(found)
+            errors.append([errors_mm(data, registration, points, counts) for data in (previous, rebuilt)])
+    return np.array(errors)
 
 
-def show(names: Sequence[str], figures: Float[np.ndarray, "N 2 2 k"], counts: Sequence[int]) -> None:
-    for way, kind in enumerate(("scan", "vertices")):
-        table = Table("subject", *(f"{k}" for k in counts), title=f"{kind}: previous, next, mm, at components")
-        for name, rows in zip(names, figures[:, :, way], strict=True):
-            table.add_row(name, *(f"{one:.3f} {two:.3f}" for one, two in rows.T))
+def print_tables(names: Sequence[str], errors: Float[np.ndarray, "N 2 2 k"], counts: Sequence[int]) -> None:
+    """Print a table and the statistics of the ratio for each measure."""
+    for index, measure in enumerate(MEASURES):
+        table = Table("subject", *(f"{k}" for k in counts), title=f"{measure}: previous, next, mm, by components")
+        for name, rows in zip(names, errors[:, :, index], strict=True):
+            table.add_row(name, *(f"{previous_mm:.3f} {next_mm:.3f}" for previous_mm, next_mm in rows.T))
         Console(width=100).print(table)
-        ratio = figures[:, 1, way] / figures[:, 0, way]
-        for k, of in zip(counts, ratio.T, strict=True):
-            low, middle, high = np.quantile(of, (0, 0.5, 1))
-            print(f"{kind} components {k} better {(of < 1).sum()} median {middle:.3f} from {low:.3f} to {high:.3f}")
+        ratios = errors[:, 1, index] / errors[:, 0, index]
+        for k, ratio in zip(counts, ratios.T, strict=True):
+            low, median, high = np.quantile(ratio, (0, 0.5, 1))
+            better = (ratio < 1).sum()
+            print(f"{measure} components {k} better {better} median {median:.3f} from {low:.3f} to {high:.3f}")
 
 
 def main() -> None:
@@ -141,26 +148,25 @@ def main() -> None:
         default = getattr(true_meshes().identity, name.replace("-", "_"))
         parser.add_argument(f"--{name}", action=argparse.BooleanOptionalAction, default=default)
     options = parser.parse_args()
-    pairs = registered(options.captures, options.model, options.out)
-    if bad := [capture.subject for capture, one in pairs if capture.scan is None]:
+    pairs = register_all(options.captures, options.model, options.out)
+    if missing := [capture.subject for capture, _ in pairs if capture.scan is None]:
         raise InputError(
-            "Captures are no use", where=", ".join(bad), expected="a scan", got="none", fix="leave them out"
+            "Captures have no scan", where=", ".join(missing), expected="a scan", got="none", fix="exclude them"
         )
-    for capture, one in pairs:
-        if one.status not in USABLE:
-            print(f"{capture.subject} is in no model: {one.reason}")
-    share = None if options.shrinkage == "chosen" else float(options.shrinkage)
+    for capture, registration in pairs:
+        if registration.status not in USABLE:
+            print(f"{capture.subject} is in no model: {registration.reason}")
     counts = sorted({*options.components, options.headline})
     settings = IdentitySettings(
         variance_ratio=1.0,
-        max_components=counts[-1],
-        shrinkage=share,
+        max_components=counts[-1],  # as many as MODEL is evaluated with
+        shrinkage=None if options.shrinkage == "chosen" else float(options.shrinkage),
         by_area=options.by_area,
         mirrored=options.mirrored,
-    )  # as many as MODEL is measured with
-    figures = left_out(pairs, gnm_npz.read(options.model), settings, counts)
-    show([capture.subject for capture, _ in pairs], figures, counts)
-    ratio = (figures[:, 1, 0] / figures[:, 0, 0])[:, counts.index(options.headline)]
+    )
+    errors = leave_one_out(pairs, gnm_npz.read(options.model), settings, counts)
+    print_tables([capture.subject for capture, _ in pairs], errors, counts)
+    ratio = (errors[:, 1, 0] / errors[:, 0, 0])[:, counts.index(options.headline)]
     print(f"{settings}")
     print(f"better {(ratio < 1).sum()} of {len(ratio)}")
     print(f"median_ratio {np.median(ratio):.3f}")

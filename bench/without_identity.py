@@ -1,10 +1,11 @@
-"""Make a model that cannot say one known person: that person's direction is projected out of its identity basis.
+"""Write a model that cannot represent one known person: their deviation is projected out of its identity basis.
 
     python -m bench.without_identity MODEL.npz SAMPLES.npz OUT.npz [--sample 0]
 
-A fit with such a model shows how far vertices slide where no prior holds them: scan distance does not see it, vertex
-error against the person's true mesh does. SAMPLES holds identity deltas `identity_deltas` (S, V, 3) in metres, or
-whatever array of that shape it has. Landmark schemes beside the model are copied beside the new one.
+A fit with such a model shows how far vertices slide along the surface where no prior constrains them: the distance from
+the scan does not measure it, the vertex error against the person's true mesh does. SAMPLES contains identity deltas
+(S, V, 3) in metres, an array whose name contains "identity". Landmark schemes beside the model are copied beside the
+new one.
 """
 
 import argparse
@@ -19,10 +20,7 @@ from registration.model import gnm_npz
 
 
 def project_out(basis: np.ndarray, direction: np.ndarray) -> np.ndarray:
-    """A basis (I, V, 3) without its part along `direction` (V, 3): no coefficients move the mesh along it.
-
-    The rows are made orthogonal to the direction. What the basis can still say is all that lies across it.
-    """
+    """Return the basis (I, V, 3) without its part along `direction` (V, 3): every component is orthogonal to it."""
     unit = (direction / np.linalg.norm(direction)).astype(np.float64)
     rows = basis.astype(np.float64)
     return (rows - np.tensordot(rows, unit, 2)[:, None, None] * unit).astype(basis.dtype)
@@ -37,20 +35,20 @@ def main() -> None:
     data = gnm_npz.read(options.model)
     shape = data.template_vertex_positions.shape
     with np.load(options.samples) as samples:
-        fitting = [name for name in samples.files if samples[name].shape[1:] == shape and "identity" in name]
-        if not fitting:
+        names = [name for name in samples.files if samples[name].shape[1:] == shape and "identity" in name]
+        if not names:
             raise InputError(
                 "No identity samples of this model",
                 where=options.samples,
                 expected=f"an array (S, {shape[0]}, 3) of identity deltas in metres",
                 got=", ".join(f"{name} {samples[name].shape}" for name in samples.files),
-                fix="give the samples that belong to the model",
+                fix="pass the samples that belong to the model",
             )
-        direction = samples[fitting[0]][options.sample]
+        direction = samples[names[0]][options.sample]
     gnm_npz.write(replace(data, vertex_identity_basis=project_out(data.vertex_identity_basis, direction)), options.out)
     for scheme in options.model.parent.glob("head_sparse_*.txt"):
         shutil.copy(scheme, options.out.parent)
-    print(f"{options.out}: without {fitting[0]}[{options.sample}]")
+    print(f"{options.out}: without {names[0]}[{options.sample}]")
 
 
 if __name__ == "__main__":
