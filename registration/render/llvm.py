@@ -17,6 +17,8 @@ import tempfile
 from pathlib import Path
 
 from registration.errors import InputError
+from registration.storage.cache import cache_folder
+from registration.storage.files import write_json
 
 ENVIRONMENT = "DRJIT_LIBLLVM_PATH"
 OLDEST_MAJOR = 16
@@ -136,8 +138,7 @@ def _packages() -> list[str]:
 
 def _cache_file() -> Path:
     """Where proofs are kept. Raises RuntimeError for a user without a home."""
-    home = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
-    return Path(home) / "gnm-registration" / "llvm.json"
+    return cache_folder() / "llvm.json"
 
 
 def _fingerprint(library: Path) -> dict[str, str | int]:
@@ -168,9 +169,7 @@ def _remember(named: str | None, library: Path) -> None:
         # Under its own path too: this process and its children find it named in their environment from now on.
         known |= dict.fromkeys([named or "", str(library)], _fingerprint(library))
         file.parent.mkdir(parents=True, exist_ok=True)
-        beside = file.with_suffix(f".{os.getpid()}")
-        beside.write_text(json.dumps(known, indent=1))
-        beside.replace(file)
+        write_json(file, known)
 
 
 if __name__ == "__main__":

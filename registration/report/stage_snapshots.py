@@ -1,6 +1,5 @@
 """Where a fit stands, to be looked at when a registration went wrong: a picture and the mesh after each stage."""
 
-import os
 from pathlib import Path
 
 import numpy as np
@@ -9,6 +8,7 @@ from PIL import Image
 
 from registration.frames import linear_to_srgb
 from registration.report.inputs import ReportView
+from registration.storage.files import atomic_file
 from registration.storage.mesh import write_ply
 
 
@@ -33,7 +33,7 @@ def write_stage(
     sheet = np.concatenate([np.pad(row, ((0, 0), (0, width - row.shape[1]), (0, 0))) for row in rows])
     folder.mkdir(parents=True, exist_ok=True)
     Image.fromarray((np.clip(np.nan_to_num(sheet), 0, 1) * 255).astype(np.uint8)).save(folder / f"{name}.png")
-    beside, mesh = folder / f".{name}.ply", folder / f"{name}.ply"
-    write_ply(beside, vertices, triangles)
-    os.replace(beside, mesh)
+    mesh = folder / f"{name}.ply"
+    with atomic_file(mesh) as temporary:
+        write_ply(temporary, vertices, triangles)
     return mesh

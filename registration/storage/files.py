@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from registration.errors import InputError
-from registration.storage.hashing import to_jsonable
+from registration.storage.jsonable import to_jsonable
 
 _AT_FDCWD, _RENAME_EXCHANGE = -100, 2  # linux/fcntl.h, linux/fs.h
 

@@ -2,7 +2,6 @@
 
 import hashlib
 import json
-import math
 import platform
 from collections.abc import Mapping
 from dataclasses import fields, is_dataclass, replace
@@ -12,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from registration.storage.jsonable import to_jsonable
 from registration.types import Capture, Registration
 
 PACKAGES = (
@@ -103,25 +103,6 @@ def hash_arrays(*arrays: np.ndarray) -> str:
     digest = hashlib.sha256()
     _feed(digest, list(arrays))
     return digest.hexdigest()
-
-
-def to_jsonable(value: Any) -> Any:
-    """Any configuration as JSON values: dataclasses become objects with their type's name, non-finite numbers null."""
-    if is_dataclass(value) and not isinstance(value, type):
-        return {"type": type(value).__name__, **{f.name: to_jsonable(getattr(value, f.name)) for f in fields(value)}}
-    if isinstance(value, Mapping):
-        return {str(key): to_jsonable(item) for key, item in value.items()}
-    if isinstance(value, (set, frozenset)):
-        return sorted((to_jsonable(item) for item in value), key=repr)
-    if isinstance(value, (list, tuple)):
-        return [to_jsonable(item) for item in value]
-    if hasattr(value, "tolist"):  # NumPy and torch arrays and scalars
-        return to_jsonable(value.tolist())
-    if isinstance(value, float):
-        return value if math.isfinite(value) else None
-    if value is None or isinstance(value, (bool, int, str)):
-        return value
-    return str(value)
 
 
 def versions() -> dict[str, str]:

@@ -39,7 +39,7 @@ from cattrs.gen import make_dict_structure_fn, override
 
 from registration.errors import InputError
 from registration.storage.files import atomic_write_text, has_kind, json_text
-from registration.storage.hashing import to_jsonable
+from registration.storage.jsonable import to_jsonable
 
 R = TypeVar("R", bound="Record")
 Hook = Callable[[Any, Any], Any]  # of cattrs: (value, type) -> the structured value

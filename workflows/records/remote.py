@@ -2,7 +2,6 @@
 
 import hashlib
 import json
-import os
 import shutil
 import tempfile
 from collections.abc import Iterator
@@ -13,9 +12,9 @@ from typing import Any
 import fsspec
 
 from registration.errors import InputError
+from registration.storage.cache import cache_folder
 from workflows.ids import redact
 
-CACHE = Path(os.environ.get("XDG_CACHE_HOME", "~/.cache")).expanduser() / "gnm-registration" / "fetched"
 MAX_BYTES = 64 * 2**30  # of one capture: far beyond any, and what a hostile listing must not make us fetch
 
 
@@ -78,10 +77,11 @@ def fetch_model(place: str) -> Path:
     if path not in infos:
         raise _unusable(place, expected="a model's NPZ file", got="no such file")
     told = {p: [str(i.get(k)) for k in ("size", "ETag", "etag", "LastModified", "mtime")] for p, i in infos.items()}
-    cached = CACHE / hashlib.sha256(json.dumps([place, told], sort_keys=True).encode()).hexdigest()[:32]
+    cache = cache_folder() / "fetched"
+    cached = cache / hashlib.sha256(json.dumps([place, told], sort_keys=True).encode()).hexdigest()[:32]
     if not cached.is_dir():
-        CACHE.mkdir(parents=True, exist_ok=True)
-        fresh = Path(tempfile.mkdtemp(prefix=".fetch-", dir=CACHE))
+        cache.mkdir(parents=True, exist_ok=True)
+        fresh = Path(tempfile.mkdtemp(prefix=".fetch-", dir=cache))
         try:
             for one in infos:
                 fs.get_file(one, str(fresh / PurePosixPath(one).name))

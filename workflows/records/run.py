@@ -11,9 +11,10 @@ import numpy as np
 from registration.capture.native import natural_key
 from registration.errors import InputError
 from registration.model import gnm_npz
-from registration.model.fetch import cache_folder, cached_path
+from registration.model.fetch import cached_path
 from registration.model.gnm_npz import GNMData
 from registration.stabilize.subject_meshes import SkullSkin, SubjectMeshes, subject_meshes
+from registration.storage.cache import cache_folder
 from registration.storage.files import read_json_of_kind
 from registration.storage.registration_folder import load_registration, read_manifest
 from workflows.records.subject import KIND, MANIFEST, USABLE

@@ -1,6 +1,5 @@
 """What a model is built from and measured on, off the disk: registrations of a run, true meshes of captures."""
 
-import os
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -18,6 +17,7 @@ from registration.model.gnm_npz import GNMData
 from registration.stabilize import stabilized_folder as stabilized
 from registration.stabilize.automatic import stabilize_subject
 from registration.stabilize.subject_meshes import SkullSkin, SubjectMeshes, subject_meshes
+from registration.storage.files import atomic_file
 from registration.storage.registration_folder import load_registration, read_manifest
 from workflows.records.held_out import TAG
 from workflows.records.subject import Captures, Usable, read_usable
@@ -156,16 +156,15 @@ def write_held_out(people: Sequence[HeldOutSubject], triangles: np.ndarray, file
     rows += [(o, c, c, v) for o in people for c, v in zip(o.categories, o.expressions, strict=True)]
     shared = [tag for tag in (people[0].tags if people else ()) if all(tag in one.tags for one in people)]
     arrays = {TAG + tag: np.array([one.tags[tag] for one, *_ in rows]) for tag in shared}
-    beside = file.with_name(f".{file.name}.{os.getpid()}.npz")
     file.parent.mkdir(parents=True, exist_ok=True)
-    np.savez(
-        beside,
-        allow_pickle=False,
-        vertices=np.array([vertices for *_, vertices in rows], np.float32),
-        triangles=triangles,
-        subjects=np.array([one.subject for one, *_ in rows]),
-        labels=np.array([label for _, label, _, _ in rows]),
-        categories=np.array([category for _, _, category, _ in rows]),
-        **{name: array for name, array in arrays.items() if array.dtype.kind != "O"},
-    )
-    os.replace(beside, file)
+    with atomic_file(file) as temporary:
+        np.savez(
+            temporary,
+            allow_pickle=False,
+            vertices=np.array([vertices for *_, vertices in rows], np.float32),
+            triangles=triangles,
+            subjects=np.array([one.subject for one, *_ in rows]),
+            labels=np.array([label for _, label, _, _ in rows]),
+            categories=np.array([category for _, _, category, _ in rows]),
+            **{name: array for name, array in arrays.items() if array.dtype.kind != "O"},
+        )
