@@ -25,7 +25,7 @@ def camera() -> Camera:
 
 
 def drawn(views: int, angle: float = 0.0, colour: float = 0.0) -> tuple[Targets, Rendered]:
-    """Targets that face the camera, and a rendering turned and brightened against them."""
+    """Targets that face the camera, and a rendering rotated and brightened relative to them."""
     pixels = Pixels.all_of([camera()] * views)
     count = len(pixels.view)
     normals = torch.tensor([[0.0, 0, -1]]).expand(count, 3)

@@ -1,4 +1,4 @@
-"""Update rules against their formulas, and the loop on problems whose answers are known."""
+"""Update rules against their formulas, and the loop on problems with known solutions."""
 
 import pytest
 import torch
@@ -25,7 +25,7 @@ def test_adam_steps_by_its_rate():
 
 
 def paper_updates(gradients: list[torch.Tensor], rate: float, b1: float, b2: float) -> torch.Tensor:
-    """Nicolet 2021: Adam with the largest second moment of all coordinates, as released (`AdamUniform`)."""
+    """[Nicolet 2021]: Adam with the largest second moment of all coordinates, as released (`AdamUniform`)."""
     g1 = g2 = torch.zeros_like(gradients[0])
     total = torch.zeros_like(gradients[0])
     for step, gradient in enumerate(gradients, start=1):
@@ -37,7 +37,7 @@ def paper_updates(gradients: list[torch.Tensor], rate: float, b1: float, b2: flo
 
 def test_adam_uniform_is_the_papers_where_one_coordinate_leads(monkeypatch):
     """Ours measures a vertex' gradient by its length and averages the largest; the paper's the largest average
-    coordinate. With one vertex ahead all the way, along one axis, they are the same."""
+    coordinate. For one dominant vertex along one axis they are equal."""
     monkeypatch.setattr(AdamUniformBlock, "QUANTILE", 1.0)
     rng = torch.Generator().manual_seed(0)
     gradients = [torch.randn(50, 3, generator=rng, dtype=torch.float64) for _ in range(12)]
@@ -125,22 +125,22 @@ def test_gradients_do_not_add_up_over_steps():
 
 @pytest.mark.parametrize("bad", [float("nan"), float("inf")])
 def test_a_term_that_is_not_finite_stops_the_loop(bad):
-    """It is named, it is in the history, and the unknowns are those before that step."""
+    """It is named, it is in the history, and the parameters are those before that step."""
     tensor = torch.ones(2, requires_grad=True)
-    kept: list[torch.Tensor] = []
+    states: list[torch.Tensor] = []
 
     def objective(step: int) -> dict[str, torch.Tensor]:
         return {"good": tensor.square().sum(), "bad": tensor.sum() * (bad if step == 3 else 1.0)}
 
     block = AdamBlock([tensor], Rate(start=0.1, end=0.1))
-    history, failure = minimize([block], objective, 10, lambda step: kept.append(tensor.detach().clone()))
+    history, failure = minimize([block], objective, 10, lambda step: states.append(tensor.detach().clone()))
     assert failure == "bad not finite at step 3"
-    assert len(kept) == 3 and len(history["bad"]) == len(history["good"]) == 4
-    torch.testing.assert_close(tensor.detach(), kept[-1])
+    assert len(states) == 3 and len(history["bad"]) == len(history["good"]) == 4
+    torch.testing.assert_close(tensor.detach(), states[-1])
 
 
 def test_a_gradient_that_is_not_finite_stops_the_loop():
-    """The root of zero is fine, its slope is not."""
+    """The square root of zero is finite, its derivative is not."""
     tensor = torch.zeros(2, requires_grad=True)
     block = AdamBlock([tensor], Rate(start=0.1, end=0.1))
     _, failure = minimize([block], lambda step: {"root": (0 * tensor).sqrt().sum()}, 3)

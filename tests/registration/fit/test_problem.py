@@ -151,7 +151,7 @@ def test_a_stage_without_a_weight_has_no_term(context: FitContext, initial: Init
     stage = Stage(name="nothing", steps=1, level=1)
     weights = replace(stage.weights, normals=0.0, mask=0.0, classes=0.0, landmarks=0.0, tongue=0.0)
     problem = FitProblem(context, initial)
-    made = terms.make_terms(
+    created = terms.make_terms(
         StageContext(
             fit=context,
             stage=replace(stage, weights=weights),
@@ -161,4 +161,4 @@ def test_a_stage_without_a_weight_has_no_term(context: FitContext, initial: Init
             regularizer=None,
         )
     )
-    assert made == ()
+    assert created == ()

@@ -1,4 +1,4 @@
-"""The mesh that a fit optimises is the mesh that the saved parameters give."""
+"""The mesh that a fit optimizes is the mesh of the saved parameters."""
 
 from dataclasses import replace
 

@@ -1,4 +1,4 @@
-"""Views that stand apart are found, weighed down and named; a fit that is bad everywhere blames none."""
+"""Views that deviate from the others get lower weights and are named; a fit that is bad everywhere names none."""
 
 import numpy as np
 import pytest
@@ -43,10 +43,10 @@ def test_a_shifted_view_is_named_and_hardly_counts(what):
     assert (weights.geometry[torch.arange(8) != 3] == 1).all()
 
 
-@pytest.mark.parametrize("log_gain, told", [(-6.0, "times as bright"), (np.log(2.5), "2.5 times as bright")])
-def test_a_black_or_overexposed_view_keeps_its_shape(log_gain, told):
+@pytest.mark.parametrize("log_gain, message", [(-6.0, "times as bright"), (np.log(2.5), "2.5 times as bright")])
+def test_a_black_or_overexposed_view_keeps_its_shape(log_gain, message):
     weights = ViewWeights.from_errors(errors(brightness={5: -1.0 + log_gain}))
-    assert list(weights.notes) == ["cam05"] and told in weights.notes["cam05"]
+    assert list(weights.notes) == ["cam05"] and message in weights.notes["cam05"]
     assert weights.colour[5] == 0 and weights.geometry[5] == 1
 
 
@@ -60,8 +60,8 @@ def test_a_view_without_landmarks_or_mask_is_not_suspected():
 
 
 def test_the_reason_names_views():
-    told = errors(outline={3: 14.0, 7: 14.0}, landmarks={1: 30.0}).disagreement(6.0)
-    assert told == "landmarks off by 30 px in views cam01; silhouette off by 14 px in views cam03, cam07"
+    message = errors(outline={3: 14.0, 7: 14.0}, landmarks={1: 30.0}).disagreement(6.0)
+    assert message == "landmarks off by 30 px in views cam01; silhouette off by 14 px in views cam03, cam07"
     assert errors().disagreement(6.0) is None
 
 
@@ -75,33 +75,33 @@ def targets(shift_px: int = 0) -> Targets:
     mask = torch.zeros(2, 64, 64)
     mask[0, 16:48, 16:48] = 1
     mask[1, 16:48, 16 + shift_px : 48 + shift_px] = 1
-    seen = pixels.of_image(mask)
-    ones = torch.ones_like(seen)
+    coverage = pixels.of_image(mask)
+    ones = torch.ones_like(coverage)
     return Targets(
         names=("a", "b"),
         class_names=("skin",),
         pixels=pixels,
-        rgb=torch.stack([seen * 0.5] * 3, -1),
-        rgb_weight=seen,
-        normals=torch.zeros(len(seen), 3),
-        normal_weight=seen,
-        mask=seen,
+        rgb=torch.stack([coverage * 0.5] * 3, -1),
+        rgb_weight=coverage,
+        normals=torch.zeros(len(coverage), 3),
+        normal_weight=coverage,
+        mask=coverage,
         mask_weight=ones,
-        classes=seen[:, None],
-        class_weight=seen,
+        classes=coverage[:, None],
+        class_weight=coverage,
         landmarks={"68": torch.ones(2, 4, 3)},
         px_per_head=32.0,
     )
 
 
 def test_errors_of_a_shifted_silhouette():
-    """8 px of 32 sideways: 512 wrong pixels on an outline of 124, in px at 512 of head height."""
+    """Shifted by 8 of 32 px: 512 pixels differ, on an outline of 124, in px at 512 of head height."""
     straight = targets()
     rendered = Rendered(rgb=straight.rgb, normals=straight.normals, classes=straight.classes, mask=straight.mask)
-    found = view_errors(rendered, targets(shift_px=8), torch.tensor([1.0, 2.0]))
-    assert found.outline_px[0] == 0
-    assert found.outline_px[1].item() == pytest.approx(2 * 8 * 32 / 124 * 16)
-    torch.testing.assert_close(found.brightness, torch.full((2,), np.log(0.5), dtype=torch.float32))
+    measured = view_errors(rendered, targets(shift_px=8), torch.tensor([1.0, 2.0]))
+    assert measured.outline_px[0] == 0
+    assert measured.outline_px[1].item() == pytest.approx(2 * 8 * 32 / 124 * 16)
+    torch.testing.assert_close(measured.brightness, torch.full((2,), np.log(0.5), dtype=torch.float32))
 
 
 def test_weights_reach_the_targets_of_the_chosen_views():

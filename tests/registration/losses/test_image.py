@@ -43,13 +43,13 @@ def targets(pixels: Pixels | None = None, seed: int = 0) -> Targets:
     )
 
 
-def same(seen: Targets) -> Rendered:
-    """A rendering that is what was seen."""
-    return Rendered(rgb=seen.rgb, normals=seen.normals, classes=seen.classes, mask=seen.mask)
+def same(target: Targets) -> Rendered:
+    """A rendering that is what was target."""
+    return Rendered(rgb=target.rgb, normals=target.normals, classes=target.classes, mask=target.mask)
 
 
-def everywhere(seen: Targets) -> torch.Tensor:
-    return torch.ones(len(seen.mask), dtype=torch.bool)
+def everywhere(target: Targets) -> torch.Tensor:
+    return torch.ones(len(target.mask), dtype=torch.bool)
 
 
 TERMS = {
@@ -68,35 +68,35 @@ WEIGHT = {"rgb": "rgb_weight", "ssim": "rgb_weight", "normals": "normal_weight"}
 
 @pytest.mark.parametrize("term", TERMS)
 def test_equal_images_cost_nothing_and_others_do(term):
-    seen = targets()
-    cost = TERMS[term](same(seen), seen, everywhere(seen)).item()
+    target = targets()
+    cost = TERMS[term](same(target), target, everywhere(target)).item()
     # The roots' rounding leaves a constant: 0.01 for each colour, 0.001 for a normal.
     assert cost == pytest.approx({"rgb": 0.03, "normals": 0.001}.get(term, 0.0), abs=1e-9)
-    other = replace(same(seen), **{COMPARED[term]: getattr(targets(seed=1), COMPARED[term]) * 0.5})
-    assert TERMS[term](other, seen, everywhere(seen)).item() > cost + 0.05
+    other = replace(same(target), **{COMPARED[term]: getattr(targets(seed=1), COMPARED[term]) * 0.5})
+    assert TERMS[term](other, target, everywhere(target)).item() > cost + 0.05
 
 
 @pytest.mark.parametrize("term", TERMS)
 def test_gradients_against_differences(term):
-    seen = targets()
+    target = targets()
     start = getattr(same(targets(seed=1)), COMPARED[term])
     if term == "mask":
         start = start * 0.6
 
     def cost(values: torch.Tensor) -> torch.Tensor:
-        return TERMS[term](replace(same(seen), **{COMPARED[term]: values}), seen, everywhere(seen))
+        return TERMS[term](replace(same(target), **{COMPARED[term]: values}), target, everywhere(target))
 
     assert torch.autograd.gradcheck(cost, start.clone().requires_grad_(), fast_mode=True)
 
 
 @pytest.mark.parametrize("term", TERMS)
 def test_what_has_no_weight_has_no_effect(term):
-    """Neither on the value nor on any gradient, whatever is rendered or seen there."""
-    seen = targets()
+    """Neither on the value nor on any gradient, whatever is rendered or target there."""
+    target = targets()
     hidden = torch.zeros(HEIGHT, WIDTH, dtype=torch.bool)
     hidden[4:9, 5:12] = True
     hidden = hidden.reshape(-1)
-    seen = replace(seen, **{WEIGHT[term]: 1.0 - hidden.double()})
+    target = replace(target, **{WEIGHT[term]: 1.0 - hidden.double()})
     rendered = same(targets(seed=1))
 
     def result(other_rendered: bool) -> tuple[float, torch.Tensor]:
@@ -104,7 +104,7 @@ def test_what_has_no_weight_has_no_effect(term):
         if other_rendered:
             values[hidden] = getattr(same(targets(seed=2)), COMPARED[term])[hidden] * 0.7
         values.requires_grad_()
-        cost = TERMS[term](replace(rendered, **{COMPARED[term]: values}), seen, everywhere(seen))
+        cost = TERMS[term](replace(rendered, **{COMPARED[term]: values}), target, everywhere(target))
         cost.backward()
         return cost.item(), values.grad
 
@@ -117,89 +117,93 @@ def test_what_has_no_weight_has_no_effect(term):
 
 def test_rgb_by_hand():
     """A root of linear light, smoothed by 0.01; a mean over the subject's pixels, not over the listed ones."""
-    seen = targets()
-    seen = replace(seen, rgb=torch.full_like(seen.rgb, 0.25), mask=torch.zeros_like(seen.mask))
-    seen.mask[:10], seen.rgb_weight[:] = 1.0, 0.0
-    seen.rgb_weight[3] = 0.5
-    rendered = replace(same(seen), rgb=torch.full_like(seen.rgb, 0.25))
+    target = targets()
+    target = replace(target, rgb=torch.full_like(target.rgb, 0.25), mask=torch.zeros_like(target.mask))
+    target.mask[:10], target.rgb_weight[:] = 1.0, 0.0
+    target.rgb_weight[3] = 0.5
+    rendered = replace(same(target), rgb=torch.full_like(target.rgb, 0.25))
     rendered.rgb[3] = torch.tensor([0.16, 0.25, -1.0])  # roots 0.4, 0.5, and 0.01 at the floor
     expected = 0.5 * (np.hypot(0.1, 0.01) + 0.01 + np.hypot(0.49, 0.01)) / 10
-    assert image.rgb_l1(rendered, seen, everywhere(seen)).item() == pytest.approx(expected)
-    assert image.rgb_l1(rendered, seen, torch.zeros(len(seen.mask), dtype=torch.bool)).item() == 0
+    assert image.rgb_l1(rendered, target, everywhere(target)).item() == pytest.approx(expected)
+    assert image.rgb_l1(rendered, target, torch.zeros(len(target.mask), dtype=torch.bool)).item() == 0
 
 
 def test_dark_pixels_have_finite_gradients():
-    seen = targets()
-    dark = torch.zeros_like(seen.rgb).requires_grad_()
-    image.rgb_l1(replace(same(seen), rgb=dark), seen, everywhere(seen)).backward()
+    target = targets()
+    dark = torch.zeros_like(target.rgb).requires_grad_()
+    image.rgb_l1(replace(same(target), rgb=dark), target, everywhere(target)).backward()
     assert dark.grad.isfinite().all()
 
 
 def test_normals_by_hand():
-    seen = targets()
-    seen = replace(seen, normals=torch.zeros_like(seen.normals), normal_weight=torch.zeros_like(seen.normal_weight))
-    seen.normals[:3] = torch.tensor([0.0, 0, 1])
-    seen.normal_weight[:3] = torch.tensor([1.0, 0.25, 1.0])
-    rendered = replace(same(seen), normals=torch.zeros_like(seen.normals))
+    target = targets()
+    target = replace(
+        target, normals=torch.zeros_like(target.normals), normal_weight=torch.zeros_like(target.normal_weight)
+    )
+    target.normals[:3] = torch.tensor([0.0, 0, 1])
+    target.normal_weight[:3] = torch.tensor([1.0, 0.25, 1.0])
+    rendered = replace(same(target), normals=torch.zeros_like(target.normals))
     rendered.normals[:3] = torch.tensor([[0, 0.6, 0.8], [0, 1, 0], [0, 0, -1]])
     lengths = np.sqrt(np.array([0.4, 2.0]) + 1e-6)  # squared: 0.36 + 0.04 and 1 + 1; the third is beyond 1.5
-    value = image.normals(rendered, seen, everywhere(seen), 1.5).item()
-    assert value == pytest.approx((lengths * [1, 0.25]).sum() / len(seen.mask))
-    two = image.normals(rendered, seen, everywhere(seen), 2.5).item()
-    assert two == pytest.approx(((lengths * [1, 0.25]).sum() + np.sqrt(4 + 1e-6)) / len(seen.mask))
+    value = image.normals(rendered, target, everywhere(target), 1.5).item()
+    assert value == pytest.approx((lengths * [1, 0.25]).sum() / len(target.mask))
+    two = image.normals(rendered, target, everywhere(target), 2.5).item()
+    assert two == pytest.approx(((lengths * [1, 0.25]).sum() + np.sqrt(4 + 1e-6)) / len(target.mask))
 
 
 def test_mask_by_hand():
     """|x| beyond a quarter, x^2 within: the halves meet with one slope."""
-    seen = targets()
-    seen = replace(seen, mask=torch.zeros_like(seen.mask))
-    seen.mask[:5] = torch.tensor([1.0, 1, 1, 1, 0.5])
-    rendered = replace(same(seen), mask=seen.mask.clone())
+    target = targets()
+    target = replace(target, mask=torch.zeros_like(target.mask))
+    target.mask[:5] = torch.tensor([1.0, 1, 1, 1, 0.5])
+    rendered = replace(same(target), mask=target.mask.clone())
     rendered.mask[:4] = torch.tensor([0.0, 0.75, 0.9, 1.0])
-    seen.mask_weight[0] = 0.5
+    target.mask_weight[0] = 0.5
     expected = 0.5 * (1 - 0.125) + 0.125 + 0.01 / 0.5
-    assert image.mask(rendered, seen).item() == pytest.approx(expected / 4.5)
+    assert image.mask(rendered, target).item() == pytest.approx(expected / 4.5)
 
 
 def test_classes_by_hand():
     """Each class has its weight; where the rendering misses the subject nothing is compared."""
-    seen = targets()
-    seen = replace(seen, classes=torch.zeros_like(seen.classes), class_weight=torch.zeros_like(seen.class_weight))
-    seen.classes[:2] = torch.tensor([1.0, 0, 0])
-    seen.class_weight[:2] = 1
-    rendered = replace(same(seen), classes=torch.zeros_like(seen.classes), mask=torch.ones_like(seen.mask))
+    target = targets()
+    target = replace(
+        target, classes=torch.zeros_like(target.classes), class_weight=torch.zeros_like(target.class_weight)
+    )
+    target.classes[:2] = torch.tensor([1.0, 0, 0])
+    target.class_weight[:2] = 1
+    rendered = replace(same(target), classes=torch.zeros_like(target.classes), mask=torch.ones_like(target.mask))
     rendered.classes[0] = torch.tensor([0.0, 1.0, 0])
     rendered.mask[1] = 0.2
     weights = torch.tensor([1.0, 4.0, 1.0])
-    assert image.classes(rendered, seen, weights).item() == pytest.approx(0.875 * 5 / len(seen.mask))
+    assert image.classes(rendered, target, weights).item() == pytest.approx(0.875 * 5 / len(target.mask))
 
 
 def test_surfaces_of_their_own_must_agree():
     """An eye on skin, or a miss, is not compared; half a lip or a soft border is."""
     pixels = Pixels.of([camera()], torch.arange(HEIGHT * WIDTH).reshape(1, HEIGHT, WIDTH) < 5)
-    seen = targets(pixels)
+    target = targets(pixels)
     shares = [[1.0, 0, 0], [1, 0, 0], [0, 1, 0], [0.4, 0.6, 0], [0, 0, 1]]
     rendered = [[1.0, 0, 0], [0, 1, 0], [0, 1, 0], [0.6, 0.4, 0], [0, 1, 0]]
-    seen = replace(seen, classes=torch.tensor(shares, dtype=torch.float64))
-    shown = replace(same(seen), classes=torch.tensor(rendered, dtype=torch.float64))
-    assert image.pixel_agreement(shown, seen, [1, 2]).tolist() == [True, False, True, True, False]
-    assert image.pixel_agreement(shown, seen, []).all()
+    target = replace(target, classes=torch.tensor(shares, dtype=torch.float64))
+    shown = replace(same(target), classes=torch.tensor(rendered, dtype=torch.float64))
+    assert image.pixel_agreement(shown, target, [1, 2]).tolist() == [True, False, True, True, False]
+    assert image.pixel_agreement(shown, target, []).all()
     missed = replace(shown, mask=torch.tensor([0.4, 1, 1, 1, 1], dtype=torch.float64))
-    assert image.pixel_agreement(missed, seen, [1, 2]).tolist() == [False, False, True, True, False]
+    assert image.pixel_agreement(missed, target, [1, 2]).tolist() == [False, False, True, True, False]
 
 
 def test_ssim_is_that_of_a_window_of_eleven():
     """Against skimage's Gaussian SSIM in the middle of the image, where borders do not matter."""
     from skimage.metrics import structural_similarity
 
-    seen, other = targets(), targets(seed=1)
+    target, other = targets(), targets(seed=1)
     middle = torch.zeros(1, HEIGHT, WIDTH, dtype=torch.float64)
     middle[0, 7, 8] = 1
-    seen = replace(seen, rgb_weight=seen.pixels.of_image(middle))
-    # Elsewhere the rendering would be replaced by what was seen: leave a trace of weight.
-    seen = replace(seen, rgb_weight=seen.rgb_weight.clamp_min(1e-12))
-    value = image.rgb_ssim(same(other), seen, everywhere(seen)).item() * len(seen.mask)
-    a, b = (seen.pixels.image(image.srgb_encoded(t.rgb))[0].numpy() for t in (other, seen))
+    target = replace(target, rgb_weight=target.pixels.of_image(middle))
+    # Elsewhere the rendering would be replaced by the target: keep a tiny weight.
+    target = replace(target, rgb_weight=target.rgb_weight.clamp_min(1e-12))
+    value = image.rgb_ssim(same(other), target, everywhere(target)).item() * len(target.mask)
+    a, b = (target.pixels.image(image.srgb_encoded(t.rgb))[0].numpy() for t in (other, target))
     _, full = structural_similarity(
         a,
         b,
@@ -223,11 +227,11 @@ def test_a_few_pixels_or_all_of_them():
     only = {name: values * index for name, values in vars(whole).items() if name.endswith("weight")}
     whole = replace(whole, mask=whole.mask * index, **only)
     shown = Pixels.of([camera()], chosen)
-    place = shown.of_image(whole.pixels.index)
-    listed = {name: value[place] for name, value in vars(whole).items() if isinstance(value, torch.Tensor)}
+    index = shown.of_image(whole.pixels.index)
+    listed = {name: value[index] for name, value in vars(whole).items() if isinstance(value, torch.Tensor)}
     part = replace(whole, pixels=shown, **listed)
-    cut = Rendered(**{name: value[place] for name, value in vars(rendered).items()})
+    cut = Rendered(**{name: value[index] for name, value in vars(rendered).items()})
     for name, term in TERMS.items():
         if name != "ssim":  # its windows see the background beyond the list
             agree = everywhere(whole)
-            assert term(cut, part, agree[place]).item() == pytest.approx(term(rendered, whole, agree).item()), name
+            assert term(cut, part, agree[index]).item() == pytest.approx(term(rendered, whole, agree).item()), name

@@ -1,4 +1,4 @@
-"""Landmarks: projection against the camera's own, residuals by hand, and a robust mean that outliers cannot rule."""
+"""Landmarks: projection against `Camera.project`, residuals by hand, and a mean that is robust against outliers."""
 
 import numpy as np
 import pytest
@@ -30,10 +30,10 @@ def test_projection_is_the_cameras():
 
 def test_residuals_by_hand():
     """3 and 4 px off are 5; at a head of 256 px that is 10 of the standard head; confidence 0.5 is not enough."""
-    seen = torch.tensor(np.stack([np.column_stack([c.project(POINTS)[0], np.ones(5)]) for c in cameras()]))
-    seen[0, 0, :2] += torch.tensor([3.0, -4.0])
-    seen[1, 2, 2], seen[1, 3, 2], seen[0, 1, 2] = 0.5, 0.51, 0.0
-    distance, counts = landmark.residuals(cameras(), torch.tensor(POINTS), seen, 256.0)
+    detected = torch.tensor(np.stack([np.column_stack([c.project(POINTS)[0], np.ones(5)]) for c in cameras()]))
+    detected[0, 0, :2] += torch.tensor([3.0, -4.0])
+    detected[1, 2, 2], detected[1, 3, 2], detected[0, 1, 2] = 0.5, 0.51, 0.0
+    distance, counts = landmark.residuals(cameras(), torch.tensor(POINTS), detected, 256.0)
     expected = torch.zeros(2, 5, dtype=torch.float64)
     expected[0, 0] = 10
     torch.testing.assert_close(distance, expected, atol=1e-5, rtol=0)
@@ -57,10 +57,10 @@ def test_an_outlier_hardly_pulls():
 
 
 def test_gradient_through_projection():
-    seen = torch.tensor(np.stack([np.column_stack([c.project(POINTS)[0] + 2, np.ones(5)]) for c in cameras()]))
+    detected = torch.tensor(np.stack([np.column_stack([c.project(POINTS)[0] + 2, np.ones(5)]) for c in cameras()]))
 
     def cost(points: torch.Tensor) -> torch.Tensor:
-        distance, counts = landmark.residuals(cameras(), points, seen, 300.0)
+        distance, counts = landmark.residuals(cameras(), points, detected, 300.0)
         return landmark.geman_mcclure(distance, counts, 3.0)
 
     assert torch.autograd.gradcheck(cost, torch.tensor(POINTS, requires_grad=True))
@@ -68,7 +68,7 @@ def test_gradient_through_projection():
 
 def test_a_perfect_fit_has_a_finite_gradient():
     points = torch.tensor(POINTS, requires_grad=True)
-    seen = torch.tensor(np.stack([np.column_stack([c.project(POINTS)[0], np.ones(5)]) for c in cameras()]))
-    distance, counts = landmark.residuals(cameras(), points, seen, 300.0)
+    detected = torch.tensor(np.stack([np.column_stack([c.project(POINTS)[0], np.ones(5)]) for c in cameras()]))
+    distance, counts = landmark.residuals(cameras(), points, detected, 300.0)
     landmark.geman_mcclure(distance, counts, 3.0).backward()
     assert points.grad.isfinite().all() and points.grad.abs().max() < 1e-3

@@ -27,8 +27,8 @@ def elasticity(columns: int, rows: int, half_gain_m: float, decay_m: float = 0.0
     return flat
 
 
-def kept(penalty: OffsetRegularizer, mode: torch.Tensor) -> float:
-    """What a fit to `mode`, pulled with strength one, keeps of it: the minimum over the mode's height."""
+def gain_of(penalty: OffsetRegularizer, mode: torch.Tensor) -> float:
+    """The fraction of `mode` that a fit to it keeps against the penalty: the minimum over its amplitude."""
     height = torch.tensor(0.0, dtype=torch.float32, requires_grad=True)
     rest = (height * mode - mode).square().sum(-1).mean() + sum(penalty(height * mode).values())
     (slope,) = torch.autograd.grad(rest, height, create_graph=True)
@@ -45,15 +45,15 @@ def test_gain_of_waves(turns, half_gain_mm):
     mode = torch.tensor(np.outer(0.001 * field, [0.6, 0, 0.8]), dtype=torch.float32)
     a, b, c = (float(s[0]) for s in regularization_weights(np.array([half_gain_mm * 1e-3]), np.array([0.025])))
     q = np.linalg.norm(k) / EDGE_M
-    found = kept(elasticity(columns, rows, half_gain_mm * 1e-3), mode)
-    assert found == pytest.approx(1 / (1 + a + b * q**2 + c * q**4), rel=0.05)
+    gain = gain_of(elasticity(columns, rows, half_gain_mm * 1e-3), mode)
+    assert gain == pytest.approx(1 / (1 + a + b * q**2 + c * q**4), rel=0.05)
 
 
 def test_half_of_a_wave_of_the_half_gain_length_is_kept():
     field, k = wave(60, 60, (3, 0))
     length_m = 2 * np.pi / np.linalg.norm(k) * EDGE_M
     mode = torch.tensor(np.outer(0.001 * field, [0, 0, 1]), dtype=torch.float32)
-    assert kept(elasticity(60, 60, length_m), mode) == pytest.approx(0.5, abs=0.02)
+    assert gain_of(elasticity(60, 60, length_m), mode) == pytest.approx(0.5, abs=0.02)
 
 
 def test_an_offset_without_data_decays_over_the_decay_length():
@@ -114,9 +114,9 @@ def test_stiffness_is_per_place():
         device=torch.device("cpu"),
     )
     costs = []
-    for place in (20 * 40 + 10, 20 * 40 + 30):
+    for vertex in (20 * 40 + 10, 20 * 40 + 30):
         bump = torch.zeros(count, 3)
-        bump[place, 2] = 0.001
+        bump[vertex, 2] = 0.001
         costs.append(float(penalty(bump)["offset laplacian"]))
     assert costs[1] == pytest.approx(16 * costs[0], rel=1e-3)
 

@@ -169,7 +169,7 @@ def test_what_is_accepted_costs_nothing_in_its_pairs_alone():
 
 
 def outside(data: GNMData, vertices: torch.Tensor, excess: torch.Tensor) -> np.ndarray:
-    """Whether each vertex that has an excess lies outside the skin all the same."""
+    """Whether each vertex with an excess depth lies outside the skin nevertheless."""
     skin = data.triangles[(regions.components(data) == 0)[data.triangles].all(1)].astype(np.int64)
     deep = excess.nonzero()[:, 0]
     points = vertices[deep] + 5e-5 * vertex_normals(vertices, torch.as_tensor(skin))[deep]
@@ -178,7 +178,7 @@ def outside(data: GNMData, vertices: torch.Tensor, excess: torch.Tensor) -> np.n
 
 @needs_shared
 def test_skin_at_the_corners_of_the_mouth_is_not_in_the_other_lip(full, penalty):
-    """A face that purses its lips: behind the skin beside them lies the lining of the other lip, through the flesh."""
+    """Pursed lips: behind the skin next to them, through the interior, lies the lining of the other lip."""
     vertices, random = template(full).numpy().astype(np.float64), np.random.default_rng(5)
     for basis, share in ((full.expression_basis[200:350], 0.5), (full.expression_basis[350:382], 0.3)):
         vertices = vertices + np.einsum("e,evc->vc", random.normal(size=len(basis)) * share, basis)

@@ -1,4 +1,4 @@
-"""Parts that cross come apart again, and nothing else moves much; `bench/self_intersection.py` has more of it."""
+"""The penalty separates parts that intersect, and nothing else moves much; see also `bench/self_intersection.py`."""
 
 import numpy as np
 import pytest

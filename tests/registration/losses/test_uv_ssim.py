@@ -1,4 +1,4 @@
-"""The term against sliding: on a ball with a smaller one before it, and on the official model's head.
+"""The loss against sliding: on a ball with a smaller one in front of it, and on the official model's head.
 
 Values, gradients by differences, what must be ignored; then vertices that have slid must come back, and under a gain
 and a blush they must not move.
@@ -29,7 +29,7 @@ SURFACE = 0.05  # weight of the distance to the true surface
 
 @pytest.fixture(scope="module")
 def problem() -> Problem:
-    """A ball seen by four cameras; a small ball hides a part of it. Six charts each."""
+    """A ball in four views; a small ball occludes a part of it. Six charts each."""
     backend.activate()
     sides = [ball(16, np.zeros(3), np.full(3, RADIUS)), ball(4, np.array([0.035, 0.01, 0.105]), np.full(3, 0.012))]
     points = np.concatenate([side[0] for side in sides])
@@ -126,7 +126,7 @@ def test_pixels_without_weight_are_not_looked_at(problem):
 
 
 def test_what_is_hidden_is_not_looked_at(problem):
-    """Without the small ball, its pictures are taken for the large one's skin."""
+    """Without the small ball, its pixels are compared with the large ball's texture."""
     batch = replace(problem.batch, rgb_weight=torch.ones_like(problem.batch.rgb_weight))
     hidden = cost(problem, problem.truth, batch)
     seen = cost(problem, problem.truth, batch, triangles=problem.triangles[:3072], corner_uvs=problem.corner_uvs[:3072])
@@ -134,7 +134,7 @@ def test_what_is_hidden_is_not_looked_at(problem):
 
 
 def test_a_new_look_follows_the_mesh(problem):
-    """What a camera sees is asked again when the mesh has moved: turned about, the back is in front."""
+    """Visibility is determined again when the mesh has moved: rotated by half a turn, the back is in front."""
     loss = problem.loss(SIZE_PX)
     loss(torch.as_tensor(problem.truth, dtype=torch.float32), problem.batch)
     turned = torch.as_tensor(problem.truth * [-1, 1, -1], dtype=torch.float32)
@@ -150,7 +150,7 @@ def test_resolutions_of_the_reference_agree(problem):
 
 
 def test_windows_hold_one_chart(problem):
-    """At every scale: what has a weight is further from all other charts than a window reaches."""
+    """At every scale: texels with a weight are farther from all other charts than a window's radius."""
     loss = replace(problem, weights=np.ones(len(problem.truth))).loss(SIZE_PX)
     atlas = texels(problem.triangles, problem.corner_uvs, SIZE_PX)
     charts = atlas.image(atlas.chart, -1)
@@ -172,7 +172,7 @@ def test_sizes_that_cannot_be_halved_are_refused(problem):
 
 
 def search(problem: Problem, start: np.ndarray, batch: Targets | None, stages, size_px: int = SIZE_PX) -> np.ndarray:
-    """With the term, or without if there is no batch."""
+    """With the loss, or without if there is no batch."""
     surface, loss = sliding.OnSurface(problem), problem.loss(size_px)
     terms = {"surface": lambda vertices: SURFACE * surface(vertices)}
     if batch is not None:

@@ -1,4 +1,4 @@
-"""Registrations that several tests look at; each is made once, some in a process beside the tests' own."""
+"""Registrations that several tests share; each is computed once, some in a process of their own."""
 
 import shutil
 import subprocess
@@ -18,7 +18,7 @@ from tests.registration.register.synthetic import MODEL, Truth, make
 
 
 class Notes:
-    """A progress that keeps what it is told."""
+    """A progress that records its calls."""
 
     def __init__(self) -> None:
         self.notes: list[str] = []
@@ -35,7 +35,7 @@ class Notes:
 
 @dataclass(frozen=True, kw_only=True)
 class Run:
-    """A registration that was made."""
+    """A computed registration."""
 
     truth: Truth
     out: Path
@@ -44,7 +44,7 @@ class Run:
 
     @property
     def error_mm(self) -> np.ndarray:
-        """Distance of each vertex from the true one."""
+        """Distance of each vertex from the ground truth."""
         return 1e3 * np.linalg.norm(self.result.vertices - self.truth.vertices, axis=1)
 
 
@@ -61,7 +61,7 @@ class Beside:
         self.stdout = ""
 
     def run(self) -> Run:
-        """Wait for it; the notes are the lines of its log."""
+        """Wait for the process; the notes are the lines of its log."""
         if self._ended is None:
             self.stdout, log = self._process.communicate(timeout=600)
             assert self._process.returncode == 0, log
@@ -100,13 +100,13 @@ def again_beside(neutral: Truth, folder: Path) -> Iterator[Beside]:
 
 @pytest.fixture(scope="session")
 def registered(neutral: Truth, again_beside: Beside, folder: Path) -> Run:
-    """The neutral, as anyone would register it."""
+    """The neutral with default options."""
     return run(neutral, folder / "out" / "neutral")
 
 
 @pytest.fixture(scope="session")
 def again(again_beside: Beside) -> Run:
-    """The same once more."""
+    """The same registration again."""
     return again_beside.run()
 
 

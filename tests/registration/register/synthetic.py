@@ -1,7 +1,7 @@
-"""A small synthetic capture of the tiny head, of which everything is known.
+"""A small synthetic capture of the tiny head with complete ground truth.
 
-Identity, expression, joints, pose in a turned world, offsets, texture and camera gains are drawn from formulas; the
-pictures come from the renderer with many rays per pixel, the fit's from one.
+Identity, expression, joints, pose in a rotated world, offsets, texture and camera gains follow from formulas; the
+images come from the renderer with many rays per pixel, the fit's from one.
 """
 
 from collections.abc import Mapping
@@ -30,9 +30,9 @@ from tests.conftest import FIXTURES
 
 MODEL = FIXTURES / "tiny_gnm.npz"
 LABELS = ("background", *CLASSES, "neck_other")
-WORLD = Rotation.from_rotvec([0.5, -0.8, 0.3])  # the capture's world is no upright one
-PLACE = np.array([0.7, -0.3, 1.1])  # of the head's middle in it, m
-MIDDLE = np.array([0.0, 0.29, 0.02])  # of the head in the model's frame, m
+WORLD = Rotation.from_rotvec([0.5, -0.8, 0.3])  # the world is not upright
+CENTRE_WORLD = np.array([0.7, -0.3, 1.1])  # of the head in the world, m
+CENTRE_MODEL = np.array([0.0, 0.29, 0.02])  # of the head in the model's frame, m
 # Yaw and pitch (degrees) of the cameras around the head, distance (m) and focal length (in image widths).
 RIG = (
     (-75, 5, 0.62, 2.5),
@@ -56,7 +56,7 @@ HEAD_TURN = {"neutral": (0.0, 0.0, 0.0), "smile": (0.04, 0.10, -0.03)}  # of the
 
 @dataclass(frozen=True, kw_only=True)
 class Truth:
-    """What a capture was made from."""
+    """The ground truth of a capture."""
 
     root: Path
     parameters: Parameters
@@ -72,7 +72,7 @@ def make(root: Path, expression: str = "neutral") -> Truth:
     vertices = GNM(data)(parameters, torch.as_tensor(offsets, dtype=torch.float32)).numpy()
     scheme = read_scheme(FIXTURES / "head_sparse_68.txt", len(vertices))
     cameras = [_camera(*row, number) for number, row in enumerate(RIG)]
-    pictures = _pictures(data, vertices, cameras)
+    pictures = _images(data, vertices, cameras)
     views = []
     for number, (camera, picture) in enumerate(zip(cameras, pictures, strict=True)):
         points = scheme.points(vertices)
@@ -100,7 +100,9 @@ def _known(data: GNMData, expression: str) -> tuple[Parameters, Float[np.ndarray
         identity=torch.tensor(IDENTITY, dtype=torch.float32),
         expression=torch.tensor(EXPRESSIONS[expression]),
         rotations=torch.tensor(rotations, dtype=torch.float32),
-        translation=torch.tensor(PLACE - root_joint - WORLD.apply(MIDDLE - root_joint), dtype=torch.float32),
+        translation=torch.tensor(
+            CENTRE_WORLD - root_joint - WORLD.apply(CENTRE_MODEL - root_joint), dtype=torch.float32
+        ),
         scale=torch.tensor(1.0),
     )
     template = data.template_vertex_positions.astype(np.float64)
@@ -111,13 +113,13 @@ def _known(data: GNMData, expression: str) -> tuple[Parameters, Float[np.ndarray
 
 
 def _camera(yaw: float, pitch: float, distance_m: float, focal: float, number: int) -> Camera:
-    """A camera that looks at the middle of the head, its principal point off the image's centre."""
+    """A camera that looks at the centre of the head; its principal point is not the image's centre."""
     out = Rotation.from_euler("YX", [yaw, -pitch], degrees=True).as_matrix()
     axes = np.stack([out[:, 0], -out[:, 1], -out[:, 2]])  # x right, y down, z towards the head
     pose = np.eye(4)
     pose[:3, :3] = axes @ WORLD.as_matrix().T
     pose[:3, 3] = [0.01, -0.012, distance_m]
-    pose[:3, 3] -= pose[:3, :3] @ PLACE
+    pose[:3, 3] -= pose[:3, :3] @ CENTRE_WORLD
     intrinsics = np.array(
         [
             [focal * WIDTH_PX, 0, WIDTH_PX * (0.47 + 0.01 * number)],
@@ -128,7 +130,7 @@ def _camera(yaw: float, pitch: float, distance_m: float, focal: float, number: i
     return Camera(width_px=WIDTH_PX, height_px=HEIGHT_PX, intrinsics=intrinsics, T_cam_world=pose)
 
 
-def _pictures(data: GNMData, vertices: np.ndarray, cameras: list[Camera]) -> np.ndarray:
+def _images(data: GNMData, vertices: np.ndarray, cameras: list[Camera]) -> np.ndarray:
     """(N, H, W, 3 + 3 + 1 + K): RGB, world normals, mask, classes (those of LABELS but the background)."""
     backend.activate("llvm")
     classes = np.concatenate([vertex_classes(data)[1], neck_other(data)[:, None].astype(np.float32)], 1)
@@ -141,7 +143,7 @@ def _pictures(data: GNMData, vertices: np.ndarray, cameras: list[Camera]) -> np.
 
 
 def _texture(size: int = 512) -> torch.Tensor:
-    """Skin-coloured noise of two sizes, drawn in the atlas: its seams show."""
+    """Skin-coloured noise at two scales, in the atlas: seams are visible."""
     rng = np.random.default_rng(7)
 
     def noise(sigma: float) -> np.ndarray:
@@ -171,11 +173,11 @@ def _view(name: str, camera: Camera, picture: np.ndarray, gain: float, landmarks
 
 
 def _scan(data: GNMData, vertices: np.ndarray) -> Scan:
-    """The outer skin and the eyes, with points in the middle of every edge: the truth's own surface."""
+    """The outer skin and the eyes, subdivided once: the surface of the ground truth."""
     import trimesh
 
     outer = group(data, "skin_exterior") + group(data, "left_eye") + group(data, "right_eye") > 0.5
-    kept = data.triangles[outer[data.triangles].all(1)]
-    mesh = trimesh.Trimesh(vertices, kept, process=False).subdivide()
+    skin_triangles = data.triangles[outer[data.triangles].all(1)]
+    mesh = trimesh.Trimesh(vertices, skin_triangles, process=False).subdivide()
     mesh.remove_unreferenced_vertices()
     return Scan(vertices=np.array(mesh.vertices, np.float64), triangles=np.array(mesh.faces, np.int64))

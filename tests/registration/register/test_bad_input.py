@@ -1,4 +1,4 @@
-"""Everything that a registration must refuse: clearly, before any compute, and leaving the disk as it was."""
+"""Inputs that a registration must refuse with a clear message, before any computation and without writing anything."""
 
 import json
 import os
@@ -42,11 +42,11 @@ class Request:
         return register(self.capture, self.model, self.out, RegisterOptions(**options), **settings)
 
     def change_model(self, **arrays: np.ndarray | None) -> None:
-        """Replace arrays of the model file, or take them out where None is given."""
+        """Replace arrays of the model file, or remove those that are None."""
         with np.load(self.model) as archive:
-            kept = {name: archive[name] for name in archive.files} | arrays
+            arrays_of_model = {name: archive[name] for name in archive.files} | arrays
         self.model.unlink()  # may be a link to the fixture
-        np.savez(self.model, **{name: array for name, array in kept.items() if array is not None})
+        np.savez(self.model, **{name: array for name, array in arrays_of_model.items() if array is not None})
 
 
 Spoil = Callable[[Request], None]
@@ -54,7 +54,7 @@ BAD: dict[str, tuple[Spoil, str, str, str, str]] = {}  # name -> spoil, what, wh
 
 
 def bad(what: str, *, where: str, got: str, fix: str) -> Callable[[Spoil], Spoil]:
-    """Put a case into the table: a phrase of each part of the message that must come."""
+    """Add a case to the table: a phrase of each part of the expected message."""
 
     def add(spoil: Spoil) -> Spoil:
         BAD[spoil.__name__] = (spoil, what, where, got, fix)
@@ -70,7 +70,7 @@ def edit(path: Path, old: str, new: str) -> None:
 
 
 def edit_line(path: Path, start: str, change: Callable[[list[str]], list[str]]) -> None:
-    """Change the words of the line that starts so."""
+    """Change words in the lines that start with `start`."""
     lines = path.read_text().splitlines()
     (number,) = [i for i, line in enumerate(lines) if line.startswith(start)]
     lines[number] = " ".join(change(lines[number].split()))
@@ -209,7 +209,7 @@ def model_with_nan(request: Request) -> None:
 
 
 class Payload:
-    """Unpickling it makes a file."""
+    """Unpickling it creates a folder."""
 
     def __init__(self, path: Path):
         self._path = path
@@ -220,15 +220,15 @@ class Payload:
 
 @bad("'variant' cannot be read", where="tiny_gnm.npz", got="allow_pickle=False", fix="gnmreg model fetch")
 def model_with_a_pickle(request: Request) -> None:
-    made = request.folder / "unpickled"
-    pickle.loads(pickle.dumps(Payload(made)))
-    assert made.exists()  # the payload works
-    made.rmdir()
+    unpickled = request.folder / "unpickled"
+    pickle.loads(pickle.dumps(Payload(unpickled)))
+    assert unpickled.exists()  # the payload works
+    unpickled.rmdir()
     array = np.empty(1, object)
-    array[0] = Payload(made)
+    array[0] = Payload(unpickled)
     request.change_model(variant=array)
     with zipfile.ZipFile(request.model) as archive:
-        assert str(made).encode() in archive.read("variant.npy")
+        assert str(unpickled).encode() in archive.read("variant.npy")
 
 
 @bad("no vertex group 'skin'", where="vertex_group_names", got="hockey_mask", fix="official vertex groups")
@@ -315,7 +315,7 @@ def neutral_of_another_basis(request: Request) -> None:
 
 
 def write_neutral(out: Path, data: gnm_npz.GNMData) -> Path:
-    """A registration folder of the model at rest."""
+    """A registration folder of the model's template."""
     model = GNM(data)
     rest = model.neutral()
     vertices = model(rest).numpy()
@@ -411,7 +411,7 @@ def test_there_are_at_least_twenty_cases():
 
 
 def test_the_request_itself_is_good(request_: Request, monkeypatch: pytest.MonkeyPatch):
-    """What the table spoils would have been computed."""
+    """Without the changes of the table the registration starts to compute."""
 
     class Started(Exception):
         pass
@@ -436,7 +436,7 @@ def test_a_former_result_stays(request_: Request, monkeypatch: pytest.MonkeyPatc
 
 
 def test_no_head_in_the_masks(request_: Request):
-    """Without landmarks the head is searched in the masks; thin stripes are none. Nothing is written either."""
+    """Without landmarks the pose is estimated from the masks; thin stripes are no head. Nothing is written either."""
     shutil.rmtree(request_.capture / "landmarks")
     stripes = np.zeros((200, 160), np.uint8)
     stripes[:, 30:34] = stripes[:, 120:123] = 255

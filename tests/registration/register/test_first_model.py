@@ -1,4 +1,4 @@
-"""From nothing: a subject beyond the first model's span, photographed and registered; figures against the truth."""
+"""A synthetic subject outside the first model's span, rendered and registered; metrics against the ground truth."""
 
 from pathlib import Path
 
@@ -35,7 +35,7 @@ def test_neutral(model: Path, tmp_path: Path) -> None:
 
 
 def test_teeth_and_tongue_of_an_open_mouth(model: Path, tmp_path: Path) -> None:
-    """Teeth and tongue have no offsets: what the pictures and the `oral` landmarks say must reach the model."""
+    """Teeth and tongue have no offsets: images and the `oral` landmarks must determine them through the model."""
     root = capture(tmp_path / "capture", seed=5, expression="jaw_open")
     result = register(root, model, tmp_path / "out")
     error = errors_mm(result, root)

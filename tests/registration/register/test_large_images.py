@@ -22,7 +22,7 @@ LIMIT_GB = 6.0
 
 
 def enlarge(source: Path, target: Path) -> None:
-    """The same capture as larger cameras would have taken it. Maps of indices and normals are not interpolated."""
+    """The same capture with larger images. Label and normal maps are not interpolated."""
     target.mkdir()
     for name in ("capture.toml", "scan.ply", "ground_truth.npz"):
         shutil.copy(source / name, target / name)

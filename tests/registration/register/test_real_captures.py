@@ -1,4 +1,4 @@
-"""The bounds that real captures must keep, with the draft recipe."""
+"""Bounds on the errors of real captures with the draft recipe."""
 
 import shutil
 from pathlib import Path
@@ -15,7 +15,7 @@ MODEL = SHARED / "data" / "gnm" / "gnm_head_reconstructed.npz"
 
 
 def figures(capture: Path, out: Path) -> dict[str, Any]:
-    """Register, print and return the face's figures in mm."""
+    """Register, print and return the metrics of the face in mm."""
     result = register(capture, MODEL, out)
     face = result.figures["scan_to_mesh"]["face"]
     error = result.figures.get("vertex_error", {}).get("face", {})
@@ -30,9 +30,9 @@ def ict(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
 
 
 def test_the_model_s_own_topology(tmp_path: Path):
-    found = figures(CAPTURES / "gnm_identity_a" / "neutral", tmp_path / "out")
-    assert found["scan"]["mean_mm"] <= 0.05
-    assert found["vertices"]["mean_mm"] <= 0.20
+    result = figures(CAPTURES / "gnm_identity_a" / "neutral", tmp_path / "out")
+    assert result["scan"]["mean_mm"] <= 0.05
+    assert result["vertices"]["mean_mm"] <= 0.20
 
 
 def test_another_topology(ict: dict[str, Any]):
@@ -43,5 +43,5 @@ def test_another_topology(ict: dict[str, Any]):
 def test_landmarks_hidden(ict: dict[str, Any], tmp_path: Path):
     source = CAPTURES / "ict_dev" / "neutral"
     hidden = shutil.copytree(source, tmp_path / "capture", ignore=shutil.ignore_patterns("landmarks"))
-    found = figures(hidden, tmp_path / "out")
-    assert abs(found["scan"]["mean_mm"] - ict["scan"]["mean_mm"]) <= 0.05
+    result = figures(hidden, tmp_path / "out")
+    assert abs(result["scan"]["mean_mm"] - ict["scan"]["mean_mm"]) <= 0.05

@@ -1,4 +1,4 @@
-"""A capture of which everything is known, registered: what was put in comes back."""
+"""A registration of a synthetic capture recovers its ground truth."""
 
 import json
 import re
@@ -55,7 +55,7 @@ def test_surface_vertices_and_status(registered: Run):
 
 
 def test_offsets_were_needed(registered: Run):
-    """The bumps that were put on the model are a millimetre high: a fit of the model alone must miss them."""
+    """The ground truth has bumps of a millimetre on the model: a fit without offsets must miss them."""
     result = registered.result
     model = GNM(read(MODEL))
     names = ("identity", "expression", "rotations", "translation", "scale")

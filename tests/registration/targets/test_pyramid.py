@@ -22,7 +22,7 @@ WEIGHTS = ("rgb_weight", "normal_weight", "mask_weight", "class_weight")
 
 
 def labels_of(direction: np.ndarray) -> np.ndarray:
-    """Labels by where on the ball a point lies; `direction` is its outward unit normal in the world."""
+    """Labels by the position on the ball; `direction` is its outward unit normal in the world."""
     x, y, z = np.moveaxis(direction, -1, 0)
     labels = np.where(y < -0.6, 2, np.where(y > 0.55, 3, 1))
     return np.where((x - 0.35) ** 2 + (y - 0.1) ** 2 + np.minimum(z, 0) < 0.04, 4, labels)
@@ -57,7 +57,7 @@ def images(level: Targets, name: str) -> np.ndarray:
 
 
 def world_directions(camera) -> tuple[np.ndarray, np.ndarray]:
-    """The ball's outward normal at each pixel's centre, by ray tracing, and how near the ray is to its rim (m)."""
+    """The ball's outward normal at each pixel's centre, and the distance of the ray from the ball's outline, m."""
     y, x = np.mgrid[: camera.height_px, : camera.width_px] + 0.5
     rays = np.stack([x, y, np.ones_like(x)], -1) @ np.linalg.inv(camera.intrinsics).T @ camera.T_cam_world[:3, :3]
     rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
@@ -106,7 +106,7 @@ def test_landmarks_follow_their_cameras(pyramid, capture):
 
 
 def test_windows_hold_the_head_and_a_margin(pyramid):
-    """The ball's rim is inside every window, what is far from it is not; all windows have one size."""
+    """The ball's outline is inside every crop, pixels far from it are not; all crops have one size."""
     finest = pyramid[0]
     assert len({(c.width_px, c.height_px) for c in finest.pixels.cameras}) == 1
     assert finest.pixels.cameras[0].width_px % 2 ** (LEVELS - 1) == 0
@@ -138,7 +138,7 @@ def test_a_level_is_the_block_mean_of_the_one_before(pyramid):
 
 
 def test_reducing_while_decoding_gives_the_same_level(capture, pyramid):
-    """At 1/2 from the start: the windows may begin elsewhere, the cameras tell where."""
+    """At half the resolution: crops may start elsewhere, as their cameras say."""
     half = build_pyramid(capture, class_map(CLASSES), finest_head_px=int(pyramid[1].px_per_head) - 2, levels=1)[0]
     assert half.px_per_head == pytest.approx(pyramid[1].px_per_head, abs=1)
     compared = 0
@@ -265,7 +265,7 @@ def test_progress_is_told(capture):
 
 
 def test_a_mask_larger_than_the_labels_makes_no_head_of_the_neck(tmp_path):
-    """Labels and masks come from two networks: what only the mask has belongs to what it is next to."""
+    """Labels and masks come from two networks: pixels in the mask without a label belong to the neighbouring class."""
     plain = [picture(f"cam{i}", turn) for i, turn in enumerate(small.TURNS)]
     larger = [replace(view, mask=distance_transform_edt(~view.mask) <= 3) for view in plain]
     made = []
