@@ -3,9 +3,10 @@
 The public names below are imported on first use: `import registration` loads neither torch nor the renderer.
 """
 
-import importlib
 import os
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
+
+from registration.lazy_imports import attach
 
 # Torch's threads spin after each operation by default and take the cores from the renderer's threads (and from every
 # other process): steps were measured up to six times slower. Must be set before torch is first imported.
@@ -56,43 +57,4 @@ __all__ = [
     "save_registration",
 ]
 
-_LOCATIONS = {  # public name -> where it is defined
-    "Camera": "registration.types:Camera",
-    "Capture": "registration.types:Capture",
-    "CaptureReport": "registration.capture.doctor:CaptureReport",
-    "GNM": "registration.model.gnm:GNM",
-    "GNMData": "registration.model.gnm_npz:GNMData",
-    "InputError": "registration.errors:InputError",
-    "Lengths": "registration.fit.recipes:Lengths",
-    "OffsetRegion": "registration.fit.recipes:OffsetRegion",
-    "Parameters": "registration.types:Parameters",
-    "Rate": "registration.fit.recipes:Rate",
-    "Recipe": "registration.fit.recipes:Recipe",
-    "RegisterOptions": "registration.options:RegisterOptions",
-    "Registration": "registration.types:Registration",
-    "RegistrationEvaluation": "registration.evaluate.evaluation:Evaluation",
-    "Stage": "registration.fit.recipes:Stage",
-    "View": "registration.types:View",
-    "Weights": "registration.fit.recipes:Weights",
-    "check_capture": "registration.capture.doctor:check_capture",
-    "console_progress": "registration.progress:shown",
-    "evaluate_registration": "registration.evaluate.evaluation:evaluate",
-    "load_model": "registration.model.gnm_npz:read",
-    "load_recipe": "registration.fit.recipes:load_recipe",
-    "load_registration": "registration.storage.registration_folder:load_registration",
-    "read_capture": "registration.capture.native:read_capture",
-    "register": "registration.pipeline:register",
-    "save_registration": "registration.storage.registration_folder:save_registration",
-}
-
-
-def __getattr__(name: str) -> Any:
-    if name not in _LOCATIONS:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    module, _, attribute = _LOCATIONS[name].partition(":")
-    globals()[name] = value = getattr(importlib.import_module(module), attribute)
-    return value
-
-
-def __dir__() -> list[str]:
-    return sorted({*globals(), *__all__})
+__getattr__, __dir__ = attach(__name__, __file__)
