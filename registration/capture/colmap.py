@@ -1,18 +1,22 @@
-"""Read and write COLMAP models: the cameras of a capture."""
+"""Read and write COLMAP models: the cameras of a capture.
+
+Our own reader, since pycolmap's wheel contains GPL code (docs/adr/0006-no-gpl-by-default.md).
+"""
 
 import math
-import re
 from collections.abc import Callable, Mapping
 from pathlib import Path
 
 import numpy as np
-import pycolmap
 from jaxtyping import Float, UInt8
+from scipy.spatial.transform import Rotation
 
+from registration.capture.colmap_binary import read_binary_model, read_binary_points
+from registration.capture.colmap_model import ColmapCamera, ColmapModel, Pose
+from registration.capture.colmap_text import read_text_model, read_text_points
 from registration.errors import InputError
 from registration.types import Camera
 
-_NOT_FINITE = re.compile(r"(?<![\w.])[-+]?(nan|inf(inity)?)(?![\w.])", re.IGNORECASE)
 # COLMAP's parameters -> (fx, fy, cx, cy, OpenCV distortion in the order k1 k2 p1 p2 k3 k4 k5 k6)
 _MODELS: dict[str, Callable[..., tuple[float, ...]]] = {
     "SIMPLE_PINHOLE": lambda f, cx, cy: (f, f, cx, cy),
@@ -24,32 +28,23 @@ _MODELS: dict[str, Callable[..., tuple[float, ...]]] = {
 }
 _WRITTEN = {0: "PINHOLE", 4: "OPENCV", 5: "FULL_OPENCV", 8: "FULL_OPENCV"}  # by number of distortion coefficients
 _GREY = 128  # colour of points that have none
+_SAME_POSE = 1e-6  # entries of two matrices of one pose, metres and cosines
 
 
 def read_cameras(sparse: Path) -> dict[str, Camera]:
-    """Read the cameras of a COLMAP model, text or binary.
+    """Read the cameras of a COLMAP model, text or binary, in `sparse` or `sparse/0`.
 
     Returns:
         Image's file name -> its camera.
 
     Raises:
-        InputError: the model cannot be read, two images have one name, a camera model is not supported, or intrinsics
-            or a pose are singular or not finite.
+        InputError: the model cannot be read, is there twice with other cameras, two images have one name, a camera
+            model is not supported, or intrinsics or a pose are singular, not finite, or not those of the frames.
     """
-    if not sparse.is_dir():
-        raise InputError(
-            "The COLMAP model is missing",
-            where=sparse,
-            expected="cameras, images and points3D as .txt or .bin",
-            got="no such folder",
-            fix="store the calibration there; see docs/formats.md",
-        )
-    try:
-        model = pycolmap.Reconstruction(str(sparse))
-    except (ValueError, IndexError, RuntimeError) as error:
-        raise _unreadable_model(sparse, error) from None
     cameras: dict[str, Camera] = {}
-    for image in sorted(model.images.values(), key=lambda image: image.name):
+    model = _read_model(_model_folder(sparse))
+    _check_frames(model)
+    for image in sorted(model.images, key=lambda image: image.name):
         if image.name in cameras:
             raise InputError(
                 "Two images of the COLMAP model have one name",
@@ -58,9 +53,36 @@ def read_cameras(sparse: Path) -> dict[str, Camera]:
                 got=image.name,
                 fix="rename one of them",
             )
-        where = f"{sparse}: image {image.name}"
-        cameras[image.name] = _camera(image.camera, _pose(image, where), where)
+        where = f"{image.where}: image {image.name}"
+        if image.camera_id not in model.cameras:
+            raise InputError(
+                "An image of the COLMAP model has no camera",
+                where=where,
+                expected=f"one of {len(model.cameras)} cameras' ids",
+                got=image.camera_id,
+                fix="add the camera, or correct the image's camera id",
+            )
+        source = model.cameras[image.camera_id]
+        pose = _matrix((image.quaternion_wxyz, image.translation), where)
+        cameras[image.name] = _camera(source, pose, f"{source.where}: image {image.name}")
     return cameras
+
+
+def read_points(sparse: Path) -> tuple[Float[np.ndarray, "P 3"], UInt8[np.ndarray, "P 3"]]:
+    """Read the points of a COLMAP model.
+
+    Returns:
+        Positions (metres, world) and sRGB colours; none if the model has no file of points.
+
+    Raises:
+        InputError: the file of points is malformed.
+    """
+    folder = _model_folder(sparse)
+    if (folder / "points3D.bin").is_file():
+        return read_binary_points(folder / "points3D.bin")
+    if (folder / "points3D.txt").is_file():
+        return read_text_points(folder / "points3D.txt")
+    return np.zeros((0, 3)), np.zeros((0, 3), np.uint8)
 
 
 def write_model(
@@ -81,102 +103,180 @@ def write_model(
         ValueError: COLMAP has no model for a camera: it has skew, or another number of distortion coefficients than 0,
             4, 5 or 8.
     """
-    model = pycolmap.Reconstruction()
+    lenses = ["# CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]"]
+    images = ["# IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME", "# POINTS2D[] as (X, Y, POINT3D_ID)"]
     for number, (name, camera) in enumerate(cameras.items(), 1):
         K, count = camera.intrinsics, len(camera.distortion)
         if count not in _WRITTEN or K[0, 1] != 0:
             raise ValueError(f"{name}: COLMAP has no model for this camera")
-        lens = pycolmap.Camera(
-            camera_id=number,
-            model=_WRITTEN[count],
-            width=camera.width_px,
-            height=camera.height_px,
-            params=[K[0, 0], K[1, 1], K[0, 2], K[1, 2], *camera.distortion, *[0.0] * (3 if count == 5 else 0)],
-        )
-        model.add_camera_with_trivial_rig(lens)
-        image = pycolmap.Image(name=name, camera_id=number, image_id=number)
-        model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(camera.T_cam_world[:3]))
+        parameters = [K[0, 0], K[1, 1], K[0, 2], K[1, 2], *camera.distortion, *[0.0] * (3 if count == 5 else 0)]
+        lenses.append(f"{number} {_WRITTEN[count]} {camera.width_px} {camera.height_px} {_numbers(parameters)}")
+        x, y, z, w = Rotation.from_matrix(camera.T_cam_world[:3, :3]).as_quat(canonical=True)
+        images += [f"{number} {_numbers((w, x, y, z, *camera.T_cam_world[:3, 3]))} {number} {name}", ""]
     shades = np.full((len(points), 3), _GREY, np.uint8) if colours is None else colours
-    for point, shade in zip(points, shades, strict=True):
-        model.add_point3D(point, pycolmap.Track(), shade)
+    rows = ["# POINT3D_ID, X, Y, Z, R, G, B, ERROR, TRACK[] as (IMAGE_ID, POINT2D_IDX)"]
+    for number, (point, shade) in enumerate(zip(points, shades, strict=True), 1):
+        rows.append(f"{number} {_numbers(point)} {' '.join(map(str, shade))} 0")
     sparse.mkdir()
-    model.write_text(str(sparse))
-    for name in ("rigs.txt", "frames.txt"):  # trivial; without them poses have one home, images.txt
-        (sparse / name).unlink()
+    for file, lines in (("cameras.txt", lenses), ("images.txt", images), ("points3D.txt", rows)):
+        (sparse / file).write_text("\n".join(lines) + "\n", "utf-8")
 
 
-def _camera(source: pycolmap.Camera, T_cam_world: Float[np.ndarray, "4 4"], where: str) -> Camera:
-    if source.model_name not in _MODELS:
+def _numbers(values: object) -> str:
+    return " ".join(repr(float(value)) for value in np.asarray(values, np.float64))
+
+
+def _model_folder(sparse: Path) -> Path:
+    """The folder that holds the model: `sparse` itself, or `sparse/0`, where COLMAP's mapper writes its first one."""
+    if not sparse.is_dir():
+        raise InputError(
+            "The COLMAP model is missing",
+            where=sparse,
+            expected="cameras, images and points3D as .txt or .bin",
+            got="no such folder",
+            fix="store the calibration there; see docs/formats.md",
+        )
+    if not _kinds(sparse) and _kinds(sparse / "0"):
+        if others := [path.name for path in sparse.iterdir() if path.name != "0" and _kinds(path)]:
+            raise InputError(
+                "There are several COLMAP models",
+                where=sparse,
+                expected="one model, in this folder or in its folder 0",
+                got=", ".join(["0", *sorted(others)]),
+                fix="move the files of the one to use into this folder",
+            )
+        return sparse / "0"
+    return sparse
+
+
+def _kinds(folder: Path) -> list[str]:
+    """Which of the two kinds of files hold cameras and images."""
+    return [kind for kind in ("bin", "txt") if all((folder / f"{name}.{kind}").is_file() for name in _NEEDED)]
+
+
+_NEEDED = ("cameras", "images")
+
+
+def _read_model(folder: Path) -> ColmapModel:
+    """Read the model; one that is there as text and as binary must be the same."""
+    kinds = _kinds(folder)
+    if not kinds:
+        raise InputError(
+            "The COLMAP model cannot be read",
+            where=folder,
+            expected="cameras and images, both as .txt or both as .bin, as COLMAP writes them",
+            got=", ".join(sorted(path.name for path in folder.iterdir())) or "an empty folder",
+            fix="export the model again with COLMAP's model_converter",
+        )
+    readers = {"bin": read_binary_model, "txt": read_text_model}
+    model, *others = [readers[kind](folder) for kind in kinds]
+    if others and (name := _difference(model, others[0])):
+        raise InputError(
+            "The COLMAP model is there twice, with other cameras",
+            where=folder,
+            expected="one model, or the same as .bin and as .txt",
+            got=f"they differ in {name}",
+            fix="remove the files that are out of date",
+        )
+    return model
+
+
+def _difference(first: ColmapModel, second: ColmapModel) -> str | None:
+    """Where two models differ by more than rounding: the name of an image."""
+
+    def rows(model: ColmapModel) -> dict[str, np.ndarray]:
+        table = {}
+        for image in model.images:
+            camera = model.cameras.get(image.camera_id)
+            numbers = (*image.quaternion_wxyz, *image.translation, *(camera.parameters if camera else ()))
+            size = (camera.width_px, camera.height_px) if camera else ()
+            table[image.name] = np.array([*numbers, *size], np.float64)
+        return table
+
+    ours, theirs = rows(first), rows(second)
+    for name in sorted(ours.keys() | theirs.keys()):
+        a, b = ours.get(name), theirs.get(name)
+        if a is None or b is None or a.shape != b.shape or not np.allclose(a, b, rtol=1e-9, atol=1e-9, equal_nan=True):
+            return f"image {name}"
+    return None
+
+
+def _check_frames(model: ColmapModel) -> None:
+    """Compare the images' poses with those of rigs and frames, where the model has these: neither wins silently."""
+    images = {image.id: image for image in model.images}
+    for frame in model.frames:
+        for camera_id, image_id in frame.images:
+            image = images.get(image_id)
+            if image is None or (frame.rig_id, camera_id) not in model.sensors_from_rig:
+                continue
+            where = f"{image.where}: image {image.name}"
+            rig_from_world = _matrix((frame.quaternion_wxyz, frame.translation), f"frame of image {image.name}")
+            sensor = model.sensors_from_rig[frame.rig_id, camera_id]
+            expected = (
+                rig_from_world if sensor is None else _matrix(sensor, f"rig of image {image.name}") @ rig_from_world
+            )
+            pose = _matrix((image.quaternion_wxyz, image.translation), where)
+            if not np.allclose(pose, expected, rtol=_SAME_POSE, atol=_SAME_POSE):
+                raise InputError(
+                    "An image's pose is not that of its frame",
+                    where=where,
+                    expected="one pose in the files of images and of rigs and frames",
+                    got=f"poses that differ by up to {np.abs(pose - expected).max():.3g}",
+                    fix="remove the rigs' and frames' files if the images' poses are right, or export the model again",
+                )
+
+
+def _camera(source: ColmapCamera, T_cam_world: Float[np.ndarray, "4 4"], where: str) -> Camera:
+    if source.model not in _MODELS:
         raise InputError(
             "The camera model is not supported",
             where=where,
             expected=", ".join(_MODELS),
-            got=source.model_name,
+            got=source.model,
             fix="undistort the images with COLMAP's image_undistorter, or calibrate with a supported model",
         )
-    fx, fy, cx, cy, *distortion = _MODELS[source.model_name](*map(float, source.params))
+    fx, fy, cx, cy, *distortion = _MODELS[source.model](*source.parameters)
     if not all(map(math.isfinite, (fx, fy, cx, cy, *distortion))) or fx <= 0 or fy <= 0:
         raise InputError(
             "The intrinsics are singular or not finite",
             where=where,
             expected="finite numbers, focal lengths > 0",
-            got=source.params_to_string(),
+            got=", ".join(map(str, source.parameters)),
             fix="calibrate the camera again",
         )
-    if not (0 < source.width < 2**16 and 0 < source.height < 2**16):
+    if not (0 < source.width_px < 2**16 and 0 < source.height_px < 2**16):
         raise InputError(
             "The camera's image size is out of range",
             where=where,
             expected="1 to 65535 px a side",
-            got=f"{source.width} x {source.height}",
+            got=f"{source.width_px} x {source.height_px}",
             fix="write the image's size into the COLMAP model",
         )
     return Camera(
-        width_px=source.width,
-        height_px=source.height,
+        width_px=source.width_px,
+        height_px=source.height_px,
         intrinsics=np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]]),
         T_cam_world=T_cam_world,
         distortion=tuple(distortion) if any(distortion) else (),
     )
 
 
-def _pose(image: pycolmap.Image, where: str) -> Float[np.ndarray, "4 4"]:
-    pose = image.cam_from_world() if image.has_pose else None
-    quaternion = np.zeros(4) if pose is None else np.array(pose.rotation.quat)
-    T_cam_world = np.eye(4)
-    if pose is not None:
-        T_cam_world[:3] = pose.matrix()
-    # pycolmap silently turns a zero quaternion into the identity: check the quaternion itself.
-    if not np.isfinite(T_cam_world).all() or not np.linalg.norm(quaternion) > 1e-6:
+def _matrix(pose: Pose, where: str) -> Float[np.ndarray, "4 4"]:
+    """The transform of a pose; the quaternion is normalized."""
+    quaternion, translation = np.array(pose[0]), np.array(pose[1])
+    length = np.linalg.norm(quaternion)
+    if not np.isfinite([*quaternion, *translation]).all() or not length > 1e-6:
         raise InputError(
             "The pose is singular or not finite",
             where=where,
             expected="a unit quaternion and a finite translation",
-            got="no pose" if pose is None else f"quaternion xyzw {quaternion}, translation {pose.translation}",
+            got=f"quaternion wxyz {quaternion}, translation {translation}",
             fix="calibrate the camera again, or remove its image from the COLMAP model",
         )
-    return T_cam_world
-
-
-def _unreadable_model(sparse: Path, error: Exception) -> InputError:
-    """COLMAP's own messages name neither line nor reason, so look for the most frequent one: NaN or infinity."""
-    for path in (sparse / "cameras.txt", sparse / "images.txt"):
-        lines = path.read_text("utf-8", "replace").splitlines() if path.is_file() else []
-        for number, line in enumerate(lines, 1):
-            if not line.startswith("#") and _NOT_FINITE.search(line):
-                return InputError(
-                    "The intrinsics are singular or not finite"
-                    if path.stem == "cameras"
-                    else "The pose is singular or not finite",
-                    where=f"{path}, line {number}",
-                    expected="finite numbers",
-                    got=line[:120],
-                    fix="calibrate the camera again, or remove its image from the COLMAP model",
-                )
-    return InputError(
-        "The COLMAP model cannot be read",
-        where=sparse,
-        expected="cameras, images and points3D as .txt or .bin, as COLMAP writes them",
-        got=error,
-        fix="export the model again with COLMAP's model_converter",
-    )
+    w, x, y, z = quaternion / length
+    T = np.eye(4)
+    T[0, :3] = 1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)
+    T[1, :3] = 2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)
+    T[2, :3] = 2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)
+    T[:3, 3] = translation
+    return T
