@@ -1,5 +1,6 @@
 # make setup   makes .venv with exactly the versions of constraints.txt, and finds or installs what the system must have
-# make setup-mesh   sets up, and adds PyMeshLab, which is GPL: `gnmreg capture check` then reports the topology of scans
+# make setup-optional   sets up, and adds what contains GPL code: PyMeshLab, with which `gnmreg capture check` reports the
+#                       topology of scans, and pycolmap, with which tests compare the COLMAP reader
 # make demo    sets up, makes a head model and a capture from nothing, and registers it: about five minutes
 # make demo-batch   a population of five in three expressions each, and two rounds of coregistration over it with two workers: quarter of an hour
 # make check   sets up, then style, types and import directions
@@ -25,13 +26,13 @@ PIP := $(BIN)/python -m pip --disable-pip-version-check install --constraint con
 packages = { [ "$$(id -u)" = 0 ] && command -v apt-get >/dev/null && apt-get update -q \
 	&& DEBIAN_FRONTEND=noninteractive apt-get install -y -q --no-install-recommends $(1); }
 
-.PHONY: setup setup-mesh demo demo-batch check test test-durability
+.PHONY: setup setup-optional demo demo-batch check test test-durability
 
 setup: $(INSTALLED)
 	@$(BIN)/python -m registration.render.llvm --install
 
-setup-mesh: setup
-	@$(PIP) --only-binary=:all: --no-build-isolation --editable '.[mesh]'
+setup-optional: setup
+	@$(PIP) --only-binary=:all: --no-build-isolation --editable '.[mesh,colmap]'
 	lacking() { $(BIN)/python -c 'import pymeshlab' 2>&1 | grep -oE 'lib[^ (:]+: cannot open shared object|.*Error: .*' | sort -u || true; }
 	[ -z "$$(lacking)" ] || $(call packages,libgl1 libopengl0) || true
 	if [ -n "$$(lacking)" ]; then

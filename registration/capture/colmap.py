@@ -103,8 +103,11 @@ def write_model(
         ValueError: COLMAP has no model for a camera: it has skew, or another number of distortion coefficients than 0,
             4, 5 or 8.
     """
-    lenses = ["# CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]"]
-    images = ["# IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME", "# POINTS2D[] as (X, Y, POINT3D_ID)"]
+    lenses = _header("Camera list with one line of data per camera", "CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]")
+    images = _header(
+        "Image list with two lines of data per image", "IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME"
+    )
+    images.append("#   POINTS2D[] as (X, Y, POINT3D_ID)")
     for number, (name, camera) in enumerate(cameras.items(), 1):
         K, count = camera.intrinsics, len(camera.distortion)
         if count not in _WRITTEN or K[0, 1] != 0:
@@ -114,7 +117,8 @@ def write_model(
         x, y, z, w = Rotation.from_matrix(camera.T_cam_world[:3, :3]).as_quat(canonical=True)
         images += [f"{number} {_numbers((w, x, y, z, *camera.T_cam_world[:3, 3]))} {number} {name}", ""]
     shades = np.full((len(points), 3), _GREY, np.uint8) if colours is None else colours
-    rows = ["# POINT3D_ID, X, Y, Z, R, G, B, ERROR, TRACK[] as (IMAGE_ID, POINT2D_IDX)"]
+    columns = "POINT3D_ID, X, Y, Z, R, G, B, ERROR, TRACK[] as (IMAGE_ID, POINT2D_IDX)"
+    rows = _header("3D point list with one line of data per point", columns)
     for number, (point, shade) in enumerate(zip(points, shades, strict=True), 1):
         rows.append(f"{number} {_numbers(point)} {' '.join(map(str, shade))} 0")
     sparse.mkdir()
@@ -122,8 +126,13 @@ def write_model(
         (sparse / file).write_text("\n".join(lines) + "\n", "utf-8")
 
 
+def _header(content: str, columns: str) -> list[str]:
+    return [f"# {content}:", f"#   {columns}"]
+
+
 def _numbers(values: object) -> str:
-    return " ".join(repr(float(value)) for value in np.asarray(values, np.float64))
+    """Return numbers with all their digits."""
+    return " ".join(f"{value:.17g}" for value in np.asarray(values, np.float64))
 
 
 def _model_folder(sparse: Path) -> Path:

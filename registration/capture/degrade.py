@@ -14,11 +14,10 @@ from types import MappingProxyType
 
 import cv2
 import numpy as np
-import pycolmap
 from jaxtyping import Float
 
 from registration.capture import degradation, native, pixels, triangulation
-from registration.capture.colmap import write_model
+from registration.capture.colmap import read_points, write_model
 from registration.capture.degradation import FAULTS, DegradationPreset
 from registration.capture.native_writer import check_new
 from registration.capture.scan import read_scan
@@ -186,10 +185,7 @@ def _write_png(path: Path, content: np.ndarray) -> None:
 
 def _write_cameras(sparse: Path, cameras: Mapping[str, Camera], source: Path) -> None:
     """Write the COLMAP model, with the points of the source's model."""
-    points = [point for _, point in sorted(pycolmap.Reconstruction(str(source)).points3D.items())]
-    positions = np.array([point.xyz for point in points]).reshape(-1, 3)
-    colours = np.array([point.color for point in points], np.uint8).reshape(-1, 3)
-    write_model(sparse, cameras, positions, colours)
+    write_model(sparse, cameras, *read_points(source))
 
 
 def _description(

@@ -23,7 +23,7 @@ from registration.geometry.meshlab import scan_topology
 from registration.types import Camera, Capture, View
 
 MAX_SCAN_DISTANCE_MM = 10.0  # median distance of the landmarks from the scan, which shows the skin that they lie on
-NO_TOPOLOGY = "not checked, PyMeshLab is not installed or cannot start (make setup-mesh)"
+NO_TOPOLOGY = "not checked, PyMeshLab is not installed or cannot start (make setup-optional)"
 _LENSES = {0: "pinhole", 4: "k1 k2 p1 p2", 5: "k1 k2 p1 p2 k3", 8: "k1 k2 p1 p2 k3..k6"}
 
 

@@ -40,7 +40,7 @@ def read_capture(root: Path) -> Capture:
             fix="check the path",
         )
     settings = _read_settings(_inside(root, root / "capture.toml"))
-    for path in (root / "sparse", *sorted((root / "sparse").glob("*"))):
+    for path in (root / "sparse", *sorted((root / "sparse").rglob("*"))):
         _inside(root, path)
     cameras = read_cameras(root / "sparse")
     views = tuple(_read_view(root, name, cameras[name]) for name in sorted(cameras, key=natural_key))

@@ -9,12 +9,12 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-import pycolmap
 import pytest
 from PIL import Image
 
 from registration.capture.doctor import check_capture
 from registration.errors import InputError
+from tests.registration.capture.binary_model import to_binary
 from tests.registration.capture.small import data_lines, make
 
 Spoil = Callable[[Path], None]
@@ -74,25 +74,15 @@ def no_model(root: Path) -> None:
     shutil.rmtree(root / "sparse")
 
 
-@bad("The COLMAP model cannot be read", where="sparse", got="", fix="model_converter")
+@bad("The COLMAP model cannot be read", where="images.txt, line 4", got="", fix="model_converter")
 def damaged_model(root: Path) -> None:
     edit(root / "sparse" / "images.txt", "cam0.png", "")
 
 
-@bad("The COLMAP model cannot be read", where="sparse", got="", fix="model_converter")
+@bad("The COLMAP model cannot be read", where="images.bin, byte 347", got="2", fix="model_converter")
 def truncated_binary_model(root: Path) -> None:
     to_binary(root)
     cut(root / "sparse" / "images.bin")
-
-
-def to_binary(root: Path) -> None:
-    """The COLMAP model as older versions wrote it: poses lie in images.bin."""
-    model = pycolmap.Reconstruction(str(root / "sparse"))
-    shutil.rmtree(root / "sparse")
-    (root / "sparse").mkdir()
-    model.write_binary(str(root / "sparse"))
-    (root / "sparse" / "rigs.bin").unlink()
-    (root / "sparse" / "frames.bin").unlink()
 
 
 @bad("The camera model is not supported", where="image cam3.png", got="OPENCV_FISHEYE", fix="image_undistorter")
@@ -108,7 +98,7 @@ def zero_quaternion(root: Path) -> None:
     replace_pose(root, "0 0 0 0 0 0 0.45")
 
 
-@bad("The pose is singular or not finite", where="images.txt, line 1", got="nan", fix="calibrate")
+@bad("The pose is singular or not finite", where="images.txt, line 1: image cam0.png", got="nan", fix="calibrate")
 def pose_not_finite(root: Path) -> None:
     replace_pose(root, "1 0 0 0 0 nan 0.45")
 
@@ -136,7 +126,7 @@ def no_focal_length(root: Path) -> None:
     path.write_text(path.read_text().replace("120 160 240 ", "120 160 0 "))
 
 
-@bad("The intrinsics are singular or not finite", where="cameras.txt, line 4", got="nan", fix="calibrate")
+@bad("The intrinsics are singular or not finite", where="line 3: image cam0.png", got="nan", fix="calibrate")
 def intrinsics_not_finite(root: Path) -> None:
     edit(root / "sparse" / "cameras.txt", "120 160 240 ", "120 160 nan ", 1)
 

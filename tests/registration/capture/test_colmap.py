@@ -12,6 +12,7 @@ from registration.capture.colmap import read_cameras, read_points, write_model
 from registration.capture.colmap_model import PARAMETER_COUNTS
 from registration.errors import InputError
 from registration.types import Camera
+from tests.registration.capture.binary_model import write_binary
 
 NAMES = ("cam0.png", "left/cam 1 (ü).png", "cam2.png")
 POINTS = np.array([[0.1, -0.2, 0.3], [1 / 3, 2e-9, -4.0]])
@@ -46,27 +47,6 @@ def assert_same(found: dict[str, Camera], expected: dict[str, Camera]) -> None:
         assert (*read, *[0.0] * 8)[:8] == (*written, *[0.0] * 8)[:8]
 
 
-def binary_copy(sparse: Path, target: Path) -> Path:
-    """The model in binary files, written from the format's description alone."""
-    found, target = read_cameras(sparse), target
-    target.mkdir()
-    lenses, images = [struct.pack("<Q", len(found))], [struct.pack("<Q", len(found))]
-    for number, (name, camera) in enumerate(found.items(), 7):
-        K, distortion = camera.intrinsics, (*camera.distortion, *[0.0] * 8)[:8]
-        lenses.append(struct.pack("<IiQQ12d", number, 6, 240, 320, K[0, 0], K[1, 1], K[0, 2], K[1, 2], *distortion))
-        x, y, z, w = Rotation.from_matrix(camera.T_cam_world[:3, :3]).as_quat()
-        images.append(struct.pack("<I7dI", number, w, x, y, z, *camera.T_cam_world[:3, 3], number))
-        images.append(name.encode() + b"\0" + struct.pack("<Q2dq2dq", 2, 1.5, 2.5, -1, 3.5, 4.5, 12))
-    (target / "cameras.bin").write_bytes(b"".join(lenses))
-    (target / "images.bin").write_bytes(b"".join(images))
-    rows = [
-        struct.pack("<Q3d3BdQ2I", number, *point, *colour, 0.5, 1, 7, 0)
-        for number, (point, colour) in enumerate(zip(POINTS, COLOURS, strict=True))
-    ]
-    (target / "points3D.bin").write_bytes(struct.pack("<Q", len(rows)) + b"".join(rows))
-    return target
-
-
 def test_what_is_written_is_read(sparse: Path) -> None:
     assert_same(read_cameras(sparse), cameras())
     points, colours = read_points(sparse)
@@ -75,7 +55,7 @@ def test_what_is_written_is_read(sparse: Path) -> None:
 
 
 def test_binary_files_are_read(sparse: Path, tmp_path: Path) -> None:
-    copy = binary_copy(sparse, tmp_path / "binary")
+    copy = write_binary(sparse, tmp_path / "binary")
     assert_same(read_cameras(copy), cameras())
     np.testing.assert_array_equal(read_points(copy)[0], POINTS)
 
@@ -109,7 +89,7 @@ def test_parameter_counts_are_pycolmaps() -> None:
 def test_a_rigs_poses_are_the_images(sparse: Path) -> None:
     """Two cameras on one rig, the second with a pose in it: consistent, then moved."""
     first, second = (cameras()[name].T_cam_world for name in (NAMES[0], NAMES[2]))
-    numbers = {image.split()[-1]: image.split()[0] for image in (sparse / "images.txt").read_text().splitlines()[2::2]}
+    numbers = {image.split()[-1]: image.split()[0] for image in (sparse / "images.txt").read_text().splitlines()[3::2]}
     assert numbers["cam2.png"] == "3"
 
     def pose(T: np.ndarray) -> str:
@@ -161,7 +141,7 @@ def test_text_and_binary_must_agree(sparse: Path, tmp_path: Path) -> None:
     lines = (sparse / "cameras.txt").read_text().splitlines()
     padded = [line if line[0] == "#" else line + " 0" * (16 - len(line.split())) for line in lines]
     (sparse / "cameras.txt").write_text("\n".join(padded))
-    copy = binary_copy(sparse, tmp_path / "binary")
+    copy = write_binary(sparse, tmp_path / "binary")
     for file in copy.iterdir():
         (sparse / file.name).write_bytes(file.read_bytes())
     assert_same(read_cameras(sparse), cameras())
@@ -183,13 +163,13 @@ def edit(file: str, old: str, new: str) -> Callable[[Path], None]:
 
 def test_where_a_text_file_is_malformed_is_named(sparse: Path) -> None:
     damages = {
-        "cameras.txt, line 2": [
+        "cameras.txt, line 3": [
             edit("cameras.txt", "PINHOLE 240", "PINHOLE wide"),
             edit("cameras.txt", "160.125", ""),
             edit("cameras.txt", "160.125", "160.125 7"),
         ],
-        "images.txt, line 3": [edit("images.txt", " 1 cam0.png", ""), edit("images.txt", " 1 cam0.png", " a cam0.png")],
-        "images.txt, line 4": [edit("images.txt", "cam0.png\n", "cam0.png\n1 2 3 4")],
+        "images.txt, line 4": [edit("images.txt", " 1 cam0.png", ""), edit("images.txt", " 1 cam0.png", " a cam0.png")],
+        "images.txt, line 5": [edit("images.txt", "cam0.png\n", "cam0.png\n1 2 3 4")],
         "cameras.txt": [lambda sparse: (sparse / "cameras.txt").write_bytes(b"1 PINHOLE \xff\xfe")],
     }
     originals = {file.name: file.read_bytes() for file in sparse.iterdir()}
@@ -204,7 +184,7 @@ def test_where_a_text_file_is_malformed_is_named(sparse: Path) -> None:
 
 
 def test_every_truncation_of_a_binary_file_is_refused(sparse: Path, tmp_path: Path) -> None:
-    copy = binary_copy(sparse, tmp_path / "binary")
+    copy = write_binary(sparse, tmp_path / "binary")
     for name, read in (("cameras.bin", read_cameras), ("images.bin", read_cameras), ("points3D.bin", read_points)):
         whole = (copy / name).read_bytes()
         for size in range(0, len(whole), 5):
@@ -217,7 +197,7 @@ def test_every_truncation_of_a_binary_file_is_refused(sparse: Path, tmp_path: Pa
 
 
 def test_counts_are_compared_with_the_files_size(sparse: Path, tmp_path: Path) -> None:
-    copy = binary_copy(sparse, tmp_path / "binary")
+    copy = write_binary(sparse, tmp_path / "binary")
     for name, read in (("cameras.bin", read_cameras), ("images.bin", read_cameras), ("points3D.bin", read_points)):
         whole = (copy / name).read_bytes()
         (copy / name).write_bytes(struct.pack("<Q", 2**60) + whole[8:])

@@ -5,7 +5,7 @@ import pytest
 
 from registration.geometry.meshlab import scan_topology
 
-pytest.importorskip("pymeshlab", reason="no PyMeshLab, or no OpenGL libraries: make setup-mesh")
+pytest.importorskip("pymeshlab", reason="no PyMeshLab, or no OpenGL libraries: make setup-optional")
 TETRAHEDRON = np.array([[0, 2, 1], [0, 1, 3], [1, 2, 3], [0, 3, 2]])
 CORNERS = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]])
 

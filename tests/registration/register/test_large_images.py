@@ -6,12 +6,14 @@ import shutil
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
-import pycolmap
+import numpy as np
 import pytest
 
+from registration.capture.colmap import read_cameras, read_points, write_model
 from tests.conftest import SHARED, needs_shared
 
 CAPTURE = SHARED / "data" / "captures" / "ict_dev" / "neutral"
@@ -26,12 +28,12 @@ def enlarge(source: Path, target: Path) -> None:
     target.mkdir()
     for name in ("capture.toml", "scan.ply", "ground_truth.npz"):
         shutil.copy(source / name, target / name)
-    model = pycolmap.Reconstruction(str(source / "sparse"))
-    for camera in model.cameras.values():
-        assert (camera.width, camera.height) == (480, 720)
-        camera.rescale(WIDTH_PX, HEIGHT_PX)
-    (target / "sparse").mkdir()
-    model.write_text(str(target / "sparse"))
+    grown = {}
+    for name, camera in read_cameras(source / "sparse").items():
+        assert (camera.width_px, camera.height_px) == (480, 720)
+        intrinsics = np.diag([SCALE, SCALE, 1.0]) @ camera.intrinsics
+        grown[name] = replace(camera, width_px=WIDTH_PX, height_px=HEIGHT_PX, intrinsics=intrinsics)
+    write_model(target / "sparse", grown, *read_points(source / "sparse"))
     for part in ("images", "masks", "normals", "segmentation"):
         (target / part).mkdir()
         how = cv2.INTER_LINEAR if part == "images" else cv2.INTER_NEAREST
