@@ -36,13 +36,14 @@ from registration.geometry.surface_samples import sample_surface
 from registration.geometry.topology import vertex_areas
 from registration.model import gnm_npz, regions
 from registration.model.gnm_npz import GNMData
+from registration.options import RegisterOptions
 from registration.progress import shown
 from registration.render.studio.shoot import Quality
 from workflows.engine.database import default_url
 from workflows.engine.process import migrate
 from workflows.farm.coregistration import coregister
 from workflows.farm.plan import make_plan
-from workflows.records.coregistration import FIRST
+from workflows.records.coregistration import FIRST_MODEL as FIRST
 from workflows.records.held_out import read_held_out
 from workflows.steps.hold_out import PEOPLE
 from workflows.steps.synthesize import Population, synth_dataset
@@ -131,10 +132,9 @@ def main() -> None:
         captured = time.perf_counter()
         plan = make_plan(
             options.out / "dataset",
-            model_path=first,
-            out=options.out / "rounds",
-            recipe=options.recipe,
-            seed=options.seed,
+            first,
+            options.out / "rounds",
+            RegisterOptions(recipe=options.recipe, seed=options.seed),
             components=COMPONENTS,
             samples=SAMPLES,
             rule=Rule(rounds=options.rounds, failures=1.0, early=False),
@@ -142,19 +142,19 @@ def main() -> None:
         farm = options.out / "farm"
         url = default_url(farm)
         migrate(url)
-        record = coregister(plan, url=url, folder=farm, workers=options.jobs, progress=progress)
-    if "stopped" in record:
-        sys.exit(record["stopped"])
+        result = coregister(plan, url=url, folder=farm, workers=options.jobs, progress=progress)
+    if result.stopped:
+        sys.exit(result.stopped)
     print(f"captures {count} seconds {captured - start:.0f}; rounds {time.perf_counter() - captured:.0f}")
     subjects = read_held_out(options.out / "rounds" / "held_out" / PEOPLE).subjects
-    models = {name: gnm_npz.read(Path(file)) for name, file in record["models"].items()}
+    models = {name: gnm_npz.read(Path(file)) for name, file in result.state.models.items()}
     names = list(models)
     samples = model_samples(models[FIRST], options.training, options.seed)
     models[CONTROL] = build_model(samples, models[FIRST]).data
     distances = print_distances(models, subjects)
-    for round_ in record["rounds"]:
-        rejected = [row["name"] for row in round_["build"]["rejected"]]
-        print(f"{round_['name']} {round_['decide']} rejected {rejected}")
+    for round_ in result.state.rounds:
+        rejected = [registration.name for registration in round_.build.rejected]
+        print(f"{round_.name} {round_.decide} rejected {rejected}")
     truths = np.stack([read_truth(file) for file in sorted((options.out / "dataset").glob("*/*/ground_truth.npz"))])
     for number, name in enumerate(names):
         print(f"specificity {number} {mean_specificity_mm(models[name], truths):.3f}")

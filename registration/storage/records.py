@@ -78,7 +78,7 @@ class Record:
     def to_json(self) -> dict[str, Any]:
         """Return the JSON object: "kind" and "schema", then the fields in the order of their declaration."""
         head: dict[str, Any] = {"kind": self.KIND, "schema": self.SCHEMA} if self.KIND else {}
-        return head | _to_json(self)
+        return head | to_json(self)
 
     def to_text(self) -> str:
         """Return the text of the file."""
@@ -227,14 +227,14 @@ def _shown(value: Any) -> str:
     return text if len(text) <= 60 else f"{text[:57]}..."
 
 
-def _to_json(value: Any) -> Any:
-    """As `to_jsonable`, but dataclasses become objects of their fields alone, with the keys of `json_key`."""
+def to_json(value: Any) -> Any:
+    """Return JSON values as `to_jsonable`, but of dataclasses their fields alone, with the keys of `json_key`."""
     if is_dataclass(value) and not isinstance(value, type):
-        return {f.metadata.get(_KEY, f.name): _to_json(getattr(value, f.name)) for f in fields(value)}
+        return {f.metadata.get(_KEY, f.name): to_json(getattr(value, f.name)) for f in fields(value)}
     if isinstance(value, Mapping):
-        return {str(key): _to_json(item) for key, item in value.items()}
+        return {str(key): to_json(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
-        return [_to_json(item) for item in value]
+        return [to_json(item) for item in value]
     return to_jsonable(value)
 
 

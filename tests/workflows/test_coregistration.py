@@ -20,19 +20,20 @@ from coregister.next_model.recipes import DEFAULT_MODEL_RECIPE, load_model_recip
 from coregister.stopping_rule import Rule
 from registration.errors import InputError
 from registration.model import gnm_npz
+from registration.options import RegisterOptions
 from tests.workflows.conftest import change
 from tests.workflows.farm.inline import Inline, really
 from tests.workflows.rounds import ACTS, MODEL, Finds, head, world, write_people, write_person
 from workflows.cli.app import main
 from workflows.engine.reader import QueueReader
 from workflows.engine.serialization import JobFailed
-from workflows.farm.coregistration import begin
+from workflows.farm.coregistration import start_coregistration
 from workflows.farm.flows import coregister
 from workflows.farm.local import LocalFarm, LocalRunResult
 from workflows.farm.plan import make_plan
 from workflows.pages import model
 from workflows.records.dataset import read_dataset, split
-from workflows.records.training_subjects import Registered
+from workflows.records.training_subjects import RegisteredSubjects
 
 TWICE = Rule(rounds=2, failures=1.0, early=False)
 
@@ -48,7 +49,7 @@ def finds(monkeypatch) -> Finds:
     monkeypatch.setattr(workflows.steps.stabilize, "write_stabilize_page", lambda *a: "<html></html>")
     monkeypatch.setattr(workflows.pages.coregistration, "number_curves", lambda *a: "<svg></svg>")
     monkeypatch.setattr(model, "number_curves", lambda *a: "<svg></svg>")
-    monkeypatch.setattr(model, "heat_pictures", lambda *a, **k: [])
+    monkeypatch.setattr(model, "heat_images", lambda *a, **k: [])
     return found
 
 
@@ -59,8 +60,8 @@ def dataset(capture: Path, tmp_path: Path) -> Path:
 
 
 def go(dataset: Path, out: Path, **options) -> dict:
-    settings = dict(model_path=MODEL, rule=TWICE, components=(2,), samples=2)
-    plan = begin(make_plan(dataset, out=out, **{**settings, **options}))
+    settings = dict(model=MODEL, rule=TWICE, components=(2,), samples=2)
+    plan = start_coregistration(make_plan(dataset, out=out, **{**settings, **options}))
     scope = Inline("run", really((dataset, MODEL.parent, out)), [])
     asyncio.run(coregister(scope, plan=str(plan)))
     return told(out)
@@ -120,7 +121,7 @@ def test_python_builds_the_same_model_from_the_same_registrations(dataset, finds
         run = out / "it00" / "registrations"
         names = record["plan"]["split"]["training"]
         tags = {subject: found.tags(subject) for subject in names}
-        subjects = Registered(run=run, names=names, model=data, steady=run / "stabilized", tags=tags)
+        subjects = RegisteredSubjects(run=run, names=names, model=data, steady=run / "stabilized", tags=tags)
         recipe = None if name == DEFAULT_MODEL_RECIPE else load_model_recipe(name)
         built = build_model(subjects, data, recipe, categories=found.categories)
         manifest = json.loads((out / "it00/model/gnm_head.manifest.json").read_text())
@@ -243,7 +244,7 @@ def test_expressions_reach_the_builder_in_the_neutrals_own_frame(dataset, finds,
     still = workflows.steps.stabilize.stabilize_subjects(
         run=str(run), names=["p0", "p1"], model=str(MODEL), out=str(run / "stabilized")
     )
-    subjects = list(Registered(run=run, names=["p0", "p1"], model=data, steady=Path(still["out"])))
+    subjects = list(RegisteredSubjects(run=run, names=["p0", "p1"], model=data, steady=Path(still["out"])))
     assert [subject.name for subject in subjects] == ["p0", "p1"]
     for seed, subject in enumerate(subjects):
         assert subject.neutral is not None
@@ -291,7 +292,7 @@ def all_tagged(dataset: Path) -> None:
         (without_neutral, "no neutral"),
         (twice, "same subject"),
         (another_label, "label is unknown"),
-        (incomplete, "not all there"),
+        (incomplete, "incomplete"),
         (all_tagged, "too few subjects to build a model from"),
     ],
 )
@@ -307,12 +308,12 @@ def test_datasets_that_cannot_be_used_are_refused(dataset, finds, tmp_path, spoi
     [
         ({"components": (2, 60)}, "too few subjects for so many components"),
         ({"components": (4, 2)}, "out of order"),
-        ({"recipe": "magic"}, "no such recipe"),
-        ({"held_out": 1.5}, "share to hold out"),
+        ({"options": RegisterOptions(recipe="magic")}, ""),
+        ({"held_out": 1.5}, "fraction to hold out"),
         ({"held_out": 0.9}, "too few subjects to build"),
         ({"held_out": Path("nobody.txt")}, "cannot be read"),
-        ({"rule": Rule(rounds=0)}, "no round"),
-        ({"model_path": Path("none.npz")}, ""),
+        ({"rule": Rule(rounds=0)}, "There is no round"),
+        ({"model": Path("none.npz")}, ""),
     ],
 )
 def test_settings_that_cannot_be_used_are_refused(dataset, finds, tmp_path, options, what):
@@ -364,7 +365,7 @@ def test_the_command(dataset, finds, tmp_path, capsys, monkeypatch):
         assert main(local) == 0
         shown = capsys.readouterr().out
         assert "model 1, 2 components: generalization" in shown and str(out / "index.html") in shown
-    assert told(out)["plan"]["split"]["how"] == "a share of 0.4 by seed 0" and len(finds.made) == 6
+    assert told(out)["plan"]["split"]["how"] == "a fraction of 0.4 by seed 0" and len(finds.made) == 6
     finds.outcomes["p0/neutral"] = finds.outcomes["p1/neutral"] = ValueError("odd")
     assert main([*local, "--seed", "1"]) == 1
-    assert "captures failed; look into them" in capsys.readouterr().out
+    assert "captures failed; inspect them" in capsys.readouterr().out

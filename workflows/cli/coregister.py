@@ -70,29 +70,28 @@ def coregister(
 
     plan = make_plan(
         dataset,
-        model_path=model,
-        out=out,
-        recipe=fit.recipe,
+        model,
+        out,
+        fit.register_options(),
         model_recipe=rounds.model_recipe,
         held_out=_fraction_or_file(rounds.held_out),
-        seed=fit.seed,
-        views=fit.views,
         components=rounds.components or None,
         rule=Rule(rounds=rounds.iterations, early=not rounds.all_iterations),
     )
     folder = farm.farm_folder(out)
     url = farm.url_for(folder)
     if not farm.local:
-        print(f"{submit_coregistration(url, plan, variant=fit.variant)} is in the queue; see gnmreg status")
+        print(f"{submit_coregistration(url, plan)} is in the queue; see gnmreg status")
         return 0
     migrate(url)
     gpus = gpus_here(None) if fit.variant == "cuda" else ()
     with shown() as progress:
-        record = coregister(plan, url=url, folder=folder, workers=farm.workers, gpus=gpus, progress=progress)
-    for name, figures in record["generalization_mm"].items():
-        print(f"{name}, {record['at']} components: generalization {figures[str(record['at'])]:.3f} mm")
-    print(f"{record.get('stopped') or record['verdict']['reason']}\n{out / PAGE}")
-    return 1 if "stopped" in record else 0
+        result = coregister(plan, url=url, folder=folder, workers=farm.workers, gpus=gpus, progress=progress)
+    state = result.state
+    for name, curve in state.generalization_mm.items():
+        print(f"{name}, {state.at} components: generalization {curve[str(state.at)]:.3f} mm")
+    print(f"{result.stopped or (state.verdict and state.verdict.reason)}\n{out / PAGE}")
+    return 1 if result.stopped else 0
 
 
 def _fraction_or_file(text: str | None) -> float | Path | None:

@@ -115,8 +115,7 @@ def batch(
     from workflows.farm.batch import batch_jobs, submit_batch
     from workflows.farm.local import LocalFarm, gpus_here, run_until_done
 
-    settings = {"recipe": fit.recipe, "views": fit.views, "seed": fit.seed, "variant": fit.variant}
-    jobs = batch_jobs(captures, model=model, out=out, run=run, **settings)
+    jobs = batch_jobs(captures, model=model, out=out, run=run, options=fit.register_options())
     folder = farm.farm_folder(out)
     url = farm.url_for(folder)
     if farm.local:

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 from tyro.conf import Positional, arg
 
 from registration.errors import InputError
+from registration.options import RegisterOptions
 
 if TYPE_CHECKING:
     from coregister.synthetic.capture import Studio
@@ -53,6 +54,10 @@ class FitOptions:
     views: Annotated[int | None, arg(metavar="N", help_behavior_hint="(default: all)")] = None
     seed: Seed = 0
     variant: Literal["llvm", "cuda"] = "llvm"
+
+    def register_options(self) -> RegisterOptions:
+        """Return the options of the registrations."""
+        return RegisterOptions(recipe=self.recipe, views=self.views, seed=self.seed, variant=self.variant)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -33,7 +33,7 @@ def verify(store: StoreUrl, /, tidy: bool = False) -> int:
         f"{report.artifacts} artifacts; {len(report.missing)} files missing, {len(report.altered)} altered, "
         f"{len(report.orphaned)} orphaned; {len(report.unreadable)} manifests unreadable"
     )
-    return 0 if report.sound else 1
+    return 0 if report.is_sound else 1
 
 
 def retire(

@@ -6,7 +6,7 @@ from typing import Any
 from dbos import Serializer
 
 APPLICATION = "gnmreg"
-VERSION = "wf-1"  # change it only with the structure of a workflow: workers take jobs of their own version only
+VERSION = "wf-2"  # change it only with the structure of a workflow: workers take jobs of their own version only
 _ERROR = "error"
 
 

@@ -3,13 +3,15 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
-from typing import Any
 
 from registration.errors import InputError
+from registration.options import RegisterOptions
+from registration.storage.records import to_json
 from workflows.engine.jobs import DRIVER, FlowJob, Job
 from workflows.ids import check_id, redact
 from workflows.records.remote import is_remote, local_path
 from workflows.steps import table
+from workflows.steps.job_options import to_job
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -21,12 +23,28 @@ class Batch:
     roots: tuple[str, ...]  # below which all its places lie
 
 
-def batch_jobs(captures: Sequence[str], *, model: str, out: str, run: str | None = None, **settings: Any) -> Batch:
-    """Jobs for captures: folders, URLs, or @FILE with one a line. Local ones are checked to be captures.
+def batch_jobs(
+    captures: Sequence[str],
+    *,
+    model: str,
+    out: str,
+    run: str | None = None,
+    options: RegisterOptions = RegisterOptions(),  # noqa: B008  frozen
+) -> Batch:
+    """Return one job for each capture.
+
+    Args:
+        captures: folders, URLs, or @FILE with one of them per line.
+        model: file or URL.
+        out: the store, a folder or URL.
+        run: name of the run; None: that of the store.
+        options: of all registrations.
 
     Raises:
-        InputError: no capture, one that is none, a model that is missing, or two captures of one name.
+        InputError: there is no capture, one cannot be found, the model is missing, two captures have one name, or the
+            options cannot be used by a worker.
     """
+    shared = {"model": _absolute(model), "store": _absolute(out), "options": to_json(to_job(options))}
     places = [place for word in captures for place in _listed(word)]
     if not places:
         raise _wrong("There is nothing to register", where="CAPTURE", expected="captures", got="none")
@@ -38,7 +56,7 @@ def batch_jobs(captures: Sequence[str], *, model: str, out: str, run: str | None
         Job(
             id=check_id(f"{name}/{key}"),
             step=table.REGISTER_STORED,
-            arguments={"capture": place, "model": _absolute(model), "store": _absolute(out), "key": key, **settings},
+            arguments={"capture": place, "key": key, **shared},
         )
         for key, place in names.items()
     )

@@ -1,9 +1,7 @@
-"""A coregistration put into a farm's queue, or into one of its own on this machine."""
+"""Submission of a coregistration to a farm's queue, or to a farm of its own on this machine."""
 
-import json
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 from registration.progress import Progress, Silent
 from workflows.engine.client import QueueClient
@@ -11,71 +9,85 @@ from workflows.engine.jobs import DRIVER, FlowJob
 from workflows.farm.local import LocalFarm, run_until_done
 from workflows.ids import check_id
 from workflows.pages.coregistration import write_coregistration_page
-from workflows.records.coregistration import FIRST, MANIFEST, Plan, State, write_plan, write_state
+from workflows.records.coregistration import (
+    MANIFEST,
+    PLAN,
+    CoregistrationPlan,
+    CoregistrationState,
+    initial_state,
+    write_state,
+)
 
-PLAN = "plan.json"  # in the output folder: what coordinators and workers read
+
+@dataclass(frozen=True, kw_only=True)
+class CoregistrationResult:
+    """The state of a coregistration whose run has ended."""
+
+    state: CoregistrationState
+    stopped: str = ""  # why the run ended without a verdict of its last round, if it did
 
 
-def submit_coregistration(url: str, plan: Plan, *, run: str | None = None, variant: str = "llvm") -> str:
+def submit_coregistration(url: str, plan: CoregistrationPlan, *, run: str | None = None) -> str:
     """Write the plan into its output folder and put the driver into the queue at `url`. Returns the run's name.
 
-    All processes of the farm must see the dataset, the model and the output folder under the same paths. What the
-    queue knows of a run of this name that ended is forgotten: every job looks anew whether its product is there, made
-    from the same inputs, so that only what is missing or changed is computed.
+    All processes of the farm must see the dataset, the model and the output folder under the same paths. The queue's
+    rows of an earlier run of this name are deleted: every job checks again whether its product exists, so that only
+    missing or changed products are computed.
 
     Raises:
-        InputError: there is no queue, the name cannot be used, or a run of this name has not ended.
+        InputError: there is no queue, the name is invalid, or a run of this name has not ended.
     """
-    name = check_id(run or plan.out.resolve().name)
+    name = check_id(run or plan.out.name)
     queue = QueueClient(url)
     try:
         queue.forget(name)
-        arguments = {"plan": str(begin(plan)), "variant": variant}
+        arguments = {"plan": str(start_coregistration(plan))}
         queue.submit([FlowJob(id=name, flow="coregister", arguments=arguments, queue=DRIVER)])
     finally:
         queue.close()
     return name
 
 
-def begin(plan: Plan) -> Path:
-    """Write the record without rounds, and the plan, whose file is returned."""
-    plan = replace(plan, dataset=plan.dataset.resolve(), model=plan.model.resolve(), out=plan.out.resolve())
-    write_state(State(plan=plan, models={FIRST: str(plan.model)}), write_coregistration_page)
-    write_plan(plan, plan.out / PLAN)
-    return plan.out / PLAN
+def start_coregistration(plan: CoregistrationPlan) -> Path:
+    """Write the record before the first round, and the plan, whose file is returned."""
+    write_state(initial_state(plan), write_coregistration_page)
+    file = plan.out / PLAN
+    plan.write(file)
+    return file
 
 
 def coregister(
-    plan: Plan,
+    plan: CoregistrationPlan,
     *,
     url: str,
     folder: Path,
     workers: int = 1,
     gpus: tuple[int, ...] = (),
     progress: Progress | None = None,
-) -> dict[str, Any]:
-    """Go round on this machine: a coordinator and workers, started and ended. Returns `coregistration.json`.
+) -> CoregistrationResult:
+    """Execute a plan on this machine: start a coordinator and workers, wait for the run, end them.
 
-    Called again it goes on where it was interrupted: what was made from the same inputs is not made anew. If the run
-    ended without a verdict, the entry "stopped" tells why.
+    A repeated call resumes: products of the same inputs are not computed again.
 
     Args:
-        url: of the queue, which `engine.durable.migrate` made; no other process serves it.
-        folder: for the logs of jobs, with the queue if that is a file.
-        workers: captures side by side; with `gpus` one for each of them instead.
+        plan: of the coregistration.
+        url: of the queue, which `engine.process.migrate` created; no other process serves it.
+        folder: of the jobs' logs, and of the queue if that is a file.
+        workers: number of captures that are registered in parallel; with `gpus` one for each of them instead.
+        gpus: numbers of the GPUs to use; none: the CPU.
+        progress: where to report to.
 
     Raises:
         InputError: as `submit_coregistration`, or a process refused to start.
     """
+    plan = replace(plan, options=replace(plan.options, variant="cuda" if gpus else "llvm"))
     queue = QueueClient(url)
     try:
-        queue.cancel(check_id(plan.out.resolve().name))  # of a command that was killed
+        queue.cancel(check_id(plan.out.name))  # the run of an earlier command that was killed
     finally:
         queue.close()
-    name = submit_coregistration(url, plan, variant="cuda" if gpus else "llvm")
-    places = (plan.dataset, plan.model.parent, plan.out, folder)
-    roots = tuple(str(place.resolve()) for place in places)
+    name = submit_coregistration(url, plan)
+    roots = tuple(str(path) for path in (plan.dataset, plan.model.parent, plan.out, folder.resolve()))
     farm = LocalFarm(url=url, folder=folder, roots=roots, workers=workers, gpus=gpus)
     stopped = run_until_done(farm, name, progress or Silent()).reason
-    told: dict[str, Any] = json.loads((plan.out / MANIFEST).read_text("utf-8"))
-    return told | ({"stopped": stopped} if stopped else {})
+    return CoregistrationResult(state=CoregistrationState.read(plan.out / MANIFEST), stopped=stopped)

@@ -7,15 +7,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from registration.errors import InputError
-from registration.fit.recipes import named_recipe
-from registration.options import RegisterOptions
 from registration.progress import Progress
 from workflows.engine.child import function_of
 from workflows.engine.jobs import validate_arguments
 from workflows.engine.reader import JobRow
 from workflows.records.remote import fetch_capture, fetch_folder, fetch_model, is_remote, local_path
+from workflows.steps.job_options import from_job
 from workflows.steps.register import REGISTRATION
-from workflows.steps.table import STEPS
+from workflows.steps.table import REGISTER, REGISTER_STORED, STEPS
 
 if TYPE_CHECKING:
     from workflows.web.fit_page import FitPage
@@ -41,7 +40,7 @@ def debug(row: JobRow, out: Path, progress: Progress, *, port: int | None = None
         raise _wrong(str(out), expected="a new or empty folder", got="one that holds something")
     validate_arguments(row.spec, STEPS, roots=("/", "s3:/"))  # the operator chose it: any path will do
     name, arguments = row.spec["step"], row.spec["arguments"]
-    if name in ("register", "register stored"):
+    if name in (REGISTER, REGISTER_STORED):
         return _register(arguments, out, progress, port)
     if port is not None:
         raise _wrong(row.id, expected="a registration, to be viewed", got=f"the step {name!r}: leave out --view")
@@ -72,13 +71,11 @@ def _register(arguments: Mapping[str, Any], out: Path, progress: Progress, port:
         page = None if port is None else _page(out / PICTURES, capture, model, port, progress)
         if page is not None:
             until_done.callback(page.close)
-        options = {key: arguments[key] for key in ("recipe", "views", "seed", "variant") if key in arguments}
-        named_recipe(options.get("recipe", "draft"))
         result = register(
             capture,
             model,
             out / REGISTRATION,
-            RegisterOptions(**options),
+            from_job(arguments.get("options")),
             neutral=None if neutral is None else Path(neutral),
             pictures=out / PICTURES,
             progress=progress,

@@ -1,4 +1,4 @@
-"""The order of jobs on a farm: batches, subjects, and the coregistration loop. A coordinator runs them, durably.
+"""The order of jobs on a farm: batches, subjects, and the coregistration loop. A coordinator executes them durably.
 
 A flow is a function of a `FlowScope` and small JSON arguments. It submits jobs and waits; it computes nothing, and all
 its data come from steps, so that it is deterministic when it is restarted.
@@ -9,8 +9,19 @@ import json
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
-from workflows.engine.jobs import EXPRESSION_PRIORITY, GPU, NEUTRAL_PRIORITY, REBUILD, STABILIZE_PRIORITY, FlowJob, Job
-from workflows.records.coregistration import FIRST
+from coregister.stopping_rule import Verdict
+from registration.storage.records import structure, to_json
+from workflows.engine.jobs import (
+    EXPRESSION_PRIORITY,
+    GPU,
+    NEUTRAL_PRIORITY,
+    REBUILD,
+    STABILIZE_PRIORITY,
+    FlowJob,
+    Job,
+)
+from workflows.records.coregistration import FIRST_MODEL, CoregistrationPlan, RoundProducts, model_name
+from workflows.records.step_results import BuildResult, EvaluateResult, HoldOutResult, StabilizeResult
 from workflows.steps import table
 
 if TYPE_CHECKING:
@@ -18,7 +29,7 @@ if TYPE_CHECKING:
 
 
 async def batch(scope: "FlowScope") -> dict[str, int]:
-    """Wait for the jobs of a batch, which lie in the queue already. Returns state -> how many."""
+    """Wait for the jobs of a batch, which are already in the queue. Returns state -> number of jobs."""
     return await scope.wait_below(scope.id)
 
 
@@ -29,19 +40,29 @@ async def subject(
     captures: Sequence[str],
     model: str,
     out: str,
-    settings: Mapping[str, Any],
-) -> dict[str, Any]:
-    """A subject: the neutral, then each expression from it, then the record of all.
+    options: Mapping[str, Any],
+) -> dict[str, int]:
+    """Register a subject: the neutral, then each expression from it, then the record of all.
 
-    A capture that cannot be registered takes no other along; only without a neutral nothing is registered. `captures`
-    are the names of their folders, the neutral's first.
+    A capture that fails does not affect the others, except that without a neutral nothing is registered.
+
+    Args:
+        scope: of the flow.
+        subject_dir: folder of the captures.
+        captures: names of their folders, the neutral's first.
+        model: file of the model.
+        out: folder of the registrations.
+        options: a `RegisterOptions` as JSON.
+
+    Returns:
+        Numbers of usable and failed captures.
     """
     neutral, *others = captures
-    place = {"model": model, **settings}
+    shared = {"model": model, "options": dict(options)}
 
     def job(number: int, name: str) -> Job:
         kind = "neutral" if number == 0 else f"e{number:03d}"
-        arguments = {"capture": f"{subject_dir}/{name}", "out": f"{out}/{name}", **place}
+        arguments = {"capture": f"{subject_dir}/{name}", "out": f"{out}/{name}", **shared}
         arguments |= {"neutral": f"{out}/{neutral}"} if number else {"subject_dir": subject_dir}
         priority = NEUTRAL_PRIORITY if number == 0 else EXPRESSION_PRIORITY
         return Job(id=f"{scope.id}/{kind}", step=table.REGISTER, arguments=arguments, priority=priority)
@@ -51,113 +72,143 @@ async def subject(
     if done:
         done |= await scope.run([jobs[name] for name in others])
     failures = await scope.failures([jobs[name] for name in (captures if done else [neutral])])
-    leave = {name: failures[one.id] for name, one in jobs.items() if one.id in failures}
+    leave = {name: failures[job.id] for name, job in jobs.items() if job.id in failures}
     if not done:
         leave |= {name: f"the neutral failed: {leave[neutral]}" for name in others}
-    arguments = {"subject_dir": subject_dir, "out": out, "leave": leave, **_without(place, "variant")}
-    identity = _named(f"{scope.id}/collect", arguments)
+    arguments = {"subject_dir": subject_dir, "out": out, "leave": leave, **shared}
+    identity = _unique_id(f"{scope.id}/collect", arguments)
     await scope.run([Job(id=identity, step=table.COLLECT, arguments=arguments, priority=STABILIZE_PRIORITY)])
     return {"usable": len(done), "failed": len(captures) - len(done)}
 
 
-async def coregister(scope: "FlowScope", *, plan: str, variant: str = "llvm") -> dict[str, Any]:
-    """Rounds of registering all, stabilizing, building, evaluating and deciding (`coregistration.py` as a flow)."""
-    told = await scope.read(plan)
-    out, model, rule = told["out"], told["model"], told["rule"]
-    settings = {"recipe": told["recipe"], "views": told["views"], "seed": told["seed"], "variant": variant}
-    people = await _hold_out(scope, told, settings)
-    models, rounds = {FIRST: model}, list[dict[str, Any]]()
-    for number in range(rule["rounds"]):
+async def coregister(scope: "FlowScope", *, plan: str) -> dict[str, Any]:
+    """Execute the rounds of a plan: register, stabilize, build, evaluate, apply the stopping rule.
+
+    Args:
+        scope: of the flow.
+        plan: the file `plan.json`.
+
+    Returns:
+        The number of rounds, the last model's file and the reason of the end.
+    """
+    record = CoregistrationPlan.from_json(await scope.read(plan), where=plan)
+    training, model = list(record.split.training), str(record.model)
+    held_out = await _hold_out(scope, record)
+    models, rounds = {FIRST_MODEL: model}, list[RoundProducts]()
+    for number in range(record.rule.rounds):
         name = f"it{number:02d}"
-        run = f"{out}/{name}/registrations"
-        await _register(scope, name, told, told["split"]["training"], run, model, settings)
-        steady = f"{run}/stabilized"
-        names = told["split"]["training"]
-        still = await _one(scope, f"{name}/stab", table.STABILIZE, run=run, names=names, model=model, out=steady)
-        built = await _one(
-            scope,
-            f"{name}/build",
-            table.BUILD,
-            run=run,
-            names=names,
-            steady=still["out"],
-            dataset=told["dataset"],
-            previous=model,
-            out=f"{out}/{name}/model",
-            recipe=told["model_recipe"],
+        folder = f"{record.out}/{name}"
+        run = f"{folder}/registrations"
+        await _register(scope, name, record, training, run, model)
+        stabilized = StabilizeResult.from_json(
+            await _run_step(
+                scope,
+                f"{name}/stab",
+                table.STABILIZE,
+                run=run,
+                names=training,
+                model=model,
+                out=f"{run}/stabilized",
+            ),
+            where=f"{name}/stab",
         )
-        model = built["model"]
-        models[f"model {number + 1}"] = model
-        measured = await _one(
-            scope,
-            f"{name}/evaluate",
-            table.EVALUATE,
-            models=models,
-            people=people["people"],
-            out=f"{out}/{name}/evaluation",
-            components=told["components"],
-            samples=told["samples"],
-            seed=told["seed"],
+        built = BuildResult.from_json(
+            await _run_step(
+                scope,
+                f"{name}/build",
+                table.BUILD,
+                run=run,
+                names=training,
+                steady=stabilized.out,
+                dataset=str(record.dataset),
+                previous=model,
+                out=f"{folder}/model",
+                recipe=record.model_recipe.to_json(),
+            ),
+            where=f"{name}/build",
         )
-        rounds.append({"name": name, "stabilize": still, "build": built, "evaluate": measured})
-        verdict = await _one(scope, f"{name}/decide", table.END_ROUND, plan=plan, people=people, rounds=rounds)
-        if not verdict["go_on"]:
+        model = built.model
+        models[model_name(number + 1)] = model
+        evaluated = EvaluateResult.from_json(
+            await _run_step(
+                scope,
+                f"{name}/evaluate",
+                table.EVALUATE,
+                models=models,
+                people=held_out.people,
+                out=f"{folder}/evaluation",
+                components=list(record.components),
+                samples=record.samples,
+                seed=record.seed,
+            ),
+            where=f"{name}/evaluate",
+        )
+        rounds.append(RoundProducts(name=name, stabilize=stabilized, build=built, evaluate=evaluated))
+        verdict = await _end_round(scope, name, plan, held_out, rounds)
+        if not verdict.go_on:
             break
-    return {"rounds": len(rounds), "model": model, "reason": verdict["reason"]}
+    return {"rounds": len(rounds), "model": model, "reason": verdict.reason}
 
 
-async def _hold_out(scope: "FlowScope", told: Mapping[str, Any], settings: Mapping[str, Any]) -> dict[str, Any]:
-    """What models are measured on; who has no truth is registered with the first model."""
-    run = f"{told['out']}/held_out/registrations"
-    if told["bare"]:
-        await _register(scope, "held", told, told["bare"], run, told["model"], settings)
-    return await _one(
+async def _end_round(
+    scope: "FlowScope", name: str, plan: str, held_out: HoldOutResult, rounds: Sequence[RoundProducts]
+) -> Verdict:
+    """The stopping rule's verdict, in the record."""
+    arguments = {"plan": plan, "people": held_out.to_json(), "rounds": to_json(rounds)}
+    value = await _run_step(scope, f"{name}/decide", table.END_ROUND, **arguments)
+    verdict: Verdict = structure(value, Verdict, where=f"{name}/decide", title="verdict")
+    return verdict
+
+
+async def _hold_out(scope: "FlowScope", plan: CoregistrationPlan) -> HoldOutResult:
+    """The held-out subjects; those without true meshes are registered with the first model."""
+    folder = f"{plan.out}/held_out"
+    run = f"{folder}/registrations"
+    if plan.without_truth:
+        await _register(scope, "held", plan, plan.without_truth, run, str(plan.model))
+    value = await _run_step(
         scope,
         "hold_out",
         table.HOLD_OUT,
-        dataset=told["dataset"],
-        names=told["split"]["held_out"],
+        dataset=str(plan.dataset),
+        names=list(plan.split.held_out),
         registrations=run,
-        model=told["model"],
-        out=f"{told['out']}/held_out",
+        model=str(plan.model),
+        out=folder,
     )
+    return HoldOutResult.from_json(value, where="hold_out")
 
 
 async def _register(
-    scope: "FlowScope",
-    part: str,
-    told: Mapping[str, Any],
-    names: Sequence[str],
-    run: str,
-    model: str,
-    settings: Mapping[str, Any],
+    scope: "FlowScope", part: str, plan: CoregistrationPlan, names: Sequence[str], run: str, model: str
 ) -> None:
-    """All subjects, each a flow. Parks the run if too many captures fail: a person shall look before it goes on."""
+    """Register subjects, each in a flow. If too many captures fail, the run is parked for manual inspection."""
+    options = to_json(plan.options)
     flows = [
         FlowJob(
             id=f"{scope.id}/{part}/s{number:05d}",
             flow="subject",
             arguments={
-                "subject_dir": f"{told['dataset']}/{name}",
-                "captures": told["captures"][name],
+                "subject_dir": f"{plan.dataset}/{name}",
+                "captures": list(plan.captures[name]),
                 "model": model,
                 "out": f"{run}/{name}",
-                "settings": dict(settings),
+                "options": options,
             },
         )
         for number, name in enumerate(names)
     ]
     done = await scope.run(flows)
-    total = sum(len(told["captures"][name]) for name in names)
-    usable = sum(one["usable"] for one in done.values())
-    if total - usable > told["rule"]["failures"] * total:
-        raise scope.park(f"{part}: {total - usable} of {total} captures failed; look into them, then `gnmreg retry`")
+    total = sum(len(plan.captures[name]) for name in names)
+    failed = total - sum(result["usable"] for result in done.values())
+    if failed > plan.rule.failures * total:
+        raise scope.park(f"{part}: {failed} of {total} captures failed; inspect them, then `gnmreg retry`")
 
 
-async def _one(scope: "FlowScope", part: str, step: str, **arguments: Any) -> dict[str, Any]:
-    """One job's result; the run is parked if it fails."""
+async def _run_step(scope: "FlowScope", part: str, step: str, **arguments: Any) -> dict[str, Any]:
+    """The result of one job; the run is parked if it fails."""
     queue = GPU if step == table.END_ROUND else REBUILD
-    identity = _named(f"{scope.id}/{part}", arguments)
+    identity = _unique_id(f"{scope.id}/{part}", arguments)
     job = Job(id=identity, step=step, arguments=arguments, queue=queue, priority=STABILIZE_PRIORITY)
     done = await scope.run([job])
     if job.id not in done:
@@ -167,14 +218,10 @@ async def _one(scope: "FlowScope", part: str, step: str, **arguments: Any) -> di
     return result
 
 
-def _named(identity: str, arguments: Mapping[str, Any]) -> str:
-    """An id of these very arguments: a retried run may come here with others, and what is there is left as it is."""
+def _unique_id(identity: str, arguments: Mapping[str, Any]) -> str:
+    """An id for these arguments: a retried run may submit the job with others, and the queue runs each id once."""
     digest = hashlib.sha256(json.dumps(arguments, sort_keys=True).encode()).hexdigest()
     return f"{identity}-{digest[:8]}"
-
-
-def _without(values: Mapping[str, Any], name: str) -> dict[str, Any]:
-    return {key: value for key, value in values.items() if key != name}
 
 
 FLOWS: Mapping[str, Any] = {"batch": batch, "subject": subject, "coregister": coregister}

@@ -8,18 +8,20 @@ from markupsafe import Markup
 
 from registration.report.charts import Line, number_curves
 from workflows.pages.base import render
+from workflows.records.coregistration import FIRST_MODEL, model_name
 
-FIRST_MODEL = "model 0"
 MISSING = "–"
 
 
 def write_coregistration_page(record: Mapping[str, Any]) -> str:
     """Return the page for the entries of `coregistration.json`; its links lead to files beside it."""
     plan, components = record["plan"], str(record["at"])
+    recipe = plan["options"]["recipe"]
     return render(
         "coregistration.html",
         dataset=Path(plan["dataset"]).name,
         plan=plan,
+        recipe=recipe if isinstance(recipe, str) else recipe["name"],
         lead=_lead(record["verdict"]),
         components=components,
         first_mm=record["generalization_mm"].get(FIRST_MODEL, {}).get(components),
@@ -39,7 +41,7 @@ def _lead(verdict: Mapping[str, Any] | None) -> str:
 def _round(number: int, row: Mapping[str, Any], record: Mapping[str, Any], components: str) -> dict[str, Any]:
     captures = [capture for subject in row["register"].values() for capture in subject.values()]
     failed = sum(not capture["usable"] for capture in captures)
-    built, model = row["build"], f"model {number}"
+    built, model = row["build"], model_name(number)
     metrics = [record[name].get(model, {}).get(components) for name in ("generalization_mm", "specificity_mm")]
     cells = [
         row["name"],

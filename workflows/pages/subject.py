@@ -12,7 +12,7 @@ from registration.geometry.rasterizer import rasterize
 from registration.report.pictures import PAPER, data_uri
 from registration.types import Camera, Registration
 from workflows.pages.base import render
-from workflows.records.subject import Subject
+from workflows.records.subject import SubjectRecord
 
 _WIDTH_PX, _HEIGHT_PX = 144, 192  # of a thumbnail
 _OVERSAMPLING = 2
@@ -48,7 +48,7 @@ def _front(head: Float[np.ndarray, "V 3"], width_px: int, height_px: int) -> Cam
     return Camera(width_px=width_px, height_px=height_px, intrinsics=intrinsics, T_cam_world=pose)
 
 
-def write_subject_page(subject: Subject, thumbnails: Mapping[str, str]) -> str:
+def write_subject_page(subject: SubjectRecord, thumbnails: Mapping[str, str]) -> str:
     """Return the page; `thumbnails` are data URIs by the name of the row."""
     return render(
         "subject.html",

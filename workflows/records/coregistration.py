@@ -1,92 +1,118 @@
 """The record of a coregistration, `coregistration.json`, and its plan, `plan.json`, for coordinators and workers."""
 
-import json
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from coregister.next_model.recipes import ModelRecipe
-from coregister.stopping_rule import Rule
-from registration.errors import InputError
-from registration.model import gnm_npz
+from coregister.stopping_rule import Round, Rule, Verdict
+from registration.options import RegisterOptions
 from registration.storage.files import atomic_write_text, refuse_foreign
-from registration.storage.hashing import to_jsonable, versions
-from workflows.records.dataset import Split, read_dataset
-from workflows.records.training_subjects import has_truths
+from registration.storage.hashing import versions
+from registration.storage.records import Record
+from workflows.records.dataset import Split
+from workflows.records.step_results import (
+    BuildResult,
+    CaptureResult,
+    Curves,
+    EvaluateResult,
+    HoldOutResult,
+    StabilizeResult,
+)
 
-SCHEMA = 1
-KIND = "gnm-coregistration"
-MANIFEST, PAGE = "coregistration.json", "index.html"
-FIRST = "model 0"
+MANIFEST, PAGE, PLAN = "coregistration.json", "index.html", "plan.json"
+FIRST_MODEL = "model 0"
+
+
+def model_name(number: int) -> str:
+    """Return the name of a model in records and figures; 0 is the first model, n the one that round n built."""
+    return f"model {number}"
 
 
 @dataclass(frozen=True, kw_only=True)
-class Plan:
-    """All that is known before the first step, checked."""
+class CoregistrationPlan(
+    Record, kind="gnm-coregistration-plan", title="coregistration's plan", fix="run `gnmreg coregister` again"
+):
+    """Everything that is decided before the first step: `plan.json`. Paths are absolute."""
 
     dataset: Path
-    model: Path
+    model: Path  # the first one
     out: Path
-    recipe: str
+    options: RegisterOptions  # of all registrations
     model_recipe: ModelRecipe
-    views: int | None
-    seed: int
-    components: tuple[int, ...]
-    samples: int
+    components: tuple[int, ...]  # numbers of components that models are evaluated with
+    samples: int  # random heads of each model, for specificity
     rule: Rule
     split: Split
+    captures: Mapping[str, tuple[str, ...]]  # subject -> folders of captures, the neutral's first
+    without_truth: tuple[str, ...]  # held-out subjects whose captures have no true meshes
+
+    @property
+    def seed(self) -> int:
+        """The seed of everything random."""
+        return self.options.seed
 
 
 @dataclass(frozen=True, kw_only=True)
-class State:
-    """What there is so far: `coregistration.json`."""
+class RoundProducts:
+    """The results of a round's steps, as its flow has them."""
 
-    plan: Plan
-    sources: Mapping[str, str] = field(default_factory=dict)  # held-out subject -> what it is measured on
-    lost: Sequence[str] = ()  # held-out subjects that have nothing to be measured on
+    name: str  # "it00", the name of its folder
+    stabilize: StabilizeResult
+    build: BuildResult
+    evaluate: EvaluateResult
+
+
+@dataclass(frozen=True, kw_only=True)
+class RoundRecord(RoundProducts):
+    """A round, with what the stopping rule was applied to."""
+
+    register: Mapping[str, Mapping[str, CaptureResult]]  # subject -> capture -> its registration
+    decide: Round
+
+
+@dataclass(frozen=True, kw_only=True)
+class CoregistrationState(
+    Record, kind="gnm-coregistration", schema=2, title="coregistration's record", fix="run `gnmreg coregister` again"
+):
+    """All rounds so far: `coregistration.json`."""
+
+    plan: CoregistrationPlan
+    sources: Mapping[str, str] = field(default_factory=dict)  # held-out subject -> what it is evaluated on
+    lost: tuple[str, ...] = ()  # held-out subjects that have nothing to be evaluated on
     models: Mapping[str, str] = field(default_factory=dict)  # name -> file
-    rounds: Sequence[Mapping[str, Any]] = ()  # what each step of a round told
-    generalization_mm: Mapping[str, Any] = field(default_factory=dict)  # model -> components -> mm
-    specificity_mm: Mapping[str, Any] = field(default_factory=dict)
-    at: int = 0  # the number of components that decides
-    verdict: Mapping[str, Any] | None = None
+    rounds: tuple[RoundRecord, ...] = ()
+    generalization_mm: Curves = field(default_factory=dict)
+    specificity_mm: Curves = field(default_factory=dict)
+    at: int = 0  # the number of components that the stopping rule uses
+    verdict: Verdict | None = None
+    versions: Mapping[str, str] = field(default_factory=versions)
 
 
-def write_state(state: State, page: Callable[[Mapping[str, Any]], str]) -> None:
-    """Write `coregistration.json` and `index.html`, which `page` makes from its entries, each in one rename."""
-    told = to_jsonable({"kind": KIND, "schema": SCHEMA, **vars(state), "versions": versions()})
-    state.plan.out.mkdir(parents=True, exist_ok=True)
-    atomic_write_text(state.plan.out / MANIFEST, json.dumps(told, indent=1, allow_nan=False) + "\n")
-    atomic_write_text(state.plan.out / PAGE, page(told))
+def initial_state(plan: CoregistrationPlan, held_out: HoldOutResult | None = None) -> CoregistrationState:
+    """Return the state before the first round."""
+    return CoregistrationState(
+        plan=plan,
+        sources={} if held_out is None else held_out.sources,
+        lost=() if held_out is None else held_out.lost,
+        models={FIRST_MODEL: str(plan.model)},
+    )
+
+
+def write_state(state: CoregistrationState, page: Callable[[Mapping[str, Any]], str]) -> None:
+    """Write `coregistration.json` and `index.html`, each in one rename.
+
+    Args:
+        state: is written into the plan's output folder.
+        page: makes the page from the entries of `coregistration.json`.
+    """
+    out = state.plan.out
+    out.mkdir(parents=True, exist_ok=True)
+    state.write(out / MANIFEST)
+    atomic_write_text(out / PAGE, page(state.to_json()))
 
 
 def check_out(out: Path) -> None:
-    """Refuse, before any work, a folder that is not ours to write into. Raises InputError."""
-    refuse_foreign(out, kind=KIND, command="coregister", manifest=MANIFEST)
-
-
-def write_plan(plan: Plan, file: Path) -> None:
-    """All that the flow of a coregistration has to know, for coordinators and workers to read."""
-    found, data = read_dataset(plan.dataset), gnm_npz.read(plan.model)
-    names = (*plan.split.training, *plan.split.held_out)
-    bare = [name for name in plan.split.held_out if not has_truths(found.subjects[name], data)]
-    captures = {name: [one.root.name for one in found.subjects[name].captures] for name in names}
-    told = {**asdict(plan), "captures": captures, "bare": bare}  # of each subject the neutral first
-    file.parent.mkdir(parents=True, exist_ok=True)
-    atomic_write_text(file, json.dumps(to_jsonable(told), indent=1, allow_nan=False) + "\n")
-
-
-def read_plan(file: Path) -> dict[str, Any]:
-    """What `write_plan` wrote. Raises InputError if it cannot be read."""
-    try:
-        told: dict[str, Any] = json.loads(file.read_text("utf-8"))
-    except (OSError, ValueError) as error:
-        raise InputError(
-            "The plan of a coregistration cannot be read",
-            where=file,
-            expected="the file that `gnmreg coregister` wrote",
-            got=error,
-            fix="run `gnmreg coregister` again",
-        ) from None
-    return told
+    """Refuse, before any work, an output folder that is not a coregistration's. Raises InputError."""
+    refuse_foreign(out, kind=CoregistrationState.KIND, command="coregister", manifest=MANIFEST)

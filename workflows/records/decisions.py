@@ -1,64 +1,82 @@
-"""The log of decisions about components of the stabilization, as `gnmreg stabilize review` writes it: JSON lines."""
+"""The log of decisions about components of the stabilization, `decisions.jsonl`: JSON lines, append-only."""
 
 import json
 from collections.abc import Sequence
+from dataclasses import dataclass
 from datetime import UTC, datetime
 from getpass import getuser
 from pathlib import Path
 
 from registration.errors import InputError
-from registration.stabilize.decisions import ACTIONS, Decision
+from registration.stabilize.decisions import Action, Decision
 from registration.storage.files import atomic_write_text
+from registration.storage.records import Record
+
+
+@dataclass(frozen=True, kw_only=True)
+class DecisionEntry(
+    Record, title="log of decisions", fix="check the path, or review again with `gnmreg stabilize review`"
+):
+    """A line of the log."""
+
+    time: str = ""  # UTC
+    by: str = ""
+    dataset: str  # id of the registrations, model and settings that the decision is about
+    region: str
+    component: int  # from 0
+    action: Action
+    reason: str
 
 
 def read_decisions(file: Path, dataset: str) -> list[Decision]:
-    """A log's decisions, in order; those of one component may be several, the last one counts.
+    """Read the decisions of a log, in order; of several about one component the last one applies.
 
-    Raises InputError for a file that is no log, and for decisions about another dataset.
+    Args:
+        file: the log.
+        dataset: id of the dataset that the decisions must be about.
+
+    Raises:
+        InputError: the file cannot be read, a line is malformed, or decisions are about another dataset.
     """
     try:
-        entries = [json.loads(line) for line in Path(file).read_text("utf-8").splitlines() if line.strip()]
-        if unknown := [e["action"] for e in entries if e["action"] not in ACTIONS]:
-            raise ValueError(f"the action {unknown[0]!r}")
-        decisions = [
-            Decision(
-                region=str(e["region"]), component=int(e["component"]), action=e["action"], reason=str(e["reason"])
-            )
-            for e in entries
-        ]
-        datasets = {str(e["dataset"]) for e in entries}
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise InputError(
-            "The decisions cannot be read",
-            where=file,
-            expected="a log as `gnmreg stabilize review` writes it",
-            got=f"{type(error).__name__}: {error}",
-            fix="check the path, or review again",
-        ) from error
+        lines = Path(file).read_text("utf-8").splitlines()
+    except (OSError, ValueError) as error:
+        raise DecisionEntry.invalid(file, expected="a readable file of JSON lines", got=error) from error
+    entries = [
+        DecisionEntry.from_text(line, where=f"{file}, line {number}")
+        for number, line in enumerate(lines, 1)
+        if line.strip()
+    ]
+    datasets = {entry.dataset for entry in entries}
     if datasets - {dataset}:
         raise InputError(
             "The decisions are about another dataset",
             where=file,
             expected=f"dataset {dataset[:16]}",
             got=", ".join(sorted(other[:16] for other in datasets - {dataset})),
-            fix="review this dataset: components differ wherever registrations, model or settings do",
+            fix="review this dataset: its components differ with its registrations, model and settings",
         )
-    return decisions
+    return [
+        Decision(region=entry.region, component=entry.component, action=entry.action, reason=entry.reason)
+        for entry in entries
+    ]
 
 
 def append_decisions(file: Path, dataset: str, decisions: Sequence[Decision]) -> None:
-    """Add dated decisions to the log, which appears whole or not at all; what is in it stays."""
+    """Append decisions with time and user name to a log, in one rename.
+
+    Raises:
+        InputError: the log cannot be read, or is about another dataset.
+    """
     file = Path(file)
-    former = file.read_text("utf-8") if file.is_file() else ""
-    if former:
+    previous = file.read_text("utf-8") if file.is_file() else ""
+    if previous:
         read_decisions(file, dataset)
-    head = {"time": datetime.now(UTC).isoformat(timespec="seconds"), "by": _user(), "dataset": dataset}
-    lines = [
-        json.dumps({**head, "region": d.region, "component": d.component, "action": d.action, "reason": d.reason})
-        for d in decisions
-    ]
+    time, user = datetime.now(UTC).isoformat(timespec="seconds"), _user()
+    entries = [DecisionEntry(time=time, by=user, dataset=dataset, **vars(decision)) for decision in decisions]
+    lines = [json.dumps(entry.to_json()) for entry in entries]
     file.parent.mkdir(parents=True, exist_ok=True)
-    atomic_write_text(file, former + "".join(f"{line}\n" for line in lines))
+    atomic_write_text(file, previous + "".join(f"{line}\n" for line in lines))
 
 
 def _user() -> str:

@@ -1,7 +1,7 @@
-"""What `gnmreg model evaluate` is given: held-out subjects, as registrations of a run or as meshes in one NPZ file."""
+"""The input of `gnmreg model evaluate`: held-out subjects, as registrations of a run or as meshes in one NPZ file."""
 
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Int
 
-from coregister.evaluate.evaluation import NEUTRAL, HeldOutSubject
+from coregister.evaluate.evaluation import HeldOutSubject
 from registration.capture.native import natural_key, read_capture
 from registration.capture.scan import read_scan
 from registration.errors import InputError
@@ -17,14 +17,26 @@ from registration.evaluate.evaluation import CLOUD_TOLERANCE
 from registration.evaluate.face import face_ball, seen
 from registration.stabilize import stabilized_folder as stabilized
 from registration.storage.hashing import hash_arrays, hash_capture
+from registration.storage.npz import NpzSchema
 from registration.storage.registration_folder import load_registration
 from registration.types import Registration
+from workflows.records.dataset import CATEGORY
 from workflows.records.run import STABILIZED
-from workflows.records.subject import MANIFEST, USABLE
+from workflows.records.subject import MANIFEST, NEUTRAL, is_subject_folder, read_subject
 
 TAG = "tag_"  # prefix of an NPZ file's tags
-_CATEGORY = "category"
-_FIX = "see docs/formats.md, Held-out subjects"
+SCHEMA = NpzSchema(
+    title="held-out file",
+    fix="see docs/formats.md, Held-out subjects",
+    fields={
+        "vertices": ("float", "N V 3"),
+        "triangles": ("integer", "F 3"),
+        "subjects": ("text", "N"),
+        "labels": ("text", "N"),
+    },
+    indices={"triangles": "V"},
+)
+CATEGORIES = "categories"  # optional, of the length N as the tags
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -37,82 +49,73 @@ class HeldOutSet:
 
 
 def read_held_out(source: Path, captures: Path | None = None) -> HeldOutSet:
-    """The subjects of an NPZ file or of a run of `gnmreg subject`, with expressions where the run was stabilized.
+    """Read held-out subjects.
 
-    `captures`: the folder of the run's subjects, each with its captures: adds tags, categories and scans.
+    Args:
+        source: an NPZ file, or a run of `gnmreg subject`, from which expressions are read if it was stabilized.
+        captures: folder of the run's subjects, each with their captures: adds tags, categories and scans.
 
     Raises:
-        InputError: nothing there; a file, registration or capture that cannot be read; a subject without one neutral.
+        InputError: there are no subjects; a file, record, registration or capture cannot be read; a subject has not
+            exactly one neutral; topologies differ.
     """
     source = Path(source)
     if not source.is_dir():
-        found = _of_file(source)
-        return replace(found, inputs={"held_out": hash_arrays(*_arrays(found.subjects))})
-    files = sorted(source.glob(f"*/{MANIFEST}"), key=lambda file: natural_key(file.parent.name))
-    if not files:
-        raise _bad("There are no held-out subjects", source, f"folders with {MANIFEST}, or an NPZ file", "none")
+        return _from_file(source)
+    folders = sorted(filter(is_subject_folder, source.iterdir()), key=lambda folder: natural_key(folder.name))
+    if not folders:
+        raise _input_error("There are no held-out subjects", source, f"folders with {MANIFEST}, or an NPZ file", "none")
     expressions = _stabilized(source / STABILIZED)
     subjects, topologies, inputs = [], [], {}
-    for file in files:
-        one, registration, name = _of_folder(file)
-        if one.subject in expressions:
-            one = replace(one, **expressions[one.subject])
+    for folder in folders:
+        subject, registration, neutral = _from_folder(folder)
+        if subject.subject in expressions:
+            subject = replace(subject, **expressions[subject.subject])
         if captures is not None:
-            folder = Path(captures) / file.parent.name
-            one = _with_captures(one, folder, registration, name)
-            inputs[f"capture {one.subject}"] = hash_capture(read_capture(folder / name))
-        subjects.append(one)
+            capture_folder = Path(captures) / folder.name
+            subject = _with_captures(subject, capture_folder, registration, neutral)
+            inputs[f"capture {subject.subject}"] = hash_capture(read_capture(capture_folder / neutral))
+        subjects.append(subject)
         topologies.append(registration.triangles)
     if other := [s.subject for s, t in zip(subjects, topologies, strict=True) if not np.array_equal(t, topologies[0])]:
         got = f"another of {other[0]}"
-        raise _bad("The held-out subjects have different topologies", source, "one topology", got)
-    inputs["held_out"] = hash_arrays(*_arrays(subjects))
+        raise _input_error("The held-out subjects have different topologies", source, "one topology", got)
+    inputs["held_out"] = _digest(subjects)
     return HeldOutSet(subjects=tuple(subjects), triangles=topologies[0], inputs=inputs)
 
 
-def _arrays(subjects: tuple[HeldOutSubject, ...] | list[HeldOutSubject]) -> list[np.ndarray]:
-    texts = [
-        np.array([s.subject, *s.categories, json.dumps(dict(s.tags), sort_keys=True, default=str)]) for s in subjects
-    ]
-    return [array for s, text in zip(subjects, texts, strict=True) for array in (s.neutral, s.expressions, text)]
+def _digest(subjects: Sequence[HeldOutSubject]) -> str:
+    arrays: list[np.ndarray] = []
+    for subject in subjects:
+        tags = json.dumps(dict(subject.tags), sort_keys=True, default=str)
+        arrays += [subject.neutral, subject.expressions, np.array([subject.subject, *subject.categories, tags])]
+    return hash_arrays(*arrays)
 
 
-def _of_file(file: Path) -> HeldOutSet:
-    try:
-        with np.load(file, allow_pickle=False) as archive:
-            arrays = {name: archive[name] for name in archive.files}
-    except Exception as error:  # whatever a broken file makes zipfile, zlib and numpy raise
-        got = f"{type(error).__name__}: {error}"
-        raise _bad("The held-out meshes cannot be read", file, "an NPZ file of plain arrays", got) from error
-    needed = ("vertices", "triangles", "subjects", "labels")
-    if missing := [name for name in needed if name not in arrays]:
-        raise _bad("The held-out meshes are incomplete", file, f"the arrays {', '.join(needed)}", f"no {missing[0]}")
-    vertices, triangles = arrays["vertices"], arrays["triangles"]
-    if vertices.ndim != 3 or vertices.shape[2] != 3 or vertices.dtype.kind != "f":
-        got = f"{vertices.dtype} {vertices.shape}"
-        raise _bad("The held-out meshes are no meshes", f"{file}, vertices", "floats (N, V, 3)", got)
-    if triangles.ndim != 2 or triangles.shape[1] != 3 or triangles.dtype.kind not in "iu":
-        got = f"{triangles.dtype} {triangles.shape}"
-        raise _bad("The held-out meshes are no meshes", f"{file}, triangles", "integers (F, 3)", got)
-    per_mesh = ["subjects", "labels", *(n for n in arrays if n.startswith(TAG) or n == "categories")]
-    for name in per_mesh:
-        if arrays[name].shape != (len(vertices),):
+def _from_file(file: Path) -> HeldOutSet:
+    arrays = SCHEMA.read(file)
+    count = len(arrays["vertices"])
+    for name in (name for name in arrays if name.startswith(TAG) or name == CATEGORIES):
+        if arrays[name].shape != (count,):
             got = f"shape {arrays[name].shape}"
-            raise _bad("The held-out meshes are incomplete", f"{file}, {name}", f"{len(vertices)} entries", got)
-    subjects = arrays["subjects"].astype(str)
-    names = dict.fromkeys(subjects.tolist())
-    found = tuple(_of_rows(name, np.flatnonzero(subjects == name), arrays, file) for name in names)
-    return HeldOutSet(subjects=found, triangles=triangles.astype(np.int64), inputs={})
+            raise _input_error("The held-out meshes are incomplete", f"{file}, {name}", f"{count} entries", got)
+    names = dict.fromkeys(arrays["subjects"].tolist())
+    subjects = tuple(_from_rows(name, np.flatnonzero(arrays["subjects"] == name), arrays, file) for name in names)
+    triangles = arrays["triangles"].astype(np.int64)
+    return HeldOutSet(subjects=subjects, triangles=triangles, inputs={"held_out": _digest(subjects)})
 
 
-def _of_rows(subject: str, rows: Int[np.ndarray, "M"], arrays: Mapping[str, np.ndarray], file: Path) -> HeldOutSubject:
-    labels = arrays["labels"].astype(str)
+def _from_rows(
+    subject: str, rows: Int[np.ndarray, "M"], arrays: Mapping[str, np.ndarray], file: Path
+) -> HeldOutSubject:
+    """One subject, from the rows of their meshes."""
+    labels = arrays["labels"]
     neutral = [int(row) for row in rows if labels[row] == NEUTRAL]
     if len(neutral) != 1:
-        got = f"{len(neutral)} of {subject}"
-        raise _bad("A held-out subject has not one neutral", file, f'one mesh labelled "{NEUTRAL}" a subject', got)
+        expected = f'one mesh labelled "{NEUTRAL}" per subject'
+        raise _input_error("A held-out subject has not one neutral", file, expected, f"{len(neutral)} of {subject}")
     others = [int(row) for row in rows if row != neutral[0]]
-    categories = arrays.get("categories", labels).astype(str)
+    categories = arrays.get(CATEGORIES, labels).astype(str)
     return HeldOutSubject(
         subject=subject,
         neutral=arrays["vertices"][neutral[0]],
@@ -122,20 +125,19 @@ def _of_rows(subject: str, rows: Int[np.ndarray, "M"], arrays: Mapping[str, np.n
     )
 
 
-def _of_folder(file: Path) -> tuple[HeldOutSubject, Registration, str]:
+def _from_folder(folder: Path) -> tuple[HeldOutSubject, Registration, str]:
     """A subject's neutral, its registration and the name of its folder."""
-    try:
-        manifest: dict[str, Any] = json.loads(file.read_text("utf-8"))
-        subject, neutral = str(manifest["subject"]), str(manifest["neutral"])
-        status = {str(row["name"]): str(row["status"]) for row in manifest["captures"]}[neutral]
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        got = f"{type(error).__name__}: {error}"
-        raise _bad("The subject's record cannot be read", file, "entries as documented", got) from error
-    if status not in USABLE:
-        raise _bad("A held-out subject has no neutral", file, f"a usable registration {neutral!r}", status)
-    registration = load_registration(file.parent / neutral)
+    record = read_subject(folder)
+    assert record is not None, "it is a subject folder"
+    neutral = record.row(record.neutral)
+    if neutral is None or not neutral.usable:
+        got = "none" if neutral is None else neutral.status
+        expected = f"a usable registration {record.neutral!r}"
+        raise _input_error("A held-out subject has no neutral", folder / MANIFEST, expected, got)
+    registration = load_registration(folder / record.neutral)
     vertices = registration.vertices
-    return HeldOutSubject(subject=subject, neutral=vertices, expressions=vertices[None][:0]), registration, neutral
+    subject = HeldOutSubject(subject=record.subject, neutral=vertices, expressions=vertices[None][:0])
+    return subject, registration, neutral.name
 
 
 def _stabilized(folder: Path) -> dict[str, dict[str, Any]]:
@@ -145,17 +147,22 @@ def _stabilized(folder: Path) -> dict[str, dict[str, Any]]:
     count = len(stabilized.read_manifest(folder)["subjects"])
     subjects = (stabilized.read_subject(folder, number) for number in range(count))
     return {
-        one.subject: {"neutral": one.neutral, "expressions": one.vertices, "categories": one.labels} for one in subjects
+        subject.subject: {
+            "neutral": subject.neutral,
+            "expressions": subject.vertices,
+            "categories": subject.labels,
+        }
+        for subject in subjects
     }
 
 
-def _with_captures(one: HeldOutSubject, folder: Path, registration: Registration, neutral: str) -> HeldOutSubject:
-    """Tags and scan of the neutral's capture, and the categories of expressions whose captures tell one."""
+def _with_captures(subject: HeldOutSubject, folder: Path, registration: Registration, neutral: str) -> HeldOutSubject:
+    """Add the tags and the scan of the neutral's capture, and the categories that captures have."""
     capture = read_capture(folder / neutral)
-    told = {}
-    for place in sorted(path.parent for path in folder.glob("*/capture.toml")):
-        other = read_capture(place)
-        told[other.expression] = str(other.tags.get(_CATEGORY, other.expression))
+    labels = {}
+    for path in sorted(path.parent for path in folder.glob("*/capture.toml")):
+        other = read_capture(path)
+        labels[other.expression] = str(other.tags.get(CATEGORY, other.expression))
     scan: Float[np.ndarray, "P 3"] | None = None
     if capture.scan is not None:
         points = read_scan(capture.scan)
@@ -165,9 +172,9 @@ def _with_captures(one: HeldOutSubject, folder: Path, registration: Registration
         slack = () if len(points.triangles) else (CLOUD_TOLERANCE,)
         face &= seen(points.vertices, surface.vertices.astype(np.float64), surface.triangles, cameras, *slack)
         scan = points.vertices[face].astype(np.float64)
-    categories = tuple(told.get(label, label) for label in one.categories)
-    return replace(one, tags=capture.tags, categories=categories, scan=scan)
+    categories = tuple(labels.get(label, label) for label in subject.categories)
+    return replace(subject, tags=capture.tags, categories=categories, scan=scan)
 
 
-def _bad(what: str, where: object, expected: object, got: object) -> InputError:
-    return InputError(what, where=where, expected=expected, got=got, fix=_FIX)
+def _input_error(what: str, where: object, expected: object, got: object) -> InputError:
+    return InputError(what, where=where, expected=expected, got=got, fix=SCHEMA.fix)

@@ -1,10 +1,8 @@
 """The input of `gnmreg stabilize`: subject folders as `gnmreg subject` writes them."""
 
-import json
 from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -15,140 +13,148 @@ from registration.model.fetch import cached_path
 from registration.model.gnm_npz import GNMData
 from registration.stabilize.subject_meshes import SkullSkin, SubjectMeshes, subject_meshes
 from registration.storage.cache import cache_folder
-from registration.storage.files import read_json_of_kind
 from registration.storage.registration_folder import load_registration, read_manifest
-from workflows.records.subject import KIND, MANIFEST, USABLE
+from workflows.records.subject import MANIFEST, SubjectRecord, is_subject_folder, read_subject
 
 STABILIZED = "stabilized"  # the folder of the stabilized set within a run
 
 
 @dataclass(frozen=True, kw_only=True)
-class RunSubject:
-    """One subject folder: what is stabilized, by (folder name, expression)."""
+class StabilizationSubject:
+    """The registrations of one subject folder that are stabilized."""
 
     folder: Path
     subject: str
     neutral: str
-    expressions: tuple[tuple[str, str], ...]
-    left_out: tuple[str, ...]  # names of registrations that are no use
+    expressions: tuple[tuple[str, str], ...]  # (folder name, expression)
+    excluded: tuple[str, ...]  # names of unusable registrations
 
 
 @dataclass(frozen=True, kw_only=True)
-class Run:
-    """Subjects, checked as far as headers tell."""
+class StabilizationInputs:
+    """The subjects of a run, checked without reading textures."""
 
-    subjects: tuple[RunSubject, ...]
+    subjects: tuple[StabilizationSubject, ...]
     inputs: Mapping[str, str]  # SUBJECT/NAME -> content id of its registration; model
     skin: SkullSkin
 
     def meshes(self) -> Iterator[SubjectMeshes]:
-        """Subject after subject. Raises InputError for registrations that cannot be read."""
-        for one in self.subjects:
-            expressions = ((name, label, load_registration(one.folder / name)) for name, label in one.expressions)
-            yield subject_meshes(one.subject, load_registration(one.folder / one.neutral), expressions, self.skin)
+        """Yield the meshes of each subject. Raises InputError for registrations that cannot be read."""
+        for subject in self.subjects:
+            folder, pairs = subject.folder, subject.expressions
+            expressions = ((name, label, load_registration(folder / name)) for name, label in pairs)
+            yield subject_meshes(subject.subject, load_registration(folder / subject.neutral), expressions, self.skin)
 
 
-def read_run(folder: Path, data: GNMData, *, skip_failed: bool = False, only: Collection[str] | None = None) -> Run:
-    """The subjects in a folder of subject folders, or the one whose folder it is, in the order of their folders' names.
+def read_run(
+    folder: Path, data: GNMData, *, skip_failed: bool = False, only: Collection[str] | None = None
+) -> StabilizationInputs:
+    """Read and check the subjects of a run, in natural order of their folders' names.
 
-    `only`: names of the folders that count, if not all do.
+    Args:
+        folder: holds subject folders, or is one.
+        data: the model that the captures were registered with.
+        skip_failed: exclude failed registrations instead of refusing them.
+        only: names of the subject folders to read; None: all.
 
     Raises:
-        InputError: no subject; one without a usable neutral or without expressions; two of one name; registrations that
-            failed or are missing, unless `skip_failed` leaves them out; of another topology than the model; not finite.
+        InputError: there is no subject; a `subject.json` is malformed; a subject has no usable neutral or no
+            expression; two have one name; a registration failed or is missing, has another topology than the model, or
+            is not finite.
     """
-    skin, wanted = SkullSkin.of(data), gnm_npz.topology_hash(data.triangles)
+    skin, topology = SkullSkin.of(data), gnm_npz.topology_hash(data.triangles)
     folders = [path for path in _subject_folders(folder) if only is None or path.name in only]
     subjects = tuple(_subject(path, skip_failed) for path in folders)
     inputs = {"model": gnm_npz.content_hash(data)}
-    for one in subjects:
-        for name in (one.neutral, *(name for name, _ in one.expressions)):
-            key = f"{one.subject}/{name}"
+    for subject in subjects:
+        for name in (subject.neutral, *(name for name, _ in subject.expressions)):
+            key = f"{subject.subject}/{name}"
             if key in inputs:
                 raise InputError(
                     "Two folders hold the same subject",
                     where=folder,
-                    expected="one folder a subject",
-                    got=one.subject,
-                    fix="move one of them away, or correct `subject` in its capture.toml files",
+                    expected="one folder per subject",
+                    got=subject.subject,
+                    fix="move one of them, or correct `subject` in its capture.toml files",
                 )
-            inputs[key] = read_manifest(one.folder / name).content_id
-            _check_arrays(one.folder / name, wanted, data)
-    return Run(subjects=subjects, inputs=inputs, skin=skin)
+            inputs[key] = read_manifest(subject.folder / name).content_id
+            _check_arrays(subject.folder / name, topology, data)
+    return StabilizationInputs(subjects=subjects, inputs=inputs, skin=skin)
 
 
 def known_model(run: Path) -> Path:
-    """The first or the official model in the cache, if it is what the run's registrations were made with.
+    """Return the cached model file that the run's captures were registered with: the first or the official model.
 
-    Raises InputError if it is not, and as `read_run` for a run without subjects.
+    Raises:
+        InputError: it is neither of them; there is no subject, or its record is malformed.
     """
-    manifest = json.loads((_subject_folders(run)[0] / MANIFEST).read_text("utf-8"))
-    wanted = str(manifest.get("model"))
+    content = _read(_subject_folders(run)[0]).model
     for file in (cached_path(), *sorted(cache_folder().glob("first-*/*.npz"))):
-        if file.is_file() and gnm_npz.content_hash(gnm_npz.read(file)) == wanted:
+        if file.is_file() and gnm_npz.content_hash(gnm_npz.read(file)) == content:
             return file
     raise InputError(
-        "The head model of these registrations is not known here",
+        "The head model of these registrations is not in the cache",
         where=run,
         expected="the first or the official model, or the model's file",
-        got=f"a model of sha256 {wanted[:16]}",
-        fix="say where it is with --model",
+        got=f"a model of sha256 {content[:16]}",
+        fix="give its file with --model",
     )
 
 
 def _subject_folders(folder: Path) -> list[Path]:
     folder = Path(folder)
-    below = [folder] if _is_subject(folder) else []
+    below = [folder] if is_subject_folder(folder) else []
     if not below and folder.is_dir():
-        below = [path for path in folder.iterdir() if not path.name.startswith(".") and _is_subject(path)]
+        below = [path for path in folder.iterdir() if not path.name.startswith(".") and is_subject_folder(path)]
     if not below:
         raise InputError(
             "There are no subjects to stabilize",
             where=folder,
             expected=f"a folder of subject folders with {MANIFEST}, or one such folder",
             got="none" if folder.is_dir() else "no such folder",
-            fix="give the folder that holds what `gnmreg subject ... --out` wrote",
+            fix="give the folder that holds the output folders of `gnmreg subject`",
         )
     return sorted(below, key=lambda path: natural_key(path.name))
 
 
-def _is_subject(folder: Path) -> bool:
-    return read_json_of_kind(folder / MANIFEST, KIND) is not None
+def _read(folder: Path) -> SubjectRecord:
+    record = read_subject(folder)
+    assert record is not None, "one of `_subject_folders`"
+    return record
 
 
-def _subject(folder: Path, skip_failed: bool) -> RunSubject:
-    manifest = json.loads((folder / MANIFEST).read_text("utf-8"))
-    try:
-        rows: list[dict[str, Any]] = manifest["captures"]
-        neutral = str(manifest["neutral"])
-        named = {str(row["name"]): (str(row["expression"]), str(row["status"]), str(row["reason"])) for row in rows}
-        subject = str(manifest["subject"])
-    except (KeyError, TypeError) as error:
-        raise _bad("The subject's record cannot be read", folder / MANIFEST, "entries as documented", error) from error
-    _, status, reason = named.get(neutral, ("", "no such registration", ""))
-    if status not in USABLE:
-        raise _bad("A subject has no neutral", folder, f"a usable registration {neutral!r}", f"{status} {reason}")
-    lost = {name: why for name, (_, state, why) in named.items() if state not in USABLE}
+def _subject(folder: Path, skip_failed: bool) -> StabilizationSubject:
+    record = _read(folder)
+    neutral = record.row(record.neutral)
+    if neutral is None or not neutral.usable:
+        got = "no such registration" if neutral is None else f"{neutral.status} {neutral.reason}"
+        raise _input_error("A subject has no neutral", folder, f"a usable registration {record.neutral!r}", got)
+    lost = [row for row in record.rows if not row.usable]
     if lost and not skip_failed:
-        first = next(iter(lost))
-        got = f"{first}: {named[first][1]}: {lost[first]}" + (f", and {len(lost) - 1} more" if len(lost) > 1 else "")
-        raise _bad("A subject has registrations that failed", folder, "all converged or stopped", got)
-    expressions = tuple((name, label) for name, (label, _, _) in named.items() if name != neutral and name not in lost)
+        others = f", and {len(lost) - 1} more" if len(lost) > 1 else ""
+        got = f"{lost[0].name}: {lost[0].status}: {lost[0].reason}{others}"
+        raise _input_error("A subject has registrations that failed", folder, "all converged or stopped", got)
+    expressions = tuple((row.name, row.expression) for row in record.rows if row.usable and row != neutral)
     if not expressions:
-        raise _bad("A subject has no expression to stabilize", folder, "at least one beside the neutral", "none")
-    return RunSubject(
-        folder=folder, subject=subject, neutral=neutral, expressions=expressions, left_out=tuple(sorted(lost))
+        expected = "at least one besides the neutral"
+        raise _input_error("A subject has no expression to stabilize", folder, expected, "none")
+    return StabilizationSubject(
+        folder=folder,
+        subject=record.subject,
+        neutral=record.neutral,
+        expressions=expressions,
+        excluded=tuple(sorted(row.name for row in lost)),
     )
 
 
 def _check_arrays(folder: Path, topology: str, data: GNMData) -> None:
-    """What can be told without textures: before anything is computed, and in milliseconds."""
+    """Check the arrays other than textures: in milliseconds, before anything is computed."""
     file = folder / "registration.npz"
     try:
         with np.load(file, allow_pickle=False) as archive:
             triangles, vertices, confidence = (archive[name] for name in ("triangles", "vertices", "confidence"))
     except Exception as error:  # whatever a broken file makes zipfile, zlib and numpy raise
-        raise _bad("A registration cannot be read", file, "an undamaged NPZ file", error) from error
+        raise _input_error("A registration cannot be read", file, "an undamaged NPZ file", error) from error
     if gnm_npz.topology_hash(triangles) != topology:
         raise InputError(
             "A registration has another topology than the model",
@@ -158,9 +164,11 @@ def _check_arrays(folder: Path, topology: str, data: GNMData) -> None:
             fix="register all subjects with one model, and give that one with --model",
         )
     if not (np.isfinite(vertices).all() and np.isfinite(confidence).all()):
-        raise _bad("A registration is not finite", file, "finite vertices and confidence", "NaN or infinite numbers")
+        raise _input_error(
+            "A registration is not finite", file, "finite vertices and confidence", "NaN or infinite numbers"
+        )
 
 
-def _bad(what: str, where: object, expected: object, got: object) -> InputError:
-    fix = "register again with `gnmreg subject`, or leave out what failed with --skip-failed"
+def _input_error(what: str, where: object, expected: object, got: object) -> InputError:
+    fix = "register again with `gnmreg subject`, or exclude failed registrations with --skip-failed"
     return InputError(what, where=where, expected=expected, got=got, fix=fix)

@@ -8,14 +8,14 @@ make the same thing at the same time disturb nobody, and one that dies leaves an
 """
 
 import hashlib
-import json
 import posixpath
 import shutil
 import tempfile
 import time
 import uuid
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from functools import partial
 from importlib.metadata import version
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -24,33 +24,46 @@ import fsspec
 
 from registration.errors import InputError
 from registration.storage.files import atomic_write_text
+from registration.storage.records import Record
 from workflows.ids import check_id, redact
 
-SCHEMA = 1
-KIND = "gnm-artifact"
 MANIFEST = "artifact.json"
 ATTEMPT = "attempt-"
 _BLOCK = 2**20
 
 
 @dataclass(frozen=True, kw_only=True)
-class Artifact:
-    """What a manifest says."""
+class StoredFile:
+    """A file of an artifact."""
+
+    sha256: str
+    bytes: int
+
+
+@dataclass(frozen=True, kw_only=True)
+class Artifact(
+    Record,
+    kind="gnm-artifact",
+    title="artifact",
+    fix="`gnmreg store verify` lists damage; delete the record to have the artifact computed again",
+):
+    """The record of an artifact: `artifact.json`."""
 
     key: str
-    input_hash: str  # of all that decides the result
+    input_hash: str  # of everything that determines the result
     content_id: str  # sha256 over the names and digests of the files
     attempt: str  # the folder of the files, below the key
-    files: Mapping[str, Mapping[str, Any]]  # name below the attempt -> {"sha256", "bytes"}
-    about: Mapping[str, Any]  # figures and the like, small, JSON
+    files: Mapping[str, StoredFile]  # by name below the attempt
+    about: Mapping[str, Any]  # status, headline metrics and the like, small
+    version: str = field(default_factory=partial(version, "gnm-registration"))  # of this package
 
     def brief(self) -> dict[str, Any]:
-        """What a step returns to the queue about it."""
+        """Return what a step reports to the queue."""
         return {"key": self.key, "content_id": self.content_id, "about": dict(self.about)}
 
 
 @dataclass(frozen=True, kw_only=True)
-class Verified:
+class VerificationReport:
     """What re-hashing a whole store found; names are relative to the store."""
 
     artifacts: int
@@ -60,7 +73,7 @@ class Verified:
     unreadable: Mapping[str, str] = field(default_factory=dict)  # manifest -> why
 
     @property
-    def sound(self) -> bool:
+    def is_sound(self) -> bool:
         return not (self.missing or self.altered or self.unreadable)
 
 
@@ -94,7 +107,7 @@ class Store:
             content = self._fs.cat_file(path)
         except FileNotFoundError:
             return None
-        return _parsed(content, where=f"{redact(self.url)}/{key}/{MANIFEST}", key=key)
+        return _checked(content, where=f"{redact(self.url)}/{key}/{MANIFEST}", key=key)
 
     def produce(self, key: str, *, wanted: str, make: Callable[[Path], Mapping[str, Any]]) -> Artifact:
         """The artifact of `key` made from the input that hashes to `wanted`: the published one, or a fresh one.
@@ -120,40 +133,13 @@ class Store:
                 self._fs.put_file(str(file), self._path(key, attempt, file.relative_to(name).as_posix()))
             return self._published(key, attempt, wanted, Path(name), about)
 
-    def fetch(self, key: str, to: Path) -> Artifact:
-        """Copy an artifact's files into the folder `to`, checking every digest.
-
-        Raises:
-            InputError: there is none, or a file is missing or altered.
-        """
-        artifact = self.find(key)
-        if artifact is None:
-            raise _unusable(f"{redact(self.url)}/{key}", expected="a published artifact", got="none")
-        for name, told in artifact.files.items():
-            target = to / name
-            target.parent.mkdir(parents=True, exist_ok=True)
-            try:
-                self._fs.get_file(self._path(key, artifact.attempt, name), str(target))
-            except FileNotFoundError:
-                raise _unusable(f"{key}/{name}", expected="the file that the manifest names", got="none") from None
-            if _digest(target.open("rb")) != told["sha256"]:
-                raise _unusable(f"{key}/{name}", expected=f"sha256 {told['sha256']}", got="another file")
-        return artifact
-
-    def open(self, key: str, name: str) -> Any:
-        """A published file, opened for reading bytes."""
-        artifact = self.find(key)
-        if artifact is None or name not in artifact.files:
-            raise _unusable(f"{redact(self.url)}/{key}/{name}", expected="a published file", got="none")
-        return self._fs.open(self._path(key, artifact.attempt, name), "rb")
-
     def keys(self, below: str = "") -> Iterator[str]:
         """Keys of the published artifacts at and below a key, sorted."""
         for name in sorted(self._names(below)):
             if posixpath.basename(name) == MANIFEST and not _in_attempt(name):
                 yield posixpath.dirname(name)
 
-    def verify(self) -> Verified:
+    def verify(self) -> VerificationReport:
         """Read every file of the store and compare it with the manifests."""
         names, missing, altered, unreadable = set(self._names()), [], [], {}
         manifests = {name for name in names if posixpath.basename(name) == MANIFEST and not _in_attempt(name)}
@@ -165,14 +151,14 @@ class Store:
             except InputError as error:
                 unreadable[manifest] = f"expected {error.expected}, got {error.got}"
                 continue
-            for name, told in artifact.files.items() if artifact else ():
+            for name, stored in artifact.files.items() if artifact else ():
                 place = posixpath.join(key, artifact.attempt, name) if artifact else ""
                 known.add(place)
                 if place not in names:
                     missing.append(place)
-                elif _digest(self._fs.open(self._path(place), "rb")) != told["sha256"]:
+                elif _digest(self._fs.open(self._path(place), "rb")) != stored.sha256:
                     altered.append(place)
-        return Verified(
+        return VerificationReport(
             artifacts=len(manifests),
             missing=tuple(missing),
             altered=tuple(altered),
@@ -213,7 +199,7 @@ class Store:
 
     def _published(self, key: str, attempt: str, wanted: str, folder: Path, about: Mapping[str, Any]) -> Artifact:
         files = {
-            file.relative_to(folder).as_posix(): {"sha256": _digest(file.open("rb")), "bytes": file.stat().st_size}
+            file.relative_to(folder).as_posix(): StoredFile(sha256=_digest(file.open("rb")), bytes=file.stat().st_size)
             for file in _files(folder)
         }
         artifact = Artifact(
@@ -224,7 +210,7 @@ class Store:
             files=files,
             about=dict(about),
         )
-        self._write(self._path(key, MANIFEST), _text(artifact))
+        self._write(self._path(key, MANIFEST), redact(artifact.to_text()))
         return artifact
 
     def _write(self, path: str, text: str) -> None:
@@ -238,8 +224,8 @@ class Store:
         """Whether all files are there in their length; `verify` is for more."""
         try:
             return all(
-                self._fs.size(self._path(artifact.key, artifact.attempt, name)) == told["bytes"]
-                for name, told in artifact.files.items()
+                self._fs.size(self._path(artifact.key, artifact.attempt, name)) == stored.bytes
+                for name, stored in artifact.files.items()
             )
         except FileNotFoundError:
             return False
@@ -283,53 +269,22 @@ def _in_attempt(name: str) -> bool:
     return any(part.startswith(ATTEMPT) for part in posixpath.dirname(name).split("/"))
 
 
-def _content_id(files: Mapping[str, Mapping[str, Any]]) -> str:
-    lines = [f"{name} {told['sha256']}\n" for name, told in sorted(files.items())]
+def _content_id(files: Mapping[str, StoredFile]) -> str:
+    lines = [f"{name} {stored.sha256}\n" for name, stored in sorted(files.items())]
     return hashlib.sha256("".join(lines).encode()).hexdigest()
 
 
-def _text(artifact: Artifact) -> str:
-    value = {
-        "kind": KIND,
-        "schema": SCHEMA,
-        "key": artifact.key,
-        "input_hash": artifact.input_hash,
-        "content_id": artifact.content_id,
-        "attempt": artifact.attempt,
-        "files": dict(artifact.files),
-        "about": dict(artifact.about),
-        "version": version("gnm-registration"),
-    }
-    return redact(json.dumps(value, indent=1, allow_nan=False)) + "\n"
-
-
-def _parsed(content: bytes, *, where: str, key: str) -> Artifact:
-    """A manifest. Others may write into a store, so its names are checked like anything else from outside."""
-    try:
-        value = json.loads(content)
-    except (ValueError, RecursionError) as error:
-        raise _unusable(where, expected="JSON", got=error) from None
-    if not isinstance(value, dict) or value.get("kind") != KIND or value.get("schema") != SCHEMA:
-        raise _unusable(where, expected=f'"kind": "{KIND}", "schema": {SCHEMA}', got="something else")
-    try:
-        artifact = Artifact(
-            key=key,
-            input_hash=str(value["input_hash"]),
-            content_id=str(value["content_id"]),
-            attempt=str(value["attempt"]),
-            files={str(n): {"sha256": str(f["sha256"]), "bytes": int(f["bytes"])} for n, f in value["files"].items()},
-            about=dict(value["about"]),
-        )
-    except (KeyError, TypeError, ValueError, AttributeError) as error:
-        raise _unusable(where, expected="the entries of an artifact", got=repr(error)) from None
+def _checked(content: bytes, *, where: str, key: str) -> Artifact:
+    """The record in a file. Others may write into a store, so its names are checked like any other untrusted input."""
+    artifact = replace(Artifact.from_text(content, where=where), key=key)
     for name in artifact.files:
         path = PurePosixPath(name)
         if path.is_absolute() or ".." in path.parts or not path.parts or "\0" in name:
-            raise _unusable(where, expected="names inside the attempt's folder", got=repr(name))
+            raise Artifact.invalid(where, expected="names inside the attempt's folder", got=repr(name))
     if not artifact.attempt.startswith(ATTEMPT) or "/" in artifact.attempt:
-        raise _unusable(where, expected=f'an attempt named "{ATTEMPT}..."', got=repr(artifact.attempt))
+        raise Artifact.invalid(where, expected=f'an attempt named "{ATTEMPT}..."', got=repr(artifact.attempt))
     if _content_id(artifact.files) != artifact.content_id:
-        raise _unusable(where, expected=f"content id {artifact.content_id}", got="other files")
+        raise Artifact.invalid(where, expected=f"content id {artifact.content_id}", got="other files")
     return artifact
 
 
@@ -340,13 +295,3 @@ def _remove_empty(root: Path) -> None:
                 below.rmdir()
         if not any(folder.iterdir()):
             folder.rmdir()
-
-
-def _unusable(where: object, *, expected: object, got: object) -> InputError:
-    return InputError(
-        "The artifact cannot be used",
-        where=where,
-        expected=expected,
-        got=got,
-        fix="`gnmreg store verify` tells what is damaged; delete the manifest to have it made again",
-    )

@@ -1,32 +1,29 @@
-"""A subject on disk: the captures that lie in one folder, and the folder of their registrations with its
-`subject.json` (docs/formats.md)."""
+"""A subject on disk: the folder of their captures, and the folder of their registrations with its `subject.json`
+(docs/formats.md)."""
 
-import json
 from collections.abc import Mapping
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
 from registration.capture.native import natural_key, read_capture
 from registration.errors import InputError
-from registration.storage.files import atomic_write_text, read_json_of_kind
-from registration.storage.hashing import to_jsonable
+from registration.storage.files import atomic_write_text
+from registration.storage.records import Record, json_key
 from registration.storage.registration_folder import check_output_folder
 from registration.types import Capture
 
-SCHEMA = 1
-KIND = "gnm-subject"
 MANIFEST, PAGE = "subject.json", "index.html"
 NEUTRAL = "neutral"  # the expression of a neutral's capture.toml
 
 USABLE = ("converged", "stopped")  # statuses
-# "waiting": not reached yet. "error": no registration could be made. "skipped": not tried, for the neutral failed.
+# "waiting": not reached yet. "error": there is no registration. "skipped": not tried because the neutral failed.
 RowStatus = Literal["waiting", "converged", "stopped", "failed", "error", "skipped"]
 
 
 @dataclass(frozen=True, kw_only=True)
-class Captures:
-    """A subject's captures as they lie in a folder."""
+class SubjectCaptures:
+    """The captures in a subject's folder."""
 
     folder: Path
     subject: str
@@ -35,20 +32,20 @@ class Captures:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Of all captures' folders, also the broken ones'."""
+        """Names of all captures' folders, including the broken ones."""
         return (*(capture.root.name for capture in self.captures), *self.broken)
 
 
 @dataclass(frozen=True, kw_only=True)
-class Row:
-    """What became of one capture."""
+class CaptureRow:
+    """The registration of one capture of a subject."""
 
     name: str  # of the capture's folder, and of its registration's
     expression: str  # empty if the capture cannot be read
     status: RowStatus = "waiting"
     reason: str = ""
     figures: Mapping[str, Any] = field(default_factory=dict)  # the headline among the manifest's, mm
-    seconds: float | None = None  # that the registration took when it was made
+    seconds: float | None = None  # duration of the registration when it was computed
     folder: str | None = None  # of the registration, within the subject's; None: there is none
 
     @property
@@ -57,24 +54,76 @@ class Row:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Subject:
-    """What became of all captures: `subject.json`."""
+class UsableRegistrations:
+    """Those of a subject's registrations that converged or were stopped."""
+
+    subject: str
+    neutral: str  # name of its registration's folder
+    expressions: Mapping[str, str]  # folder name -> expression label
+
+
+@dataclass(frozen=True, kw_only=True)
+class SubjectRecord(
+    Record, kind="gnm-subject", title="subject's record", fix="delete it and run `gnmreg subject` again"
+):
+    """The registrations of all captures of a subject: `subject.json`."""
 
     subject: str
     model: str  # the model's content hash
     recipe: str
     neutral: str  # the row of this name
-    rows: tuple[Row, ...]  # the neutral's first
+    rows: tuple[CaptureRow, ...] = json_key("captures")  # the neutral's first
+
+    def row(self, name: str) -> CaptureRow | None:
+        """Return the row of a capture, None if there is none."""
+        return next((row for row in self.rows if row.name == name), None)
+
+    @property
+    def usable(self) -> UsableRegistrations | None:
+        """The usable registrations; None if the neutral is not among them."""
+        names = {row.name: row.expression for row in self.rows if row.usable}
+        if self.neutral not in names:
+            return None
+        expressions = {name: label for name, label in names.items() if name != self.neutral}
+        return UsableRegistrations(subject=self.subject, neutral=self.neutral, expressions=expressions)
 
 
-def read_captures(folder: Path, neutral: str | None = None) -> Captures:
-    """The captures among the sub-folders of `folder`: those with a `capture.toml`. Only headers are read.
+def is_subject_folder(folder: Path) -> bool:
+    """Return whether a folder holds a `subject.json`, valid or not."""
+    return (Path(folder) / MANIFEST).is_file()
 
-    `neutral` names the neutral's folder; otherwise it is the capture whose expression is "neutral". A capture that
-    cannot be read ends up in `broken`, unless it is the neutral that was named.
+
+def read_subject(folder: Path) -> SubjectRecord | None:
+    """Read the `subject.json` of a folder; None if there is none: it is no folder of registrations.
 
     Raises:
-        InputError: no such folder, no capture in it, no neutral or two, or captures of several subjects.
+        InputError: the record is malformed.
+    """
+    return SubjectRecord.read(Path(folder) / MANIFEST) if is_subject_folder(folder) else None
+
+
+def read_usable(folder: Path) -> UsableRegistrations | None:
+    """Return a subject folder's usable registrations; None without a record, or without a usable neutral.
+
+    Raises:
+        InputError: the record is malformed.
+    """
+    record = read_subject(folder)
+    return None if record is None else record.usable
+
+
+def read_captures(folder: Path, neutral: str | None = None) -> SubjectCaptures:
+    """Read the headers of a subject's captures: the sub-folders with a `capture.toml`.
+
+    Args:
+        folder: of the subject.
+        neutral: name of the neutral's folder; None: the capture whose expression is "neutral".
+
+    Returns:
+        The captures; one that cannot be read is in `broken`, unless it is the neutral named by the argument.
+
+    Raises:
+        InputError: there is no such folder, no capture in it, not exactly one neutral, or there are several subjects.
     """
     captures: dict[str, Capture] = {}
     broken: dict[str, InputError] = {}
@@ -93,68 +142,42 @@ def read_captures(folder: Path, neutral: str | None = None) -> Captures:
             where=folder,
             expected="captures of one subject",
             got=", ".join(f"{name}: {capture.subject}" for name, capture in captures.items()),
-            fix="give every subject a folder of its own, or correct `subject` in capture.toml",
+            fix="give every subject a separate folder, or correct `subject` in capture.toml",
         )
     ordered = (captures[first], *(capture for name, capture in captures.items() if name != first))
-    return Captures(folder=folder, subject=subjects.pop(), captures=ordered, broken=broken)
+    return SubjectCaptures(folder=folder, subject=subjects.pop(), captures=ordered, broken=broken)
 
 
-def check_subject_out(out: Path, captures: Captures) -> None:
-    """Refuse, before any work, an output folder that is not ours, or not this subject's.
+def check_subject_out(out: Path, captures: SubjectCaptures) -> None:
+    """Refuse, before any work, an output folder that is not a subject's, or another subject's.
 
     Raises:
-        InputError: `out` lies in a capture, is a file, a filled folder without our `subject.json`, or another
+        InputError: `out` lies in a capture, is a file, a filled folder without a valid `subject.json`, or another
             subject's; or one of the registration folders in it cannot be used.
     """
-    place = out.resolve()
+    resolved = out.resolve()
     for name in captures.names:
-        if (captures.folder / name).resolve() in (place, *place.parents):
-            raise _refused(out, got=f"a place inside the capture {name}", fix="choose a folder outside the captures")
+        if (captures.folder / name).resolve() in (resolved, *resolved.parents):
+            raise _refused(out, got=f"a folder inside the capture {name}", fix="choose a folder outside the captures")
         if name in (MANIFEST, PAGE):
             raise _refused(out, got=f"a capture whose folder is named {name}", fix="rename that folder")
-    if place.is_dir() and any(place.iterdir()):
-        owner = _owner(place)
-        if owner is None:
-            raise _refused(out, got="a folder that holds other things", fix="choose another output folder")
-        if owner != captures.subject:
-            raise _refused(out, got=f"the folder of subject {owner!r}", fix="give every subject a folder of its own")
+    if resolved.is_dir() and any(resolved.iterdir()):
+        record = read_subject(resolved)
+        if record is None:
+            raise _refused(out, got="a folder with other contents", fix="choose another output folder")
+        if record.subject != captures.subject:
+            got = f"the folder of subject {record.subject!r}"
+            raise _refused(out, got=got, fix="give every subject a separate folder")
     else:
-        check_output_folder(place)
+        check_output_folder(resolved)
     for name in captures.names:
-        check_output_folder(place / name)
+        check_output_folder(resolved / name)
 
 
-@dataclass(frozen=True, kw_only=True)
-class Usable:
-    """What of a subject's folder can be used."""
-
-    subject: str
-    neutral: str  # name of its registration's folder
-    expressions: Mapping[str, str]  # of the others that can be used -> what was performed
-
-
-def read_usable(folder: Path) -> Usable | None:
-    """The usable registrations that `subject.json` tells of; None without it, or if the neutral is not among them."""
-    try:
-        told = json.loads((Path(folder) / MANIFEST).read_text("utf-8"))
-        rows = {str(row["name"]): row for row in told["captures"] if row["status"] in USABLE}
-        subject, neutral = str(told["subject"]), str(told["neutral"])
-    except (OSError, ValueError, KeyError, TypeError):
-        return None
-    if neutral not in rows:
-        return None
-    expressions = {name: str(row["expression"]) for name, row in rows.items() if name != neutral}
-    return Usable(subject=subject, neutral=neutral, expressions=expressions)
-
-
-def save_subject(subject: Subject, out: Path, page: str) -> None:
-    """Write `subject.json` and `index.html`, each in one rename: whoever reads sees the old or the new one."""
+def write_subject(record: SubjectRecord, out: Path, page: str) -> None:
+    """Write `subject.json` and `index.html`, each in one rename."""
     out.mkdir(parents=True, exist_ok=True)
-    head = {"kind": KIND, "schema": SCHEMA}
-    rows = [{f.name: getattr(row, f.name) for f in fields(row)} for row in subject.rows]
-    body = {f.name: getattr(subject, f.name) for f in fields(subject) if f.name != "rows"}
-    text = json.dumps(to_jsonable({**head, **body, "captures": rows}), indent=1, allow_nan=False) + "\n"
-    atomic_write_text(out / MANIFEST, text)
+    record.write(out / MANIFEST)
     atomic_write_text(out / PAGE, page)
 
 
@@ -180,38 +203,30 @@ def _capture_folders(folder: Path) -> list[Path]:
     return sorted(below, key=lambda path: natural_key(path.name))
 
 
-def _neutral(
-    folder: Path, captures: Mapping[str, Capture], broken: Mapping[str, InputError], wanted: str | None
-) -> str:
+def _neutral(folder: Path, captures: Mapping[str, Capture], broken: Mapping[str, InputError], name: str | None) -> str:
     """The name of the neutral's folder."""
-    if wanted is not None:
-        if wanted not in captures:
+    if name is not None:
+        if name not in captures:
             raise InputError(
                 "There is no such capture",
                 where="--neutral",
                 expected=f"one of {', '.join(captures)}",
-                got=wanted,
+                got=name,
                 fix="give the name of the neutral capture's folder",
             )
-        return wanted
-    found = [name for name, capture in captures.items() if capture.expression == NEUTRAL]
-    if len(found) != 1:
-        told = [f"{name}: {capture.expression}" for name, capture in captures.items()]
-        told += [f"{name}: cannot be read ({error.what}, {error.where})" for name, error in broken.items()]
+        return name
+    neutrals = [name for name, capture in captures.items() if capture.expression == NEUTRAL]
+    if len(neutrals) != 1:
+        labels = [f"{name}: {capture.expression}" for name, capture in captures.items()]
+        labels += [f"{name}: cannot be read ({error.what}, {error.where})" for name, error in broken.items()]
         raise InputError(
-            "There are two neutrals" if found else "There is no neutral",
+            "There are two neutrals" if neutrals else "There is no neutral",
             where=folder,
             expected=f'one capture with expression = "{NEUTRAL}"',
-            got=", ".join(found or told),
+            got=", ".join(neutrals or labels),
             fix="name the neutral's folder with --neutral, or correct capture.toml",
         )
-    return found[0]
-
-
-def _owner(out: Path) -> str | None:
-    """The subject whose folder `out` is; None if it is not ours."""
-    manifest = read_json_of_kind(out / MANIFEST, KIND)
-    return None if manifest is None else str(manifest.get("subject"))
+    return neutrals[0]
 
 
 def _refused(out: Path, *, got: str, fix: str) -> InputError:

@@ -20,11 +20,11 @@ from registration.stabilize.subject_meshes import SkullSkin, SubjectMeshes, subj
 from registration.storage.files import atomic_file
 from registration.storage.registration_folder import load_registration, read_manifest
 from workflows.records.held_out import TAG
-from workflows.records.subject import Captures, Usable, read_usable
+from workflows.records.subject import SubjectCaptures, UsableRegistrations, read_usable
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Registered:
+class RegisteredSubjects:
     """Subjects of a run whose neutral is usable, with expressions where a stabilized set has them; read anew each time.
 
     Neutrals are unposed, and expressions laid onto them; the confidence is each registration's own.
@@ -37,7 +37,7 @@ class Registered:
     tags: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)  # by folder name
 
     @cached_property
-    def usable(self) -> dict[str, Usable]:
+    def usable(self) -> dict[str, UsableRegistrations]:
         found = {name: read_usable(self.run / name) for name in self.names}
         return {name: one for name, one in found.items() if one is not None}
 
@@ -92,14 +92,14 @@ def _places(steady: Path | None) -> dict[str, int]:
     return {} if steady is None else {name: k for k, name in enumerate(stabilized.read_manifest(steady)["subjects"])}
 
 
-def has_truths(captures: Captures, model: GNMData) -> bool:
+def has_truths(captures: SubjectCaptures, model: GNMData) -> bool:
     """Whether every capture of a subject has true vertices of the model's number. Raises InputError for broken ones."""
     truths = [capture.ground_truth for capture in captures.captures]
     count = len(model.template_vertex_positions)
     return not captures.broken and all(truth is not None and len(read_truth(truth)) == count for truth in truths)
 
 
-def true_meshes(captures: Captures, model: GNMData) -> SubjectMeshes:
+def true_meshes(captures: SubjectCaptures, model: GNMData) -> SubjectMeshes:
     """A subject's true vertices, seen everywhere."""
     truths = [read_truth(c.ground_truth).astype(np.float32) for c in captures.captures if c.ground_truth is not None]
     others = captures.captures[1:]

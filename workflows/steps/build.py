@@ -1,6 +1,7 @@
 """The step that builds a round's model from its registrations."""
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -14,8 +15,9 @@ from registration.storage import hashing
 from registration.storage.files import atomic_directory
 from workflows.pages.model import write_model_page
 from workflows.records.dataset import read_dataset
-from workflows.records.training_subjects import Registered
-from workflows.steps.products import STEP, JsonRecord, find_product, json_text
+from workflows.records.step_results import BuildResult, RejectedRegistration
+from workflows.records.training_subjects import RegisteredSubjects
+from workflows.steps.products import Product
 
 MODEL, PAGE = "gnm_head.npz", "index.html"
 
@@ -30,42 +32,52 @@ def build_next_model(
     out: str,
     recipe: Mapping[str, Any],
     progress: Progress | None = None,
-) -> JsonRecord:
-    """Build the next model from registrations, stabilized expressions (`steady`) and the previous model.
+) -> dict[str, Any]:
+    """Build the next model from registrations, stabilized expressions and the previous model.
 
-    `recipe` is that of `ModelRecipe.to_json`.
+    Args:
+        run: folder of the subject folders.
+        names: of the subject folders to use.
+        steady: folder of the stabilized set; None: neutrals alone.
+        dataset: its folder, for tags and categories.
+        previous: file of the previous model.
+        out: folder of the model.
+        recipe: a `ModelRecipe` as JSON.
+        progress: where to report to.
+
+    Returns:
+        A `BuildResult` as JSON.
 
     Raises:
-        InputError: as `build_model`.
+        InputError: as `build_model`, or a record is malformed.
     """
-    found, data = read_dataset(Path(dataset)), gnm_npz.read(Path(previous))
-    tags = {name: found.tags(name) for name in names}
-    place = None if steady is None else Path(steady)
-    subjects = Registered(run=Path(run), names=names, model=data, steady=place, tags=tags)
+    source, data = read_dataset(Path(dataset)), gnm_npz.read(Path(previous))
+    tags = {name: source.tags(name) for name in names}
+    stabilized = None if steady is None else Path(steady)
+    subjects = RegisteredSubjects(run=Path(run), names=names, model=data, steady=stabilized, tags=tags)
     settings = ModelRecipe.from_json(recipe, where="the job's recipe")
     inputs = {**subjects.inputs, "previous": gnm_npz.content_hash(data)}
-    wanted = hashing.input_hash(
-        inputs, {"recipe": hashing.to_jsonable(settings), "categories": found.categories, "tags": tags}
-    )
-    known = find_product(Path(out), wanted)
-    if known is not None and _is_model(Path(out) / MODEL, known["content_id"]):
-        return {**known, "model": str(Path(out) / MODEL)}
+    config = {"recipe": hashing.to_jsonable(settings), "categories": source.categories, "tags": tags}
+    folder = Path(out)
+    product = Product(folder, hashing.input_hash(inputs, config), BuildResult)
+    if (existing := product.find()) is not None and _is_model(folder / MODEL, existing.content_id):
+        return replace(existing, model=str(folder / MODEL)).to_json()
     (progress or Silent()).note(f"building a model from {len(subjects.usable)} subjects")
-    built = build_model(subjects, data, settings, categories=found.categories)
-    told = {
-        "input_hash": wanted,
-        "model": str(Path(out) / MODEL),
-        "content_id": built.manifest["content_id"],
-        "registered": sum(1 + one["expressions"] for one in built.manifest["subjects"]),
-        "rejected": built.manifest["rejected"],
-        "components": built.manifest["identity"]["components"],
-        "drift_mm": built.manifest["figures"]["drift_mm"],
-    }
-    with atomic_directory(Path(out)) as fresh:
-        provenance.write(built.data, built.manifest, built.coefficients, fresh / MODEL, Path(previous))
-        (fresh / PAGE).write_text(write_model_page(built.data, built.manifest), encoding="utf-8")
-        (fresh / STEP).write_text(json_text(told), encoding="utf-8")
-    return told
+    built = build_model(subjects, data, settings, categories=source.categories)
+    result = BuildResult(
+        input_hash=product.input_hash,
+        model=str(folder / MODEL),
+        content_id=built.manifest["content_id"],
+        registered=sum(1 + subject["expressions"] for subject in built.manifest["subjects"]),
+        rejected=tuple(RejectedRegistration(**rejected) for rejected in built.manifest["rejected"]),
+        components=built.manifest["identity"]["components"],
+        drift_mm=built.manifest["figures"]["drift_mm"],
+    )
+    with atomic_directory(folder) as temporary:
+        provenance.write(built.data, built.manifest, built.coefficients, temporary / MODEL, Path(previous))
+        (temporary / PAGE).write_text(write_model_page(built.data, built.manifest), encoding="utf-8")
+        product.write(result, temporary)
+    return result.to_json()
 
 
 def _is_model(file: Path, content: str) -> bool:

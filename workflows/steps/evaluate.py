@@ -17,7 +17,7 @@ from registration.storage.files import atomic_directory, read_json_of_kind, refu
 from registration.storage.hashing import input_hash, to_jsonable, versions
 from workflows.pages.evaluation import write_evaluate_page
 from workflows.records.held_out import read_held_out
-from workflows.steps.products import JsonRecord
+from workflows.records.step_results import EvaluateResult
 
 SCHEMA = 1
 KIND = "gnm-evaluation"
@@ -79,26 +79,47 @@ def evaluate_round(
     samples: int = 200,
     seed: int = 0,
     progress: Progress | None = None,
-) -> JsonRecord:
-    """Models by name, the first one first, and held-out people -> the folder of `gnmreg model evaluate`.
+) -> dict[str, Any]:
+    """Evaluate all models of a coregistration so far; the folder is that of `gnmreg model evaluate`.
 
-    Figures are told with the numbers of `components` that all models have; "at" is the largest of them.
-    Raises InputError as `evaluate_models`.
+    Args:
+        models: name -> file, the first model first.
+        people: file of the held-out subjects.
+        out: folder of the evaluation.
+        components: requested numbers of components; those that a model does not have are omitted.
+        samples: random heads of each model, for specificity.
+        seed: of the random heads.
+        progress: where to report to.
+
+    Returns:
+        An `EvaluateResult` as JSON.
+
+    Raises:
+        InputError: as `evaluate_models`.
     """
-    have = min(len(identity_part(gnm_npz.read(Path(path))).basis) for path in models.values())
-    counts = tuple(k for k in components if k <= have) or (have,)
+    available = min(len(identity_part(gnm_npz.read(Path(path))).basis) for path in models.values())
+    counts = tuple(k for k in components if k <= available) or (available,)
     paths = {name: Path(path) for name, path in models.items()}
     settings = EvaluationSettings(components=counts, samples=samples, seed=seed)
     manifest = evaluate_models(paths, held_out=Path(people), out=Path(out), settings=settings, progress=progress)
-    told: JsonRecord = {"out": out, "input_hash": manifest["input_hash"], "components": list(counts), "at": counts[-1]}
-    for figure, curve in (("generalization_mm", "identity"), ("specificity_mm", "specificity")):
-        curves = {name: one[curve] for name, one in manifest["figures"]["models"].items()}
-        told[figure] = {
-            name: dict(zip(map(str, one["components"]), (i["mean"] for i in one["intervals"]), strict=True))
-            for name, one in curves.items()
-            if one is not None
-        }
-    return told
+    figures = manifest["figures"]["models"]
+    return EvaluateResult(
+        input_hash=manifest["input_hash"],
+        out=out,
+        components=counts,
+        at=counts[-1],
+        generalization_mm=_means(figures, "identity"),
+        specificity_mm=_means(figures, "specificity"),
+    ).to_json()
+
+
+def _means(figures: Mapping[str, Any], curve: str) -> dict[str, dict[str, float | None]]:
+    """Model -> number of components -> mean of a curve, for the models that have it."""
+    curves = {name: model[curve] for name, model in figures.items() if model[curve] is not None}
+    return {
+        name: dict(zip(map(str, c["components"]), (i["mean"] for i in c["intervals"]), strict=True))
+        for name, c in curves.items()
+    }
 
 
 def lines(manifest: Mapping[str, Any]) -> list[str]:

@@ -1,21 +1,20 @@
 """The steps that register one capture. A worker's child calls them with JSON arguments."""
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 from registration.capture.native import read_capture
-from registration.fit.recipes import named_recipe
 from registration.inputs import input_hash, read_schemes
 from registration.model import gnm_npz
-from registration.options import RegisterOptions
 from registration.pipeline import register
 from registration.progress import Progress
-from registration.render.backend import Variant
 from registration.storage import hashing
 from registration.storage.registration_folder import read_manifest
 from workflows.engine.jobs import PermanentStepError
 from workflows.records.remote import fetch_capture, fetch_model
 from workflows.records.store import Store
+from workflows.steps.job_options import from_job
 from workflows.steps.subject import begin_subject
 
 REGISTRATION = "registration"  # the folder within an attempt
@@ -27,34 +26,42 @@ def register_stored(
     model: str,
     store: str,
     key: str,
-    recipe: str = "draft",
-    views: int | None = None,
-    seed: int = 0,
-    variant: Variant = "llvm",
+    options: Mapping[str, Any] | None = None,
     progress: Progress | None = None,
 ) -> dict[str, Any]:
-    """Register a capture and publish the folder under `key`. What was made from the same input is returned at once.
+    """Register a capture and publish the folder in a store; an artifact of the same inputs is returned at once.
+
+    Args:
+        capture: folder or URL.
+        model: file or URL, with its landmark schemes next to it.
+        store: folder or URL of the store.
+        key: of the artifact in the store.
+        options: a `RegisterOptions` as JSON.
+        progress: where to report to.
+
+    Returns:
+        The artifact's key, content id, status and attempt.
 
     Raises:
         InputError: as `register`, or an input cannot be fetched.
         PermanentStepError: the registration's status is failed; it is published nevertheless, for inspection.
     """
-    options = RegisterOptions(recipe=named_recipe(recipe), views=views, seed=seed, variant=variant)
+    chosen = from_job(options)
     file = fetch_model(model)
     data = gnm_npz.read(file)
-    schemes = read_schemes(file, data, options.landmark_files)
+    schemes = read_schemes(file, data, chosen.landmark_files)
     with fetch_capture(capture) as folder:
-        wanted = input_hash(read_capture(folder), data, schemes, None, options)
+        digest = input_hash(read_capture(folder), data, schemes, None, chosen)
 
         def make(attempt: Path) -> dict[str, Any]:
-            result = register(folder, file, attempt / REGISTRATION, options, progress=progress)
+            result = register(folder, file, attempt / REGISTRATION, chosen, progress=progress)
             scan = result.figures.get("scan_to_mesh", {}).get("face")
             return hashing.to_jsonable({"status": result.status, "reason": result.reason, "scan_to_mesh_face": scan})
 
-        made = Store(store).produce(key, wanted=wanted, make=make)
-    if made.about.get("status") == "failed":
-        raise PermanentStepError(f"registration failed: {made.about.get('reason')}")
-    return {**made.brief(), "attempt": made.attempt}
+        artifact = Store(store).produce(key, wanted=digest, make=make)
+    if artifact.about.get("status") == "failed":
+        raise PermanentStepError(f"registration failed: {artifact.about.get('reason')}")
+    return {**artifact.brief(), "attempt": artifact.attempt}
 
 
 def register_capture(
@@ -64,25 +71,32 @@ def register_capture(
     out: str,
     neutral: str | None = None,
     subject_dir: str | None = None,
-    recipe: str = "draft",
-    views: int | None = None,
-    seed: int = 0,
-    variant: Variant = "llvm",
+    options: Mapping[str, Any] | None = None,
     progress: Progress | None = None,
 ) -> dict[str, Any]:
-    """Register one capture of a subject into the folder `out`, from the folder of its neutral's registration.
+    """Register one capture of a subject into the folder `out`.
 
-    With `subject_dir`, the folder of the subject's captures, it is the first of them: the subject's record is begun.
+    Args:
+        capture: its folder.
+        model: file of the model.
+        out: folder of the registration.
+        neutral: folder of the neutral's registration; None: this capture is the neutral.
+        subject_dir: folder of the subject's captures: the subject's record is created first. For the neutral.
+        options: a `RegisterOptions` as JSON.
+        progress: where to report to.
+
+    Returns:
+        The registration's folder, status and content id.
 
     Raises:
         InputError: as `register`.
         PermanentStepError: the registration's status is failed; its folder is kept.
     """
-    options = RegisterOptions(recipe=named_recipe(recipe), views=views, seed=seed, variant=variant)
+    chosen = from_job(options)
     if subject_dir is not None:
-        begin_subject(Path(subject_dir), Path(model), Path(out).parent, options)
+        begin_subject(Path(subject_dir), Path(model), Path(out).parent, chosen)
     start = None if neutral is None else Path(neutral)
-    result = register(Path(capture), Path(model), Path(out), options, neutral=start, progress=progress)
+    result = register(Path(capture), Path(model), Path(out), chosen, neutral=start, progress=progress)
     if result.status == "failed":
         raise PermanentStepError(f"registration failed: {result.reason}")
     return {"out": out, "status": result.status, "content_id": read_manifest(Path(out)).content_id}

@@ -1,18 +1,26 @@
 """The step that ends a round: the stopping rule, the record of the coregistration and its page."""
 
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from coregister.next_model.recipes import ModelRecipe
-from coregister.stopping_rule import Round, Rule, decide
+from coregister.stopping_rule import Round, decide
 from registration.progress import Progress
+from registration.storage.records import structure, to_json
 from workflows.pages.coregistration import write_coregistration_page
-from workflows.records.coregistration import FIRST, Plan, State, read_plan, write_state
-from workflows.records.dataset import Split
-from workflows.records.subject import USABLE
+from workflows.records.coregistration import (
+    FIRST_MODEL,
+    CoregistrationPlan,
+    CoregistrationState,
+    RoundProducts,
+    RoundRecord,
+    initial_state,
+    model_name,
+    write_state,
+)
+from workflows.records.step_results import CaptureResult, EvaluateResult, HoldOutResult
+from workflows.records.subject import read_subject
 
 
 def end_round(
@@ -22,80 +30,78 @@ def end_round(
     rounds: Sequence[Mapping[str, Any]],
     progress: Progress | None = None,
 ) -> dict[str, Any]:
-    """Write the record and the page of a coregistration after a round, and tell whether to go on.
+    """Apply the stopping rule after a round, and write the record and the page of the coregistration.
 
-    `rounds`: of each round so far its name and what stabilize, build and evaluate told; the subjects' rows are read
-    from their folders.
+    Args:
+        plan: the file `plan.json`.
+        people: a `HoldOutResult` as JSON.
+        rounds: all rounds so far, each a `RoundProducts` as JSON; the records of their subjects are read from disk.
+        progress: unused; the step is short.
+
+    Returns:
+        A `Verdict` as JSON.
+
+    Raises:
+        InputError: the plan, an argument or a subject's record is malformed.
     """
-    told = read_plan(Path(plan))
-    state = State(
-        plan=_plan(told),
-        sources=people["sources"],
-        lost=people["lost"],
-        models={FIRST: told["model"]},
-    )
-    for number, one in enumerate(rounds, 1):
-        run = Path(told["out"]) / one["name"] / "registrations"
-        rows = {name: _rows(run / name) for name in told["split"]["training"]}
-        models = {**state.models, f"model {number}": one["build"]["model"]}
-        state = replace(state, models=models, rounds=(*state.rounds, {**one, "register": rows}))
-    state = apply_verdict(state, rounds[-1]["evaluate"])
+    where = "arguments of the step"
+    record = CoregistrationPlan.read(Path(plan))
+    held_out = HoldOutResult.from_json(people, where=where)
+    products: tuple[RoundProducts, ...] = structure(rounds, tuple[RoundProducts, ...], where=where, title="rounds")
+    state = apply_verdict(initial_state(record, held_out), products)
     write_state(state, write_coregistration_page)
-    assert state.verdict is not None
-    return dict(state.verdict)
+    verdict: dict[str, Any] = to_json(state.verdict)
+    return verdict
 
 
-def apply_verdict(state: State, measured: Mapping[str, Any]) -> State:
-    """The state with the figures of all models, measured alike, and the verdict."""
-    at, figures = str(measured["at"]), measured["generalization_mm"]
+def apply_verdict(state: CoregistrationState, products: Sequence[RoundProducts]) -> CoregistrationState:
+    """Return the state after some rounds: their models and records, the latest evaluation, and the verdict.
+
+    Args:
+        state: before the first round.
+        products: of all rounds so far.
+
+    Raises:
+        InputError: a subject's record is malformed.
+    """
+    plan, latest = state.plan, products[-1].evaluate
     rounds = []
-    for number, one in enumerate(state.rounds, 1):
-        failed = sum(not row["usable"] for rows in one["register"].values() for row in rows.values())
-        rounds.append(
-            {
-                "generalization_mm": figures[f"model {number}"][at],
-                "drift_mm": one["build"]["drift_mm"],
-                "registered": one["build"]["registered"],
-                "failed": failed + len(one["build"]["rejected"]),
-            }
-        )
-    verdict = decide(figures[FIRST][at], [Round(**row) for row in rounds], state.plan.rule)
-    done = [{**one, "decide": figure} for one, figure in zip(state.rounds, rounds, strict=True)]
+    for number, product in enumerate(products, 1):
+        run = plan.out / product.name / "registrations"
+        register = {name: _capture_results(run / name) for name in plan.split.training}
+        metrics = _metrics(product, register, latest, number)
+        rounds.append(RoundRecord(**vars(product), register=register, decide=metrics))
+    first_mm = latest.generalization_mm[FIRST_MODEL][str(latest.at)]
+    assert first_mm is not None
     return replace(
         state,
-        rounds=tuple(done),
-        generalization_mm=figures,
-        specificity_mm=measured["specificity_mm"],
-        at=measured["at"],
-        verdict=vars(verdict),
+        models={FIRST_MODEL: str(plan.model)} | {model_name(n): p.build.model for n, p in enumerate(products, 1)},
+        rounds=tuple(rounds),
+        generalization_mm=latest.generalization_mm,
+        specificity_mm=latest.specificity_mm,
+        at=latest.at,
+        verdict=decide(first_mm, [round_.decide for round_ in rounds], plan.rule),
     )
 
 
-def _rows(subject: Path) -> dict[str, Any]:
-    try:
-        rows: list[dict[str, Any]] = json.loads((subject / "subject.json").read_text("utf-8"))["captures"]
-    except (OSError, ValueError, KeyError):
-        return {"all": {"status": "error", "reason": "its jobs failed", "usable": False}}
-    return {
-        row["name"]: {"status": row["status"], "reason": row["reason"], "usable": row["status"] in USABLE}
-        for row in rows
-    }
+def _metrics(
+    product: RoundProducts, register: Mapping[str, Mapping[str, CaptureResult]], latest: EvaluateResult, number: int
+) -> Round:
+    """What the stopping rule needs of a round. All models are evaluated alike, in the latest evaluation."""
+    generalization_mm = latest.generalization_mm[model_name(number)][str(latest.at)]
+    assert generalization_mm is not None
+    failed = sum(not capture.usable for captures in register.values() for capture in captures.values())
+    return Round(
+        generalization_mm=generalization_mm,
+        drift_mm=product.build.drift_mm,
+        registered=product.build.registered,
+        failed=failed + len(product.build.rejected),
+    )
 
 
-def _plan(told: Mapping[str, Any]) -> Plan:
-    split = Split(
-        training=tuple(told["split"]["training"]), held_out=tuple(told["split"]["held_out"]), how=told["split"]["how"]
-    )
-    return Plan(
-        dataset=Path(told["dataset"]),
-        model=Path(told["model"]),
-        out=Path(told["out"]),
-        recipe=told["recipe"],
-        model_recipe=ModelRecipe.from_json(told["model_recipe"], where="the plan's model_recipe"),
-        views=told["views"],
-        seed=told["seed"],
-        components=tuple(told["components"]),
-        samples=told["samples"],
-        rule=Rule(**{name: value for name, value in told["rule"].items() if name != "type"}),
-        split=split,
-    )
+def _capture_results(folder: Path) -> dict[str, CaptureResult]:
+    """The registrations of a subject; without a record, none of its jobs came so far as to write one."""
+    record = read_subject(folder)
+    if record is None:
+        return {"all": CaptureResult(status="error", reason="its jobs failed", usable=False)}
+    return {row.name: CaptureResult(status=row.status, reason=row.reason, usable=row.usable) for row in record.rows}

@@ -26,9 +26,9 @@ from registration.stabilize.stabilized_folder import StoredComponents
 from registration.storage.hashing import input_hash, to_jsonable, versions
 from workflows.pages.stabilization import write_stabilize_page
 from workflows.records.decisions import read_decisions
-from workflows.records.run import STABILIZED, Run, read_run
+from workflows.records.run import STABILIZED, StabilizationInputs, read_run
+from workflows.records.step_results import StabilizeResult
 from workflows.records.subject import read_usable
-from workflows.steps.products import JsonRecord
 
 LOG = "decisions.jsonl"  # within the run
 
@@ -86,7 +86,7 @@ def stabilize_run(
             "input_hash": wanted,
             "dataset": dataset,
             "subjects": [one.subject for one in found.subjects],
-            "left_out": {one.subject: one.left_out for one in found.subjects if one.left_out},
+            "left_out": {one.subject: one.excluded for one in found.subjects if one.excluded},
             "decisions": decided,
             "figures": figures,
             "config": settings,
@@ -102,26 +102,42 @@ def stabilize_run(
 
 def stabilize_subjects(
     *, run: str, names: Sequence[str], model: str, out: str, progress: Progress | None = None
-) -> JsonRecord:
-    """A run's registrations -> the stabilized set `out`; none (`"out": null`) where there is too little to stabilize.
+) -> dict[str, Any]:
+    """Stabilize the usable registrations of a run into the set `out`, if there are enough expressions.
 
-    Raises InputError as `stabilize_run`.
+    Args:
+        run: folder of the subject folders.
+        names: of the subject folders to use.
+        model: file of the model that the captures were registered with.
+        out: folder of the stabilized set.
+        progress: where to report to.
+
+    Returns:
+        A `StabilizeResult` as JSON; its `out` is null if there are too few expressions.
+
+    Raises:
+        InputError: as `stabilize_run`.
     """
-    usable = {name: one for name in names if (one := read_usable(Path(run) / name)) is not None and one.expressions}
-    count = sum(len(one.expressions) for one in usable.values())
-    if count < LEAST_SAMPLES:
-        return {"out": None, "reason": f"{count} expressions of {len(names)} subjects"}
-    outcome = stabilize_run(
-        Path(run), model_path=Path(model), out=Path(out), skip_failed=True, only=tuple(usable), progress=progress
+    usable = {name: read_usable(Path(run) / name) for name in names}
+    counts = {name: len(subject.expressions) for name, subject in usable.items() if subject and subject.expressions}
+    total = sum(counts.values())
+    if total < LEAST_SAMPLES:
+        return StabilizeResult(out=None, reason=f"{total} expressions of {len(names)} subjects").to_json()
+    result = stabilize_run(
+        Path(run), model_path=Path(model), out=Path(out), skip_failed=True, only=tuple(counts), progress=progress
     )
-    manifest = disk.read_manifest(outcome.out)
-    told = {name: manifest[name] for name in ("content_id", "input_hash")}
-    return {"out": out, **told, "figures": to_jsonable(outcome.figures)}
+    manifest = disk.read_manifest(result.out)
+    return StabilizeResult(
+        out=out,
+        content_id=manifest["content_id"],
+        input_hash=manifest["input_hash"],
+        figures=to_jsonable(result.figures),
+    ).to_json()
 
 
 def _write_subjects(
     fresh: Path,
-    run: Run,
+    run: StabilizationInputs,
     data: GNMData,
     head: Head,
     settings: Stabilization,
@@ -178,7 +194,7 @@ def _figures(components: Sequence[Components], moved: Change, fresh: Path, count
     }
 
 
-def _check_count(run: Run, where: Path) -> None:
+def _check_count(run: StabilizationInputs, where: Path) -> None:
     count = sum(len(one.expressions) for one in run.subjects)
     if count < LEAST_SAMPLES:
         raise InputError(

@@ -1,30 +1,39 @@
 """The captures of a subject, one after the other: a plain loop over the library's public calls; also as a step."""
 
 import traceback
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 
 from registration.capture.scan import read_truth
 from registration.errors import InputError
 from registration.evaluate.evaluation import evaluate
-from registration.fit.recipes import load_recipe, named_recipe
+from registration.fit.recipes import load_recipe
 from registration.inputs import input_hash, read_schemes
 from registration.model import gnm_npz
 from registration.options import RegisterOptions
 from registration.pipeline import register
 from registration.progress import Named, Progress, Silent
 from registration.storage import hashing
-from registration.storage.files import atomic_write_text
 from registration.storage.registration_folder import read_manifest, update_figures
 from registration.types import Capture, Registration
 from workflows.pages.subject import thumbnail, write_subject_page
-from workflows.records.subject import MANIFEST, Captures, Row, Subject, check_subject_out, read_captures, save_subject
-from workflows.steps.products import STEP, JsonRecord, find_product, json_text
+from workflows.records.step_results import CaptureResult, CollectResult
+from workflows.records.subject import (
+    MANIFEST,
+    CaptureRow,
+    SubjectCaptures,
+    SubjectRecord,
+    check_subject_out,
+    read_captures,
+    write_subject,
+)
+from workflows.steps.job_options import from_job
+from workflows.steps.products import Product
 
 HEADLINE = ("scan_to_mesh", "drift")  # of a manifest's figures, those of the face
 
@@ -39,7 +48,7 @@ def register_subject(
     force: bool = False,
     leave: Mapping[str, str] | None = None,
     progress: Progress | None = None,
-) -> Subject:
+) -> SubjectRecord:
     """Register all captures of a subject: the neutral, then every expression from it, each by `register`.
 
     Every registration goes into the folder of `out` that is named as its capture's; what is there already is kept, as
@@ -75,45 +84,56 @@ def collect_subject(
     subject_dir: str,
     model: str,
     out: str,
-    recipe: str = "draft",
-    views: int | None = None,
-    seed: int = 0,
+    options: Mapping[str, Any] | None = None,
     leave: Mapping[str, str] | None = None,
     progress: Progress | None = None,
-) -> JsonRecord:
-    """A subject's captures -> the folder that `gnmreg subject` writes. What ended in an error is tried anew each time,
-    but for the captures of `leave`, which tells why.
+) -> dict[str, Any]:
+    """Write the folder that `gnmreg subject` writes, from registrations that other jobs have computed.
 
-    Raises InputError as `register_subject`.
+    Captures that have no registration yet are registered, except those of `leave`; errors are tried again each time.
+
+    Args:
+        subject_dir: folder of the captures.
+        model: file of the model.
+        out: folder of the subject's registrations.
+        options: a `RegisterOptions` as JSON.
+        leave: captures that are not to be tried -> the reason.
+        progress: where to report to.
+
+    Returns:
+        A `CollectResult` as JSON.
+
+    Raises:
+        InputError: as `register_subject`.
     """
-    options = RegisterOptions(recipe=named_recipe(recipe), views=views, seed=seed)
+    chosen, folder = from_job(options), Path(out)
     captures = read_captures(Path(subject_dir))
     data = gnm_npz.read(Path(model))
-    schemes = read_schemes(Path(model), data, options.landmark_files)
-    inputs = {one.root.name: input_hash(one, data, schemes, None, options) for one in captures.captures}
+    schemes = read_schemes(Path(model), data, chosen.landmark_files)
+    inputs = {capture.root.name: input_hash(capture, data, schemes, None, chosen) for capture in captures.captures}
     inputs |= {name: error.line for name, error in captures.broken.items()}
-    wanted = hashing.input_hash(inputs, {"subject": captures.subject})
-    place = Path(out)
-    if (known := find_product(place, wanted)) is not None and _contents(place, known["contents"]) == known["contents"]:
-        return {**known, "out": out}
-    found = register_subject(Path(subject_dir), Path(model), place, options, leave=leave, progress=progress)
-    rows = {row.name: {"status": row.status, "reason": row.reason, "usable": row.usable} for row in found.rows}
-    contents = _contents(place, [row.name for row in found.rows if row.folder])
-    told = {"out": out, "rows": rows, "contents": contents, "seconds": sum(row.seconds or 0 for row in found.rows)}
-    if all(row.folder or row.status == "skipped" for row in found.rows):
-        atomic_write_text(place / STEP, json_text({"input_hash": wanted, **told}))
-    return {"input_hash": wanted, **told}
+    product = Product(folder, hashing.input_hash(inputs, {"subject": captures.subject}), CollectResult)
+    existing = product.find()
+    if existing is not None and _contents(folder, existing.contents) == existing.contents:
+        return replace(existing, out=out).to_json()
+    record = register_subject(Path(subject_dir), Path(model), folder, chosen, leave=leave, progress=progress)
+    result = CollectResult(
+        input_hash=product.input_hash,
+        out=out,
+        rows={row.name: CaptureResult(status=row.status, reason=row.reason, usable=row.usable) for row in record.rows},
+        contents=_contents(folder, [row.name for row in record.rows if row.folder]),
+        seconds=sum(row.seconds or 0 for row in record.rows),
+    )
+    if all(row.folder or row.status == "skipped" for row in record.rows):
+        product.write(result)
+    return result.to_json()
 
 
-def _contents(place: Path, names: Sequence[str] | Mapping[str, str]) -> dict[str, str]:
-    """Content ids of the registrations of these names that are there."""
-    found = {}
-    for name in names:
-        try:
-            found[name] = str(read_manifest(place / name).content_id)
-        except InputError:
-            continue
-    return found
+def _contents(folder: Path, names: Iterable[str]) -> dict[str, str]:
+    """Content ids of those of the registrations of these names that exist."""
+    return {
+        name: read_manifest(folder / name).content_id for name in names if (folder / name / "manifest.json").is_file()
+    }
 
 
 def begin_subject(subject_dir: Path, model: Path, out: Path, options: RegisterOptions) -> None:
@@ -128,14 +148,14 @@ def begin_subject(subject_dir: Path, model: Path, out: Path, options: RegisterOp
 
 def _begun(
     subject_dir: Path, model: Path, out: Path, options: RegisterOptions, neutral: str | None
-) -> tuple[Captures, Subject]:
+) -> tuple[SubjectCaptures, SubjectRecord]:
     """A subject's captures, and what is known before the first is registered. Everything is checked."""
     load_recipe(options.recipe)
     captures = read_captures(subject_dir, neutral)
     check_subject_out(out, captures)
     data = gnm_npz.read(model)
     read_schemes(model, data, options.landmark_files)
-    start = Subject(
+    start = SubjectRecord(
         subject=captures.subject,
         model=gnm_npz.content_hash(data),
         recipe=options.recipe_name,
@@ -148,15 +168,15 @@ def _begun(
 class _Record:
     """What is known so far; every change lies on disk at once."""
 
-    def __init__(self, subject: Subject, out: Path):
+    def __init__(self, subject: SubjectRecord, out: Path):
         self.subject, self.out = subject, out
         self._thumbnails: dict[str, str] = {}  # row -> picture as a data URI
         self._save()
 
-    def row(self, capture: Capture) -> Row:
+    def row(self, capture: Capture) -> CaptureRow:
         return next(row for row in self.subject.rows if row.name == capture.root.name)
 
-    def put(self, row: Row, picture: str | None = None) -> None:
+    def put(self, row: CaptureRow, picture: str | None = None) -> None:
         if picture is not None:
             self._thumbnails[row.name] = picture
         rows = tuple(row if old.name == row.name else old for old in self.subject.rows)
@@ -164,7 +184,7 @@ class _Record:
         self._save()
 
     def _save(self) -> None:
-        save_subject(self.subject, self.out, write_subject_page(self.subject, self._thumbnails))
+        write_subject(self.subject, self.out, write_subject_page(self.subject, self._thumbnails))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -180,7 +200,7 @@ def _loop(
     record: _Record,
     leave: Mapping[str, str],
     progress: Progress,
-) -> Subject:
+) -> SubjectRecord:
     """Register the first capture, the neutral, and each other one from it. `one` is `register` with its settings."""
     neutral: _Neutral | None = None
     for number, capture in enumerate(captures, 1):
@@ -204,13 +224,13 @@ def _loop(
 
 
 def _registered(
-    row: Row,
+    row: CaptureRow,
     capture: Capture,
     folder: Path,
     one: Callable[..., Registration],
     neutral: _Neutral | None,
     progress: Progress,
-) -> tuple[Row, Registration | None]:
+) -> tuple[CaptureRow, Registration | None]:
     """One capture's row, filled in, and its registration if there is one."""
     start = neutral.folder if neutral else None
     result, reason = _attempt(partial(one, capture.root, out=folder, neutral=start, progress=progress), progress)
@@ -269,10 +289,11 @@ def _attempt(action: Callable[[], T], progress: Progress) -> tuple[T | None, str
         return None, f"{type(error).__name__}: {first}"
 
 
-def _waiting(captures: Captures) -> tuple[Row, ...]:
+def _waiting(captures: SubjectCaptures) -> tuple[CaptureRow, ...]:
     """A row for each capture, the neutral's first; those that cannot be read are told as errors."""
-    rows = [Row(name=capture.root.name, expression=capture.expression) for capture in captures.captures]
+    rows = [CaptureRow(name=capture.root.name, expression=capture.expression) for capture in captures.captures]
     broken = [
-        Row(name=name, expression="", status="error", reason=error.line) for name, error in captures.broken.items()
+        CaptureRow(name=name, expression="", status="error", reason=error.line)
+        for name, error in captures.broken.items()
     ]
     return (*rows, *broken)

@@ -1,7 +1,5 @@
 """`gnmreg dataset synth`: a population of synthetic subjects as a dataset; one seed is one population."""
 
-import json
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -10,10 +8,9 @@ from coregister.synthetic import expressions, subject
 from coregister.synthetic.capture import Studio, check
 from registration.errors import InputError
 from registration.progress import Progress, Silent
-from registration.storage.files import atomic_write_text
 from registration.storage.hashing import to_jsonable, versions
 from workflows.processes import run_parallel
-from workflows.records.dataset import HELD_OUT, KIND, MANIFEST, SCHEMA
+from workflows.records.dataset import HELD_OUT, MANIFEST, DatasetRecord
 from workflows.records.subject import NEUTRAL
 
 MOST = 1000  # subjects of one seed, so that populations of two seeds share nobody
@@ -42,7 +39,7 @@ class Population:
 
 def synth_dataset(
     out: Path, population: Population, *, jobs: int = 1, progress: Progress | None = None
-) -> dict[str, Any]:
+) -> DatasetRecord:
     """Photograph a population (`coregister.synthetic.subject.capture`, people of any age and build) into `out`.
 
     `out/SUBJECT/EXPRESSION` are captures, each whole or not there; called again it goes on where it was interrupted.
@@ -55,8 +52,8 @@ def synth_dataset(
     """
     progress, out = progress or Silent(), Path(out)
     _check(population)
-    told = _told(population)
-    _check_out(out, told)
+    record = _make_record(population)
+    _check_out(out, record)
     calls: dict[str, dict[str, Any]] = {}
     for name, seed in population.seeds.items():
         for act in (NEUTRAL, *population.expressions):
@@ -68,7 +65,7 @@ def synth_dataset(
                 calls[f"{name}, {act}"] = {"root": root, **settings}
     out.mkdir(parents=True, exist_ok=True)
     if calls:
-        _save(out, told, complete=False)
+        _write(out, record)
     lost = {}
     for done, (name, trouble) in enumerate(run_parallel(photograph, calls, jobs), 1):
         progress.at(done, len(calls), name)
@@ -83,7 +80,7 @@ def synth_dataset(
             got=reason,
             fix="run the same command again: it makes what is missing",
         )
-    return _save(out, told, complete=True)
+    return _write(out, replace(record, complete=True))
 
 
 def photograph(**settings: Any) -> str:
@@ -97,35 +94,25 @@ def photograph(**settings: Any) -> str:
     return ""
 
 
-def _told(population: Population) -> dict[str, Any]:
-    categories = {name: expressions.named(name).category for name in population.expressions}
-    told: dict[str, Any] = to_jsonable(
-        {
-            "kind": KIND,
-            "schema": SCHEMA,
-            "seeds": population.seeds,
-            "held_out": population.held,
-            "expressions": population.expressions,
-            "categories": categories,
-            "studio": population.studio,
-        }
+def _make_record(population: Population) -> DatasetRecord:
+    """The record of a dataset of which captures are still missing."""
+    return DatasetRecord(
+        complete=False,
+        categories={name: expressions.named(name).category for name in population.expressions},
+        seeds=population.seeds,
+        held_out=population.held,
+        expressions=population.expressions,
+        studio=to_jsonable(population.studio),
+        versions=versions(),
     )
-    return told
 
 
-def _save(out: Path, told: Mapping[str, Any], complete: bool) -> dict[str, Any]:
-    """Written only if it says anything new: a dataset that is there stays as it is."""
-    file, whole = out / MANIFEST, {**told, "complete": complete, "versions": versions()}
-    if _read(file) != whole:
-        atomic_write_text(file, json.dumps(whole, indent=1, allow_nan=False) + "\n")
-    return whole
-
-
-def _read(file: Path) -> Any:
-    try:
-        return json.loads(file.read_text("utf-8"))
-    except (OSError, ValueError):
-        return None
+def _write(out: Path, record: DatasetRecord) -> DatasetRecord:
+    """Write the record if it differs from the one in the folder: an existing dataset keeps its file."""
+    file = out / MANIFEST
+    if not file.is_file() or DatasetRecord.read(file) != record:
+        record.write(file)
+    return record
 
 
 def _check(population: Population) -> None:
@@ -134,31 +121,31 @@ def _check(population: Population) -> None:
         expressions.named(name)
     acts = population.expressions
     if NEUTRAL in acts or len(set(acts)) < len(acts):
-        raise _wrong("The expressions are not each once", "expressions", "names beside the neutral", ", ".join(acts))
+        raise _input_error(
+            "The expressions are not each once", "expressions", "names beside the neutral", ", ".join(acts)
+        )
     if not 1 <= population.subjects <= MOST:
-        raise _wrong("The number of subjects is out of range", "subjects", f"1 to {MOST}", population.subjects)
+        raise _input_error("The number of subjects is out of range", "subjects", f"1 to {MOST}", population.subjects)
     if population.seed < 0:
-        raise _wrong("The seed is out of range", "seed", "a whole number from 0", population.seed)
+        raise _input_error("The seed is out of range", "seed", "a whole number from 0", population.seed)
     if not 0 <= population.held_out <= population.subjects:
         expected = f"0 to {population.subjects}"
-        raise _wrong("More are held out than there are", "held-out", expected, population.held_out)
+        raise _input_error("More are held out than there are", "held-out", expected, population.held_out)
 
 
-def _check_out(out: Path, told: Mapping[str, Any]) -> None:
+def _check_out(out: Path, record: DatasetRecord) -> None:
     if not out.exists() or (out.is_dir() and not any(out.iterdir())):
         return
-    found = _read(out / MANIFEST) if out.is_dir() else None
-    ours = isinstance(found, dict) and {name: found.get(name) for name in told} == dict(told)
-    if not ours:
-        got = "another dataset" if found else "other things"
-        raise InputError(
-            "The dataset's folder cannot be used",
-            where=out,
+    file = out / MANIFEST
+    existing = DatasetRecord.read(file) if DatasetRecord.is_ours(file) else None
+    if existing is None or replace(existing, complete=record.complete, versions=record.versions) != record:
+        raise InputError.output_folder(
+            out,
             expected="a new or empty folder, or one with a dataset of the same settings",
-            got=got,
-            fix="choose another folder, or the arguments that it was made with",
+            got="other contents" if existing is None else "another dataset",
+            fix="choose another folder, or the arguments that the dataset was made with",
         )
 
 
-def _wrong(what: str, where: object, expected: object, got: object) -> InputError:
+def _input_error(what: str, where: object, expected: object, got: object) -> InputError:
     return InputError(what, where=where, expected=expected, got=got, fix="change it")

@@ -19,7 +19,7 @@ from tests.registration.capture.small import make
 from workflows.cli.app import COMMANDS, main
 from workflows.cli.farm import QueueName
 from workflows.engine.jobs import GPU, REBUILD
-from workflows.records.subject import Row, Subject
+from workflows.records.subject import CaptureRow, SubjectRecord
 
 CLI = Path(workflows.cli.__file__).parent
 TINY_MODEL = FIXTURES / "tiny_gnm.npz"
@@ -308,10 +308,12 @@ def test_subject_passes_every_argument_on(
     """The loop itself is tested in test_subject.py."""
     heard = {}
 
-    def listen(subject: Path, model: Path, out: Path, options: RegisterOptions, **settings) -> Subject:
+    def listen(subject: Path, model: Path, out: Path, options: RegisterOptions, **settings) -> SubjectRecord:
         heard.update(settings, subject=subject, model=model, out=out, options=options)
-        rows = tuple(Row(name=f"c{i}", expression="", status=s, reason="because") for i, s in enumerate(statuses))
-        return Subject(subject="anna", model="ab", recipe="draft", neutral="c0", rows=rows)
+        rows = tuple(
+            CaptureRow(name=f"c{i}", expression="", status=s, reason="because") for i, s in enumerate(statuses)
+        )
+        return SubjectRecord(subject="anna", model="ab", recipe="draft", neutral="c0", rows=rows)
 
     monkeypatch.setattr(workflows.steps.subject, "register_subject", listen)
     flags = "--recipe studio --views 7 --seed 3 --neutral N --deterministic --force --variant cuda --landmarks 68=a 5=b"

@@ -129,7 +129,7 @@ def test_a_local_farm_registers_and_is_interrupted_and_goes_on(tmp_path: Path) -
     assert second.returncode == 1 and "jobs: 3 (2 done, 1 failed)" in second.stdout, second.stdout + second.stderr
     assert 'capture.toml lacks "subject"' in second.stdout
     found = Store(tmp_path / "out").verify()
-    assert found.sound and found.artifacts == 2 and not _processes_of(str(tmp_path))
+    assert found.is_sound and found.artifacts == 2 and not _processes_of(str(tmp_path))
 
 
 def _done(url: str) -> bool:

@@ -12,15 +12,16 @@ from workflows.engine.database import default_url
 from workflows.engine.jobs import Job
 from workflows.engine.process import migrate
 from workflows.engine.reader import QueueReader
-from workflows.farm.coregistration import PLAN, submit_coregistration
+from workflows.farm.coregistration import submit_coregistration
 from workflows.farm.local import LocalFarm, run_until_done
 from workflows.farm.plan import make_plan
+from workflows.records.coregistration import PLAN
 
 
 def test_a_run_that_goes_on_stays_and_one_that_ended_is_forgotten(capture: Path, tmp_path: Path) -> None:
     dataset = write_people(capture, tmp_path / "dataset", 5)
     url, out = default_url(tmp_path), tmp_path / "june"
-    plan = make_plan(dataset, model_path=MODEL, out=out, components=(2,))
+    plan = make_plan(dataset, MODEL, out, components=(2,))
     with pytest.raises(InputError, match="There is no queue"):
         submit_coregistration(url, plan)
     assert not out.exists()
@@ -29,7 +30,7 @@ def test_a_run_that_goes_on_stays_and_one_that_ended_is_forgotten(capture: Path,
     queue, reader = QueueClient(url), QueueReader(url)
     row = reader.rows(["june"])["june"]
     assert row.state == "waiting"
-    assert row.spec == {"flow": "coregister", "arguments": {"plan": str(out / PLAN), "variant": "llvm"}}
+    assert row.spec == {"flow": "coregister", "arguments": {"plan": str(out / PLAN)}}
     queue.submit([Job(id="june/it00/s00000/neutral", step="register")])
     with pytest.raises(InputError, match="have not ended"):
         submit_coregistration(url, plan)

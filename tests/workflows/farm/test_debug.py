@@ -47,7 +47,7 @@ def calls(monkeypatch: pytest.MonkeyPatch) -> list[dict[str, Any]]:
 def test_a_registration_is_made_again_with_pictures_and_out_of_the_way(
     calls: list[dict[str, Any]], tmp_path: Path, step: str
 ) -> None:
-    arguments = {"capture": "/c/e", "model": "/m.npz", "recipe": "studio", "views": 5, "seed": 3, "variant": "llvm"}
+    arguments = {"capture": "/c/e", "model": "/m.npz", "options": {"recipe": "studio", "views": 5, "seed": 3}}
     places = {
         "register": {"out": "/results/e", "neutral": "/results/n"},
         "register stored": {"store": "/s", "key": "k"},

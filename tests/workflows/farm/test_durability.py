@@ -129,7 +129,7 @@ def test_a_frozen_worker_whose_connection_broke_is_fenced(made: Farm) -> None:
     made.queue.submit([work(made, f"run/b{n}") for n in range(6)])
     made.ends(*(f"run/b{n}" for n in range(6)))
     found = Store(made.folder / "store").verify()
-    assert found.sound and found.artifacts == 7
+    assert found.is_sound and found.artifacts == 7
 
 
 def _key(name: str) -> int:
@@ -224,4 +224,4 @@ def test_a_graph_with_kills_in_the_middle(made: Farm) -> None:
     assert counts == {"done": total}
     assert made.job("run")["result"] == {"subjects": subjects, "rebuilt": 1}
     assert lost == 0 and repeated <= 1
-    assert found.sound and found.artifacts == total
+    assert found.is_sound and found.artifacts == total

@@ -1,17 +1,22 @@
 """The order of jobs, which are done at once by what a table says of them."""
 
 import asyncio
-import json
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
 import pytest
 
+from coregister.next_model.recipes import few_registrations
+from coregister.stopping_rule import Rule
+from registration.options import RegisterOptions
 from tests.workflows.farm.inline import Inline
 from workflows.engine.jobs import Job
 from workflows.engine.serialization import JobFailed
 from workflows.farm.flows import coregister, subject
+from workflows.records.coregistration import CoregistrationPlan
+from workflows.records.dataset import Split
+from workflows.records.step_results import BuildResult, EvaluateResult
 
 Told = dict[str, Any] | Exception
 
@@ -27,7 +32,7 @@ def run_subject(step: Callable[[Job], Any]) -> tuple[dict[str, Any], list[Job]]:
         "captures": ["rest", "smile", "jaw"],
         "model": "/m",
         "out": "/o/ann",
-        "settings": {"recipe": "draft", "views": None, "seed": 1, "variant": "llvm"},
+        "options": {"recipe": "draft", "seed": 1, "variant": "cuda"},
     }
     return asyncio.run(subject(scope, **arguments)), scope.log  # type: ignore[arg-type]
 
@@ -40,6 +45,7 @@ def test_a_subject_is_the_neutral_then_expressions_then_the_record() -> None:
     assert [j.arguments.get("neutral") for j in log[:3]] == [None, "/o/ann/rest", "/o/ann/rest"]
     assert log[1].arguments["capture"] == "/c/ann/smile" and log[1].arguments["out"] == "/o/ann/smile"
     assert log[3].arguments["leave"] == {}
+    assert all(job.arguments["options"] == {"recipe": "draft", "seed": 1, "variant": "cuda"} for job in log)
 
 
 def test_an_expression_that_fails_takes_no_other_along() -> None:
@@ -75,37 +81,41 @@ class Rounds:
         if any(part in job.id for part in self.broken):
             raise failed("broken")
         if job.step == "hold out":
-            return {"people": "/o/people.npz", "sources": {}, "lost": []}
+            return {"input_hash": "h", "people": "/o/people.npz", "sources": {}, "lost": []}
         if job.step == "stabilize":
             return {"out": job.arguments["out"]}
         if job.step == "build":
-            return {"model": f"{job.arguments['out']}/gnm_head.npz"}
+            model = f"{job.arguments['out']}/gnm_head.npz"
+            return BuildResult(
+                input_hash="h", model=model, content_id="c", registered=8, rejected=(), components=2, drift_mm=0.1
+            ).to_json()
+        if job.step == "evaluate":
+            return EvaluateResult(
+                input_hash="h", out="/o", components=(2,), at=2, generalization_mm={}, specificity_mm={}
+            ).to_json()
         if job.step == "end round":
-            return {"go_on": self.go_on[len(job.arguments["rounds"]) - 1], "reason": "so it is"}
+            return {"go_on": self.go_on[len(job.arguments["rounds"]) - 1], "reason": "no gain"}
         return {}
 
 
 @pytest.fixture
 def plan(tmp_path: Path) -> Path:
     names = [f"p{n}" for n in range(5)]
-    told = {
-        "dataset": "/d",
-        "model": "/m0",
-        "out": "/o",
-        "recipe": "draft",
-        "model_recipe": {"name": "few_registrations"},
-        "views": None,
-        "seed": 0,
-        "components": [2],
-        "samples": 0,
-        "rule": {"rounds": 3, "failures": 0.2},
-        "split": {"training": names[:4], "held_out": names[4:], "how": ""},
-        "captures": {name: ["rest", "smile"] for name in names},
-        "bare": names[4:],
-    }
-    file = tmp_path / "plan.json"
-    file.write_text(json.dumps(told))
-    return file
+    plan = CoregistrationPlan(
+        dataset=Path("/d"),
+        model=Path("/m0"),
+        out=Path("/o"),
+        options=RegisterOptions(),
+        model_recipe=few_registrations(),
+        components=(2,),
+        samples=0,
+        rule=Rule(rounds=3, failures=0.2),
+        split=Split(training=tuple(names[:4]), held_out=tuple(names[4:]), how=""),
+        captures={name: ("rest", "smile") for name in names},
+        without_truth=tuple(names[4:]),
+    )
+    plan.write(tmp_path / "plan.json")
+    return tmp_path / "plan.json"
 
 
 def run_loop(plan: Path, rounds: Rounds) -> tuple[dict[str, Any], list[Job]]:
@@ -115,7 +125,7 @@ def run_loop(plan: Path, rounds: Rounds) -> tuple[dict[str, Any], list[Job]]:
 
 def test_the_loop_goes_round_with_the_model_that_it_built_until_told(plan: Path) -> None:
     result, log = run_loop(plan, Rounds([True, False]))
-    assert result == {"rounds": 2, "model": "/o/it01/model/gnm_head.npz", "reason": "so it is"}
+    assert result == {"rounds": 2, "model": "/o/it01/model/gnm_head.npz", "reason": "no gain"}
     steps = [job.step for job in log if job.step not in ("register", "collect")]
     assert steps == ["hold out", *["stabilize", "build", "evaluate", "end round"] * 2]
     registered = [job for job in log if job.step == "register"]

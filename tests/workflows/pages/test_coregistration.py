@@ -5,7 +5,11 @@ from typing import Any
 
 from workflows.pages.coregistration import write_coregistration_page
 
-PLAN = {"dataset": "/data/a<b>", "recipe": "draft", "seed": 0, "split": {"training": ["x"], "held_out": [], "how": "&"}}
+PLAN = {
+    "dataset": "/data/a<b>",
+    "options": {"recipe": "draft", "seed": 0},
+    "split": {"training": ["x"], "held_out": [], "how": "&"},
+}
 EMPTY = {
     "plan": PLAN,
     "sources": {},

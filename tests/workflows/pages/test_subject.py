@@ -8,21 +8,23 @@ import numpy as np
 
 from tests.registration.report.test_page import a_registration
 from workflows.pages.subject import thumbnail, write_subject_page
-from workflows.records.subject import Row, Subject
+from workflows.records.subject import CaptureRow, SubjectRecord
 
 
-def a_subject(*rows: Row) -> Subject:
-    return Subject(subject="a<b>", model="ab" * 32, recipe="draft", neutral="rest", rows=rows)
+def a_subject(*rows: CaptureRow) -> SubjectRecord:
+    return SubjectRecord(subject="a<b>", model="ab" * 32, recipe="draft", neutral="rest", rows=rows)
 
 
 def test_the_page_shows_every_row_and_needs_nothing_else():
     figures = {"scan_to_mesh": {"face": {"mean_mm": 0.1234, "median_mm": 0.0456}}, "drift": {"face": {"mean_mm": 0.5}}}
     page = write_subject_page(
         a_subject(
-            Row(name="rest", expression="neutral", status="converged", figures=figures, seconds=66.4, folder="rest"),
-            Row(name="big <smile>", expression="x&y", status="failed", reason="<off>", folder="big <smile>"),
-            Row(name="gone", expression="gone", status="error", reason="lost"),
-            Row(name="later", expression="later"),
+            CaptureRow(
+                name="rest", expression="neutral", status="converged", figures=figures, seconds=66.4, folder="rest"
+            ),
+            CaptureRow(name="big <smile>", expression="x&y", status="failed", reason="<off>", folder="big <smile>"),
+            CaptureRow(name="gone", expression="gone", status="error", reason="lost"),
+            CaptureRow(name="later", expression="later"),
         ),
         {"rest": "data:image/jpeg;base64,AAAA"},
     )

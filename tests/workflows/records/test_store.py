@@ -62,14 +62,11 @@ def spoil(store: Store, name: str, content: bytes | None) -> None:
     store._fs.pipe_file(path, content)
 
 
-def test_what_is_made_is_found_and_fetched(store: Store, tmp_path: Path) -> None:
+def test_a_published_artifact_is_found(store: Store) -> None:
     assert store.find("run/a") is None
     made = store.produce("run/a", wanted="hash", make=write)
     assert store.find("run/a") == made
     assert made.about == {"mm": 0.5} and set(made.files) == {"mesh.ply", "sub/page.html"}
-    assert store.fetch("run/a", tmp_path / "got") == made
-    assert (tmp_path / "got" / "sub" / "page.html").read_bytes() == b"page"
-    assert store.open("run/a", "mesh.ply").read() == b"mesh"
     assert list(store.keys()) == ["run/a"]
 
 
@@ -109,13 +106,13 @@ def test_two_attempts_at_a_time_disturb_nobody(store: Store) -> None:
     last = store.produce("a", wanted="one", make=meanwhile)
     assert store.find("a") == last
     found = store.verify()
-    assert found.sound and found.artifacts == 1 and len(found.orphaned) == 2
+    assert found.is_sound and found.artifacts == 1 and len(found.orphaned) == 2
 
 
 def test_verify_names_what_is_missing_altered_and_orphaned(store: Store) -> None:
     a = store.produce("run/a", wanted="one", make=write)
     b = store.produce("run/b", wanted="one", make=write)
-    assert store.verify().sound and store.verify().artifacts == 2
+    assert store.verify().is_sound and store.verify().artifacts == 2
     spoil(store, f"run/a/{a.attempt}/mesh.ply", b"mush")
     spoil(store, f"run/b/{b.attempt}/sub/page.html", None)
     spoil(store, "run/c/attempt-1/left", b"over")
@@ -125,24 +122,17 @@ def test_verify_names_what_is_missing_altered_and_orphaned(store: Store) -> None
     assert found.missing == (f"run/b/{b.attempt}/sub/page.html",)
     assert found.orphaned == ("run/c/attempt-1/left",)
     assert list(found.unreadable) == [f"run/d/{MANIFEST}"]
-    assert not found.sound
-
-
-def test_an_altered_file_is_not_fetched(store: Store, tmp_path: Path) -> None:
-    a = store.produce("a", wanted="one", make=write)
-    spoil(store, f"a/{a.attempt}/mesh.ply", b"mush")
-    with pytest.raises(InputError, match="artifact cannot be used"):
-        store.fetch("a", tmp_path)
+    assert not found.is_sound
 
 
 @pytest.mark.parametrize("name", ["../../outside", "/etc/passwd", "sub/../../x"])
-def test_a_manifest_that_points_outside_is_refused(store: Store, tmp_path: Path, name: str) -> None:
+def test_a_manifest_that_points_outside_is_refused(store: Store, name: str) -> None:
     store.produce("a", wanted="one", make=write)
     value = json.loads(store._fs.cat_file(store._path("a", MANIFEST)))
     value["files"] = {name: {"sha256": "0", "bytes": 1}}
     spoil(store, f"a/{MANIFEST}", json.dumps(value).encode())
     with pytest.raises(InputError) as refused:
-        store.fetch("a", tmp_path / "got")
+        store.find("a")
     assert "inside the attempt" in refused.value.expected
 
 
@@ -170,7 +160,7 @@ def test_tidying_removes_what_nobody_published_and_spares_the_young(store: Store
     assert store.tidy(older_than_s=3600) == 0
     time.sleep(1.1)  # object storage tells whole seconds
     assert store.tidy(older_than_s=0.01) == 2
-    assert store.verify().sound and not store.verify().orphaned
+    assert store.verify().is_sound and not store.verify().orphaned
     assert store.find("a") is not None
 
 

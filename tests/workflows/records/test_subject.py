@@ -8,6 +8,7 @@ import pytest
 from registration.errors import InputError
 from registration.options import RegisterOptions
 from tests.workflows.conftest import MODEL, FakeRegister, change
+from workflows.records.subject import SubjectRecord
 from workflows.steps.subject import register_subject
 
 
@@ -33,7 +34,9 @@ def filled(name: str):
         place.mkdir(parents=True)
         (place / "mine.txt").write_text("mine")
         if name != ".":
-            (place.parent / "subject.json").write_text('{"kind": "gnm-subject", "subject": "ball"}')
+            SubjectRecord(subject="ball", model="ab", recipe="draft", neutral="rest", rows=()).write(
+                place.parent / "subject.json"
+            )
         return {}
 
     return do
@@ -69,9 +72,9 @@ def unreadable(name: str, **options):
         (other("smile", '"smile"', '"neutral"'), {}, "two neutrals", "rest, smile"),
         (nothing, {"neutral": "notes"}, "no such capture", "notes"),
         (other("smile", '"ball"', '"cube"'), {}, "several subjects", "smile: cube"),
-        (filled("."), {}, "output folder", "other things"),
+        (filled("."), {}, "output folder", "other contents"),
         (filled("smile"), {}, "output folder", "mine.txt"),
-        (lambda subject: {"out": subject}, {}, "output folder", "other things"),
+        (lambda subject: {"out": subject}, {}, "output folder", "other contents"),
         (lambda subject: {"out": subject / "smile" / "out"}, {}, "output folder", "inside the capture smile"),
         (lambda subject: {"out": subject / "smile"}, {}, "output folder", "inside the capture smile"),
         (lambda subject: {"out": subject / "notes.txt"}, {}, "output folder", "a file"),

@@ -82,11 +82,11 @@ def spoil(arrays, **changes):
 
 
 BAD_FILES = {
-    "no labels": (lambda a: spoil(a, labels=None), "incomplete"),
+    "no labels": (lambda a: spoil(a, labels=None), "'labels' is missing"),
     "a tag too short": (lambda a: spoil(a, tag_age=a["tag_age"][:-1]), "incomplete"),
-    "flat vertices": (lambda a: spoil(a, vertices=a["vertices"].reshape(9, -1)), "no meshes"),
-    "whole vertices": (lambda a: spoil(a, vertices=a["vertices"].astype(int)), "no meshes"),
-    "quads": (lambda a: spoil(a, triangles=np.zeros((5, 4), int)), "no meshes"),
+    "flat vertices": (lambda a: spoil(a, vertices=a["vertices"].reshape(9, -1)), "'vertices' has a wrong shape"),
+    "whole vertices": (lambda a: spoil(a, vertices=a["vertices"].astype(int)), "'vertices' has a wrong type"),
+    "quads": (lambda a: spoil(a, triangles=np.zeros((5, 4), int)), "'triangles' has a wrong shape"),
     "two neutrals": (lambda a: spoil(a, labels=np.where(a["labels"] == "smile", "neutral", a["labels"])), "not one"),
     "no neutral": (lambda a: spoil(a, labels=np.where(a["labels"] == "neutral", "rest", a["labels"])), "not one"),
     "objects": (lambda a: spoil(a, labels=a["labels"].astype(object)), "cannot be read"),

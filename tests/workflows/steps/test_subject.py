@@ -21,13 +21,13 @@ from registration.render import backend
 from registration.storage.registration_folder import AXES, load_registration, read_manifest
 from tests.registration.register import synthetic
 from tests.workflows.conftest import MODEL, FakeRegister, Notes, add_truths, change, manifest, statuses
-from workflows.records.subject import Subject
+from workflows.records.subject import SubjectRecord
 from workflows.steps.subject import register_subject
 
 REFUSED = InputError("The lens is dirty", where="cam3", expected="a clean one", got="dust", fix="wipe it")
 
 
-def run(subject: Path, **options) -> Subject:
+def run(subject: Path, **options) -> SubjectRecord:
     out = options.pop("out", subject.parent / "out")
     return register_subject(subject, MODEL, out, **options)
 

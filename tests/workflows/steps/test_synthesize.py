@@ -69,9 +69,9 @@ def test_one_seed_is_one_population_resumed_or_not(photographs, tmp_path):
     assert len(photographs.made) == 9 == len(set(photographs.made))
     after = contents(tmp_path / "a")
     assert len(before) == 9 and all(after[name] == before[name] for name in before if name != "dataset.json")
-    assert told["seeds"] == {"synth_2000": 2000, "synth_2001": 2001, "synth_2002": 2002}
-    assert told["held_out"] == ["synth_2002"] and told["complete"] is True and told["versions"]["numpy"]
-    assert told["categories"] == {"smile": "flexing", "jaw_open": "jaw"}
+    assert told.seeds == {"synth_2000": 2000, "synth_2001": 2001, "synth_2002": 2002}
+    assert told.held_out == ("synth_2002",) and told.complete and told.versions["numpy"]
+    assert told.categories == {"smile": "flexing", "jaw_open": "jaw"}
     synth_dataset(tmp_path / "b", population)
     assert contents(tmp_path / "a") == contents(tmp_path / "b")
     written = (tmp_path / "a/dataset.json").stat().st_mtime_ns
@@ -106,7 +106,7 @@ def test_a_capture_that_fails_is_told_after_all_others_were_tried(photographs, t
         synth_dataset(tmp_path / "a", Population(subjects=6))
     assert json.loads((tmp_path / "a/dataset.json").read_text())["complete"] is False
     photographs.trouble = None
-    assert synth_dataset(tmp_path / "a", Population(subjects=6))["complete"]
+    assert synth_dataset(tmp_path / "a", Population(subjects=6)).complete
 
 
 @pytest.mark.parametrize(
