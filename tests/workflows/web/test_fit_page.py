@@ -1,4 +1,4 @@
-"""The page of a fit that is debugged, in a headless Chromium: stages appear while they are written."""
+"""The page of `gnmreg debug --view` in a headless Chromium: stages appear while they are written."""
 
 from collections.abc import Iterator
 from dataclasses import replace
@@ -37,7 +37,7 @@ def page(tmp_path: Path, capture: Capture) -> Iterator[FitPage]:
     served.close()
 
 
-def test_stages_are_taken_up_as_they_are_written(page: FitPage, tmp_path: Path) -> None:
+def test_stages_are_read_as_they_are_written(page: FitPage, tmp_path: Path) -> None:
     page.refresh()
     assert page.stages == []
     stage(tmp_path / "stages", "00_start", 1.02)
@@ -52,7 +52,7 @@ def test_stages_are_taken_up_as_they_are_written(page: FitPage, tmp_path: Path) 
     page._stage.value = "00_start"
     stage(tmp_path / "stages", "02_end", 1.0)
     page.refresh()
-    assert page._stage.value == "00_start"  # somebody looks at it
+    assert page._stage.value == "00_start"  # an operator selected it
 
 
 def test_colours_are_millimetres(page: FitPage, tmp_path: Path) -> None:
@@ -60,14 +60,14 @@ def test_colours_are_millimetres(page: FitPage, tmp_path: Path) -> None:
         stage(tmp_path / "stages", name, scale)
     page.refresh()
     off_mm = 20 * small.RADIUS_M
-    for colours, wanted in (
+    for colours, expected in (
         (TO_SCAN, {"00_start": off_mm, "01_pose": 0.0}),
         (MOTION, {"00_start": 0.0, "01_pose": off_mm}),
     ):
         page._colours.value = colours
-        for name, distance in wanted.items():
-            found = page._distance_mm(name)
-            assert found is not None and np.abs(found - distance).max() < 0.02 * off_mm
+        for name, distance in expected.items():
+            distances = page._distance_mm(name)
+            assert distances is not None and np.abs(distances - distance).max() < 0.02 * off_mm
     page._colours.value = PLAIN
     assert page._distance_mm("01_pose") is None
 
@@ -86,13 +86,13 @@ def test_a_port_in_use_is_refused(page: FitPage, capture: Capture, tmp_path: Pat
 
 
 @needs_browser
-def test_a_person_watches_a_fit(page: FitPage, tmp_path: Path) -> None:
+def test_an_operator_watches_a_fit(page: FitPage, tmp_path: Path) -> None:
     sync_api = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
     with sync_api.sync_playwright() as playwright:
         browser = playwright.chromium.launch(executable_path=CHROMIUM, args=list(FLAGS))
         tab = browser.new_page(viewport={"width": 1360, "height": 900})
-        asked = []
-        tab.on("request", lambda request: asked.append(request.url))
+        requests = []
+        tab.on("request", lambda request: requests.append(request.url))
         tab.goto(f"http://127.0.0.1:{page.port}")
         see = sync_api.expect
         see(tab.get_by_text("ball, neutral")).to_be_visible(timeout=60_000)
@@ -107,9 +107,9 @@ def test_a_person_watches_a_fit(page: FitPage, tmp_path: Path) -> None:
         for name in ("Scan", "Cameras"):
             tab.get_by_label(name, exact=True).check()
         tab.wait_for_function("document.querySelectorAll('canvas').length > 0")
-        picture = tab.screenshot()
+        image = tab.screenshot()
         browser.close()
-    assert len(picture) > 20_000
-    own = (f"http://127.0.0.1:{page.port}/", f"blob:http://127.0.0.1:{page.port}/", "data:")
-    assert asked and all(url.startswith(own) for url in asked)  # nothing from anywhere else
-    (tmp_path / "watched.png").write_bytes(picture)
+    assert len(image) > 20_000
+    allowed = (f"http://127.0.0.1:{page.port}/", f"blob:http://127.0.0.1:{page.port}/", "data:")
+    assert requests and all(url.startswith(allowed) for url in requests)
+    (tmp_path / "watched.png").write_bytes(image)

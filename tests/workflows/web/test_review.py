@@ -1,4 +1,4 @@
-"""The review page in a headless Chromium with software WebGL: what is done there is what the function call does."""
+"""The review page in a headless Chromium: decisions made there have the same effect as in a function call."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -40,13 +40,13 @@ def page(run, model_file) -> Iterator[ReviewPage]:  # noqa: F811
 
 
 @needs_browser
-def test_a_person_steps_subtracts_undoes_and_saves(page, run, model, model_file, tmp_path):  # noqa: F811
+def test_a_reviewer_steps_subtracts_undoes_and_saves(page, run, model, model_file, tmp_path):  # noqa: F811
     sync_api = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
     with sync_api.sync_playwright() as playwright:
         browser = playwright.chromium.launch(executable_path=CHROMIUM, args=list(FLAGS))
         tab = browser.new_page(viewport={"width": 1360, "height": 900})
-        asked, sockets = [], []
-        tab.on("request", lambda request: asked.append(request.url))
+        requests, sockets = [], []
+        tab.on("request", lambda request: requests.append(request.url))
         tab.on("websocket", lambda socket: sockets.append(socket.url))
         tab.goto(f"http://127.0.0.1:{page.port}")
         see = sync_api.expect
@@ -58,7 +58,7 @@ def test_a_person_steps_subtracts_undoes_and_saves(page, run, model, model_file,
 
         first = tab.get_by_text("energy of the region").locator("..").inner_text()
         tab.get_by_role("button", name="next", exact=True).click()
-        see(tab.get_by_text(first.split("\t")[-1], exact=True)).to_have_count(0)  # another share of energy
+        see(tab.get_by_text(first.split("\t")[-1], exact=True)).to_have_count(0)  # another component
         unsaved = tab.get_by_text("decisions not saved").locator("..")
         tab.get_by_role("textbox").last.fill("it turns")
         tab.get_by_role("button", name="subtract", exact=True).click()
@@ -71,11 +71,11 @@ def test_a_person_steps_subtracts_undoes_and_saves(page, run, model, model_file,
         see(unsaved).to_contain_text("1")
         tab.get_by_role("button", name="Save decisions").click()
         see(tab.get_by_text("1 decisions saved")).to_be_visible()
-        picture = tab.screenshot()
+        image = tab.screenshot()
         browser.close()
-    assert len(picture) > 20_000
-    own = (f"http://127.0.0.1:{page.port}/", f"blob:http://127.0.0.1:{page.port}/", "data:")
-    assert asked and all(url.startswith(own) for url in asked)  # nothing from anywhere else
+    assert len(image) > 20_000
+    allowed = (f"http://127.0.0.1:{page.port}/", f"blob:http://127.0.0.1:{page.port}/", "data:")
+    assert requests and all(url.startswith(allowed) for url in requests)
     assert sockets == [f"ws://127.0.0.1:{page.port}/"] or sockets == [f"ws://127.0.0.1:{page.port}"]
 
     log = run / "decisions.jsonl"
@@ -84,12 +84,12 @@ def test_a_person_steps_subtracts_undoes_and_saves(page, run, model, model_file,
     replayed = stabilize_run(run, model_path=model_file, out=tmp_path / "out", decisions=log)
     expected = stabilize(read_run(run, model).meshes(), model, decisions=decided)
     for number, subject in enumerate(expected.subjects):
-        found = disk.read_subject(replayed.out, number)
-        np.testing.assert_allclose(found.vertices, subject.vertices, atol=1e-6)
-        np.testing.assert_allclose(found.T_neutral_expression, subject.T_neutral_expression, atol=1e-9)
+        replay = disk.read_subject(replayed.out, number)
+        np.testing.assert_allclose(replay.vertices, subject.vertices, atol=1e-6)
+        np.testing.assert_allclose(replay.T_neutral_expression, subject.T_neutral_expression, atol=1e-9)
 
 
-def test_a_review_goes_on_from_its_log(page, run, model_file):  # noqa: F811
+def test_a_review_resumes_its_log(page, run, model_file):  # noqa: F811
     before: ReviewState = page.review
     before.decide("nose", 0, "subtract", "moves as one")
     before.decide("mouth", 0, "drop", "")
@@ -108,7 +108,7 @@ def test_a_review_goes_on_from_its_log(page, run, model_file):  # noqa: F811
         again.close()
 
 
-def test_looking_again_leaves_what_was_decided(page, run, model_file):  # noqa: F811
+def test_opening_a_review_again_keeps_the_decisions(page, run, model_file):  # noqa: F811
     page.review.decide("nose", 0, "subtract", "moves as one")
     page.review.save()
     decided = stabilize_run(run, model_path=model_file, decisions=run / "decisions.jsonl")
@@ -134,6 +134,6 @@ def test_an_animated_head_is_a_glb():
         sphere.vertices, rng.normal(size=sphere.vertices.shape), sphere.faces, 255 * (sphere.vertices > 0)
     )
     assert len(blob) % 4 == 0 and int.from_bytes(blob[8:12], "little") == len(blob)
-    (found,) = trimesh.load(io.BytesIO(blob), file_type="glb", process=False).geometry.values()
-    np.testing.assert_allclose(found.vertices, sphere.vertices, atol=1e-6)
-    np.testing.assert_array_equal(found.faces, sphere.faces)
+    (mesh,) = trimesh.load(io.BytesIO(blob), file_type="glb", process=False).geometry.values()
+    np.testing.assert_allclose(mesh.vertices, sphere.vertices, atol=1e-6)
+    np.testing.assert_array_equal(mesh.faces, sphere.faces)
