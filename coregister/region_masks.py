@@ -1,4 +1,5 @@
-"""Soft masks of the regions that expression bases are built for, and mirror images [GNM, Head Expression]."""
+"""Soft masks of the regions of expression bases, and mirror images [GNM, Head Expression]; docs/algorithms.md,
+"Expression basis"."""
 
 from collections.abc import Mapping
 
@@ -13,7 +14,7 @@ from registration.model.gnm_npz import GNMData
 
 REGIONS = ("left_eye_region", "right_eye_region", "lower_face_region")
 FLIP = np.array([-1.0, 1.0, 1.0])  # a mirror image's coordinates
-_BLEND = 10e-3  # metres along the surface, across which one region fades into the next
+_BLEND_M = 10e-3  # geodesic width of the transition between regions
 _UPPER = ("forehead", "middle_brow", "left_brow", "right_brow", "left_temple", "right_temple", "left_orbital")
 _UPPER_REGIONS = tuple(f"{name}_region" for name in (*_UPPER, "right_orbital"))
 
@@ -24,7 +25,14 @@ def soft_masks(
     mirror: Int[np.ndarray, "V"],
     groups: Mapping[str, Bool[np.ndarray, "V"]],
 ) -> Float[np.ndarray, "3 V"]:
-    """The share of each of `REGIONS` in every vertex of the skin; columns sum to one, the right mirrors the left."""
+    """Return the mask of each of `REGIONS`; the masks of a vertex sum to one, the right eye's mirrors the left eye's.
+
+    Args:
+        vertices: of the skin, metres, symmetric about x = 0.
+        edges: of the skin.
+        mirror: each vertex' mirror image.
+        groups: official vertex groups by name.
+    """
     length = np.linalg.norm(vertices[edges[:, 0]] - vertices[edges[:, 1]], axis=1)
     graph = sp.csr_matrix((length, (edges[:, 0], edges[:, 1])), (len(vertices),) * 2)
     upper = np.any([groups[name] for name in (*_UPPER_REGIONS, "eye_sockets")], axis=0)
@@ -34,9 +42,9 @@ def soft_masks(
 
 
 def regional_masks(data: GNMData) -> Float[np.ndarray, "3 V"]:
-    """The same of a model file, whose groups say where the eye regions are; zero where there is no skin.
+    """Return the masks of `REGIONS` for a model, by its vertex groups of eye regions; zero off the skin.
 
-    The file's groups may be hard or soft, and may overlap or leave skin out: only their border is taken.
+    The groups may be hard or soft, overlap or not cover the skin: only their border is used.
     """
     skin, mirror = regions.skin(data), data.mirror_indices
     vertices = data.template_vertex_positions.astype(np.float64)
@@ -51,24 +59,29 @@ def regional_masks(data: GNMData) -> Float[np.ndarray, "3 V"]:
 def _split(
     graph: sp.csr_matrix, upper: Bool[np.ndarray, "V"], x: Float[np.ndarray, "V"], mirror: Int[np.ndarray, "V"]
 ) -> Float[np.ndarray, "3 V"]:
-    left_of = smoothstep(0.5 + x / _BLEND)
+    left_of = smoothstep(0.5 + x / _BLEND_M)
     eyes = _fade(graph, upper)
     eyes = (eyes + eyes[mirror]) / 2
     return np.stack([eyes * left_of, eyes * (1 - left_of), 1 - eyes])
 
 
 def _fade(graph: sp.csr_matrix, inside: Bool[np.ndarray, "V"]) -> Float[np.ndarray, "V"]:
-    """1 inside and 0 outside, passing through 1/2 on the border."""
-    reach = [dijkstra(graph, directed=False, indices=np.flatnonzero(s), min_only=True) for s in (inside, ~inside)]
-    return smoothstep(0.5 + (reach[1] - reach[0]) / _BLEND)
+    """A mask that is 1 inside, 0 outside and 1/2 on the border."""
+    distance = [dijkstra(graph, directed=False, indices=np.flatnonzero(s), min_only=True) for s in (inside, ~inside)]
+    return smoothstep(0.5 + (distance[1] - distance[0]) / _BLEND_M)
 
 
-def smoothstep(share: Float[np.ndarray, "*S"]) -> Float[np.ndarray, "*S"]:
-    """0 below 0, 1 above 1, and smooth in between: 3 t^2 - 2 t^3."""
-    t = np.clip(share, 0, 1)
+def smoothstep(x: Float[np.ndarray, "*S"]) -> Float[np.ndarray, "*S"]:
+    """Return 3 t^2 - 2 t^3 with t = x clipped to [0, 1]."""
+    t = np.clip(x, 0, 1)
     return t * t * (3 - 2 * t)
 
 
 def mirrored(basis: Float[np.ndarray, "K V 3"], mirror: Int[np.ndarray, "V"]) -> Float[np.ndarray, "K V 3"]:
-    """The same displacements on the other side of the head: P diag(-1, 1, 1) E."""
+    """Return the mirror images of displacements or positions, P diag(-1, 1, 1) E.
+
+    Args:
+        basis: of the model, metres, the model's frame.
+        mirror: each vertex' mirror image, the permutation P.
+    """
     return basis[:, mirror] * FLIP

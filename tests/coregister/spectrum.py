@@ -1,5 +1,5 @@
-"""A head model whose every figure is known: components that are orthogonal to one another and to rigid motions on the
-head's skin, with standard deviations chosen here. Made from the small fixture's mesh and groups."""
+"""A head model with known statistics: components with given standard deviations, orthogonal to one another and to rigid
+motions over the head's skin. Based on the mesh and groups of the small fixture."""
 
 from dataclasses import replace
 
@@ -16,7 +16,7 @@ DEVIATIONS_MM = 0.5 * 0.7 ** np.arange(12)  # rms over the head's skin
 
 
 def spectrum_model(seed: int = 0) -> GNMData:
-    """Identity: 12 components on the head's skin. Expression: as many on the lower face, within its mask."""
+    """12 identity components on the head's skin, 12 expression components within the lower face's mask."""
     data = gnm_npz.read(TINY)
     skin = regions.head_skin(data)
     mask = regions.expression_regions(data)["lower_face"][1]
@@ -42,10 +42,10 @@ def with_identity(data: GNMData, basis: Float[np.ndarray, "K V 3"]) -> GNMData:
 def _basis(data: GNMData, weights: np.ndarray, seed: int) -> Float[np.ndarray, "K V 3"]:
     rows = np.flatnonzero(weights)
     rest = data.template_vertex_positions[rows].astype(np.float64)
-    drawn = np.random.default_rng(seed).standard_normal((len(DEVIATIONS_MM), len(rows), 3)) * weights[rows][:, None]
-    columns = np.concatenate([motion_fields(rest), drawn]).reshape(6 + len(drawn), -1).T
-    free = np.linalg.qr(columns)[0].T[6:].reshape(drawn.shape)
-    basis = np.zeros((len(drawn), *data.template_vertex_positions.shape))
+    fields = np.random.default_rng(seed).standard_normal((len(DEVIATIONS_MM), len(rows), 3)) * weights[rows][:, None]
+    columns = np.concatenate([motion_fields(rest), fields]).reshape(6 + len(fields), -1).T
+    free = np.linalg.qr(columns)[0].T[6:].reshape(fields.shape)
+    basis = np.zeros((len(fields), *data.template_vertex_positions.shape))
     basis[:, rows] = free * (DEVIATIONS_MM * 1e-3 * np.sqrt(len(rows)))[:, None, None]
     return basis
 

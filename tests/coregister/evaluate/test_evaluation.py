@@ -1,4 +1,4 @@
-"""The evaluation of models as a whole: known figures, gains, tables, what is refused, and people of the population."""
+"""Evaluation of models: known metrics, gains, tables, refused input, and subjects of the synthetic population."""
 
 import json
 from dataclasses import replace
@@ -26,18 +26,18 @@ def model():
     return spectrum_model()
 
 
-def people(model, count=4, seed=0):
-    """Samples of the model with two expressions each, whose tags and scans are known."""
+def random_subjects(model, count=4, seed=0):
+    """Random heads of the model with two expressions, tags and a scan each."""
     rng = np.random.default_rng(seed)
-    found = []
+    subjects = []
     for number in range(count):
         neutral = heads(model, rng.standard_normal((1, len(model.vertex_identity_basis))))[0]
-        acts = np.tensordot(rng.standard_normal((2, 12)), model.expression_basis, 1)
-        found.append(
+        displacements = np.tensordot(rng.standard_normal((2, 12)), model.expression_basis, 1)
+        subjects.append(
             HeldOutSubject(
                 subject=f"subject_{number}",
                 neutral=neutral,
-                expressions=neutral + acts,
+                expressions=neutral + displacements,
                 categories=("jaw", "lips"),
                 tags={
                     "gender": ("female", "male")[number % 2],
@@ -48,16 +48,16 @@ def people(model, count=4, seed=0):
                 scan=neutral[regions.head_skin(model)],
             )
         )
-    return found
+    return subjects
 
 
 @pytest.fixture(scope="module")
-def found(model):
-    return evaluate({"own": model}, people(model), model.triangles, SETTINGS)
+def result(model):
+    return evaluate({"own": model}, random_subjects(model), model.triangles, SETTINGS)
 
 
-def test_a_model_on_its_own_samples(model, found):
-    own = found.models["own"]
+def test_a_model_on_its_own_samples(model, result):
+    own = result.models["own"]
     assert own.identity.components == (2, 4, 8, 12)
     assert own.identity.at_components(12).max() < 1e-6
     means = [interval.mean for interval in own.identity.intervals]
@@ -66,7 +66,7 @@ def test_a_model_on_its_own_samples(model, found):
     assert own.scans is not None and own.scans.at_components(12).max() < 1e-2
     assert (
         own.scans.at_components(2) <= own.identity.at_components(2) + 1e-9
-    ).all()  # the surface is nearer than the vertex
+    ).all()  # the surface is at most as far as the vertex
     assert own.unconverged == 0
     skin = regions.head_skin(model)
     assert own.vertex_mm[skin].mean() == pytest.approx(own.identity.at_components(8).mean())
@@ -74,20 +74,27 @@ def test_a_model_on_its_own_samples(model, found):
     share = np.cumsum(DEVIATIONS_MM**2) / (DEVIATIONS_MM**2).sum()
     np.testing.assert_allclose(own.compactness["identity"].share, share, rtol=1e-6)
     assert own.compactness["identity"].rms_mm[-1] == pytest.approx(np.sqrt((DEVIATIONS_MM**2).sum()), rel=1e-6)
-    assert found.vertices == regions.head_skin(model).sum()
+    assert result.vertices == regions.head_skin(model).sum()
 
 
-def test_turned_and_moved_subjects_change_nothing(model, found):
-    turns = Rotation.random(4, random_state=1)
-    moved = []
-    for turn, one in zip(turns, people(model), strict=True):
+def test_metrics_do_not_depend_on_the_subjects_poses(model, result):
+    rotations = Rotation.random(4, random_state=1)
+    transformed = []
+    for rotation, subject in zip(rotations, random_subjects(model), strict=True):
 
-        def place(points, turn=turn):
-            return (turn.apply(points.reshape(-1, 3)) + (0.5, 1.0, -2.0)).reshape(points.shape)
+        def transform(points, rotation=rotation):
+            return (rotation.apply(points.reshape(-1, 3)) + (0.5, 1.0, -2.0)).reshape(points.shape)
 
-        moved.append(replace(one, neutral=place(one.neutral), expressions=place(one.expressions), scan=place(one.scan)))
-    again = evaluate({"own": model}, moved, model.triangles, SETTINGS).models["own"]
-    own = found.models["own"]
+        transformed.append(
+            replace(
+                subject,
+                neutral=transform(subject.neutral),
+                expressions=transform(subject.expressions),
+                scan=transform(subject.scan),
+            )
+        )
+    again = evaluate({"own": model}, transformed, model.triangles, SETTINGS).models["own"]
+    own = result.models["own"]
     np.testing.assert_allclose(again.identity.values_mm, own.identity.values_mm, atol=1e-6)
     np.testing.assert_allclose(again.scans.values_mm, own.scans.values_mm, rtol=2e-2, atol=1e-2)
     np.testing.assert_allclose(
@@ -99,14 +106,14 @@ def test_turned_and_moved_subjects_change_nothing(model, found):
         assert row.distance_mm.mean == pytest.approx(other.distance_mm.mean, abs=1e-6)
 
 
-def test_tables_count_subjects_and_split_them_by_what_they_share(model, found):
-    own = found.models["own"]
+def test_tables_group_subjects_by_region_category_and_tag(model, result):
+    own = result.models["own"]
     rows = {(row.kind, row.name): row for row in own.rows}
     assert {name for kind, name in rows if kind == "category"} == {"neutral", "jaw", "lips"}
     assert {name for kind, name in rows if kind == "age"} == {"20-29", "30-39", "60-69"}
     assert rows["age", "30-39"].subjects == 2 and rows["age", "20-29"].subjects == 1
     assert rows["age", "20-29"].distance_mm.low is None
-    assert "note" not in {kind for kind, _ in rows}  # everybody has another one
+    assert "note" not in {kind for kind, _ in rows}  # every subject has another one
     neutrals = own.identity.at_components(8)
     assert rows["gender", "female"].distance_mm.mean == pytest.approx(neutrals[::2].mean())
     assert rows["gender", "male"].distance_mm.mean == pytest.approx(neutrals[1::2].mean())
@@ -116,10 +123,9 @@ def test_tables_count_subjects_and_split_them_by_what_they_share(model, found):
 
 
 def test_gains_are_paired_and_of_the_same_number_of_components(model):
-    """The other model lacks the first component but has one more at the end: with k it leaves what k + 1 leave, and
-    the first."""
+    """The first model lacks the first component: its k components leave the residual of k + 1, and the first."""
     weak = with_identity(model, np.roll(model.vertex_identity_basis, -1, 0))
-    subjects = [replace(one, scan=None) for one in people(model, 12, seed=2)]
+    subjects = [replace(subject, scan=None) for subject in random_subjects(model, 12, seed=2)]
     settings = replace(SETTINGS, samples=0)
     result = evaluate({"weak": weak, "own": model, "same": weak}, subjects, model.triangles, settings)
     assert [(gain.model, gain.components) for gain in result.gains] == [
@@ -136,38 +142,41 @@ def test_gains_are_paired_and_of_the_same_number_of_components(model):
     assert result.models["own"].specificity is None
 
 
-def test_equal_seeds_make_equal_figures_that_fit_into_a_manifest(model, found):
-    again = evaluate({"own": model}, people(model), model.triangles, SETTINGS)
-    text = json.dumps(to_jsonable(found.metrics), allow_nan=False)
+def test_metrics_are_deterministic_and_serializable(model, result):
+    again = evaluate({"own": model}, random_subjects(model), model.triangles, SETTINGS)
+    text = json.dumps(to_jsonable(result.metrics), allow_nan=False)
     assert text == json.dumps(to_jsonable(again.metrics), allow_nan=False)
-    other = evaluate({"own": model}, people(model), model.triangles, replace(SETTINGS, seed=1))
-    assert other.models["own"].specificity.values_mm.tolist() != found.models["own"].specificity.values_mm.tolist()
+    other = evaluate({"own": model}, random_subjects(model), model.triangles, replace(SETTINGS, seed=1))
+    assert other.models["own"].specificity.values_mm.tolist() != result.models["own"].specificity.values_mm.tolist()
 
 
-def test_subjects_without_scans_or_expressions_have_no_such_figures(model):
-    bare = [replace(one, scan=None, expressions=one.expressions[:0], categories=()) for one in people(model)]
+def test_subjects_without_scans_or_expressions_have_no_such_metrics(model):
+    bare = [
+        replace(subject, scan=None, expressions=subject.expressions[:0], categories=())
+        for subject in random_subjects(model)
+    ]
     own = evaluate({"own": model}, bare, model.triangles, SETTINGS).models["own"]
     assert own.scans is None and own.expressions == {}
-    mixed = [people(model)[0], *bare[1:]]
+    mixed = [random_subjects(model)[0], *bare[1:]]
     own = evaluate({"own": model}, mixed, model.triangles, SETTINGS).models["own"]
     assert own.scans.intervals[0].low is None and np.isnan(own.scans.values_mm[1:]).all()
     assert len(own.expressions["lower_face"].intervals) == 4
 
 
-def spoiled(one, value):
-    neutral = one.neutral.copy()
+def with_value(subject, value):
+    neutral = subject.neutral.copy()
     neutral[5, 1] = value
-    return replace(one, neutral=neutral)
+    return replace(subject, neutral=neutral)
 
 
-BAD = {
+INVALID = {
     "no subjects": (lambda m, p, s: ({"m": m}, [], m.triangles, s), "too few held-out"),
     "one subject": (lambda m, p, s: ({"m": m}, p[:1], m.triangles, s), "too few held-out"),
     "a subject twice": (lambda m, p, s: ({"m": m}, [p[0], p[0]], m.triangles, s), "comes twice"),
     "no model": (lambda m, p, s: ({}, p, m.triangles, s), "no model"),
     "foreign topology": (lambda m, p, s: ({"m": m}, p, m.triangles[:, ::-1], s), "another topology"),
-    "NaN": (lambda m, p, s: ({"m": m}, [spoiled(p[0], np.nan), *p[1:]], m.triangles, s), "not finite"),
-    "infinite": (lambda m, p, s: ({"m": m}, [spoiled(p[0], np.inf), *p[1:]], m.triangles, s), "not finite"),
+    "NaN": (lambda m, p, s: ({"m": m}, [with_value(p[0], np.nan), *p[1:]], m.triangles, s), "not finite"),
+    "infinite": (lambda m, p, s: ({"m": m}, [with_value(p[0], np.inf), *p[1:]], m.triangles, s), "not finite"),
     "fewer vertices": (
         lambda m, p, s: (
             {"m": m},
@@ -201,15 +210,15 @@ BAD = {
 }
 
 
-@pytest.mark.parametrize("name", BAD)
-def test_what_cannot_be_evaluated_is_refused_before_any_work(model, name, monkeypatch):
+@pytest.mark.parametrize("name", INVALID)
+def test_invalid_input_is_refused_before_any_computation(model, name, monkeypatch):
     def never(*_, **__):
-        raise AssertionError("work was begun")
+        raise AssertionError("computation has started")
 
     monkeypatch.setattr(evaluation.linear_fit, "fit_correspondence", never)
-    make, what = BAD[name]
+    make, what = INVALID[name]
     with pytest.raises(InputError) as error:
-        evaluate(*make(model, people(model), SETTINGS))
+        evaluate(*make(model, random_subjects(model), SETTINGS))
     assert what in error.value.what
     assert all((error.value.where, error.value.expected, error.value.got, error.value.fix))
 
@@ -223,45 +232,47 @@ def test_a_model_of_the_official_size_on_its_own_samples():
     subjects = []
     for number in range(2):
         neutral = heads(data, rng.standard_normal((1, len(data.vertex_identity_basis))))[0]
-        move = np.tensordot(rng.standard_normal(len(members)), data.expression_basis[members].astype(np.float64), 1)
-        both = {"expressions": (neutral + move)[None], "categories": ("any",)}
+        displacement = np.tensordot(
+            rng.standard_normal(len(members)), data.expression_basis[members].astype(np.float64), 1
+        )
+        both = {"expressions": (neutral + displacement)[None], "categories": ("any",)}
         subjects.append(HeldOutSubject(subject=f"{number}", neutral=neutral, **both))
     settings = EvaluationSettings(components=(10, 20, 40), samples=0)
-    found = evaluate({"own": data}, subjects, data.triangles, settings).models["own"]
-    means = [interval.mean for interval in found.identity.intervals]
-    assert found.unconverged == 0 and means == sorted(means, reverse=True)
+    result = evaluate({"own": data}, subjects, data.triangles, settings).models["own"]
+    means = [interval.mean for interval in result.identity.intervals]
+    assert result.unconverged == 0 and means == sorted(means, reverse=True)
     assert means[0] > 0.2 and means[-1] < 1e-5
-    rows = {(row.kind, row.name): row.distance_mm.mean for row in found.rows}
+    rows = {(row.kind, row.name): row.distance_mm.mean for row in result.rows}
     assert rows["category", "any"] < 1e-5 and rows["category", "neutral"] < 1e-5
 
 
 @pytest.mark.slow
-def test_people_beyond_the_first_models_span(anatomy, model, model_file):
+def test_subjects_outside_the_first_models_span(anatomy, model, model_file):
     data, source = gnm_npz.read(model_file), anatomy.source
     rng = np.random.default_rng(12345)
-    acts = [expressions.named(name) for name in ("smile", "jaw_open", "brows_up")]
+    performed = [expressions.named(name) for name in ("smile", "jaw_open", "brows_up")]
 
-    def someone(number, draw):
+    def subject(number, draw):
         person = draw(source, rng)
         neutral, joints = anatomy.assemble(person, {name: source.target(name) for name in person.weights})
-        moved = np.stack([expressions.perform(anatomy, act, neutral, joints) for act in acts])
+        meshes = np.stack([expressions.perform(anatomy, expression, neutral, joints) for expression in performed])
         return HeldOutSubject(
             subject=f"{draw.__name__}_{number}",
             neutral=neutral,
-            expressions=moved,
-            categories=tuple(act.category for act in acts),
+            expressions=meshes,
+            categories=tuple(expression.category for expression in performed),
             tags=person.tags,
         )
 
     settings = EvaluationSettings(components=(10, 20, 40), samples=0)
     means = {}
     for draw in (population.sample_spanned_person, population.sample_unspanned_person):
-        result = evaluate({"first": data}, [someone(k, draw) for k in range(8)], data.triangles, settings)
-        figures = result.models["first"]
-        means[draw.__name__] = [interval.mean for interval in figures.identity.intervals]
-        assert figures.unconverged == 0
+        result = evaluate({"first": data}, [subject(k, draw) for k in range(8)], data.triangles, settings)
+        metrics = result.models["first"]
+        means[draw.__name__] = [interval.mean for interval in metrics.identity.intervals]
+        assert metrics.unconverged == 0
         for region in ("left_eye", "right_eye", "lower_face"):
-            assert figures.expressions[region].intervals[-1].mean < 0.15
+            assert metrics.expressions[region].intervals[-1].mean < 0.15
     spanned, unspanned = means["sample_spanned_person"], means["sample_unspanned_person"]
     assert spanned[-1] < 0.6  # 99.5 % of the variance leave 0.41 mm rms of the basis' own samples
     assert unspanned[1] > 1.2 and unspanned[-1] > 1.5 * spanned[-1]

@@ -1,4 +1,4 @@
-"""Fits to scans: known distances from a sphere and a plane, scans that only slide, and least squares as the judge."""
+"""Fits to scans: known distances from a plane and a sphere, sliding vertices, and the least-squares minimum."""
 
 import numpy as np
 import pytest
@@ -23,7 +23,7 @@ def grid(steps, size):
     return np.stack([x.ravel(), y.ravel(), np.zeros(steps * steps)], 1), triangles
 
 
-def start(count=0, pose=None):
+def initial(count=0, pose=None):
     return LinearFit(
         coefficients=np.zeros(count),
         T_model_world=np.eye(4) if pose is None else pose,
@@ -32,29 +32,29 @@ def start(count=0, pose=None):
     )
 
 
-def shifted(x, y, z, turn=(0, 0, 0)):
+def rigid(x, y, z, rotation=(0, 0, 0)):
     pose = np.eye(4)
-    pose[:3, :3], pose[:3, 3] = Rotation.from_rotvec(turn).as_matrix(), (x, y, z)
+    pose[:3, :3], pose[:3, 3] = Rotation.from_rotvec(rotation).as_matrix(), (x, y, z)
     return pose
 
 
-def spread(part, shape, count, seed):
+def surface_points(part, shape, count, seed):
     rng = np.random.default_rng(seed)
     face = rng.integers(0, len(part.triangles), count)
     return barycentric_points(shape, part.triangles, face, rng.dirichlet((1.0, 1.0, 1.0), count))
 
 
-def test_two_halves_of_a_scan_above_and_below_a_plane_are_as_far_as_they_are():
+def test_distances_of_a_scan_above_and_below_a_plane():
     vertices, triangles = grid(9, 0.2)
     part = LinearPart(
         rows=np.arange(len(vertices)), rest=vertices, basis=np.zeros((0, *vertices.shape)), triangles=triangles
     )
     rng = np.random.default_rng(0)
     points = np.c_[rng.uniform(-0.08, 0.08, (600, 2)), np.where(np.arange(600) % 2, 1e-3, -1e-3)]
-    found = fit_scan(part, points, [start(pose=shifted(0, 0, 4e-3, (0.05, -0.03, 0)))])[0]
-    assert found.converged
-    np.testing.assert_allclose(found.distance_mm, 1.0, atol=0.15)  # 600 points do not balance exactly: the plane leans
-    assert found.distance_mm.mean() == pytest.approx(1.0, abs=5e-3)
+    fit = fit_scan(part, points, [initial(pose=rigid(0, 0, 4e-3, (0.05, -0.03, 0)))])[0]
+    assert fit.converged
+    np.testing.assert_allclose(fit.distance_mm, 1.0, atol=0.15)  # 600 points do not balance exactly
+    assert fit.distance_mm.mean() == pytest.approx(1.0, abs=5e-3)
 
 
 def sphere(level=3):
@@ -65,7 +65,7 @@ def sphere(level=3):
     return vertices, np.asarray(mesh.faces)
 
 
-def test_a_sphere_of_another_size_is_as_far_as_its_radius_tells_until_a_component_gives_it_its_size():
+def test_the_distance_of_a_sphere_is_the_difference_of_radii_without_a_component_for_it():
     vertices, triangles = sphere()
     radial = vertices[None] / 0.1 * 1e-3  # a coefficient of one: 1 mm
     part = LinearPart(rows=np.arange(len(vertices)), rest=vertices, basis=radial, triangles=triangles)
@@ -74,8 +74,8 @@ def test_a_sphere_of_another_size_is_as_far_as_its_radius_tells_until_a_componen
     points *= 0.103 / np.linalg.norm(points, axis=1, keepdims=True)
     centre = np.array([0.004, -0.002, 0.003])
     points += centre
-    fixed, free = fit_scan(part, points, [start(0), start(1)])
-    faceted = 0.1 * 1e3 * 0.5 * (0.5 * 2 * np.sin(np.radians(63.4 / 8) / 2)) ** 2  # chords lie this much inside, about
+    fixed, free = fit_scan(part, points, [initial(0), initial(1)])
+    faceted = 0.1 * 1e3 * 0.5 * (0.5 * 2 * np.sin(np.radians(63.4 / 8) / 2)) ** 2  # chords are inside by about this
     assert fixed.converged and free.converged
     assert fixed.distance_mm.mean() == pytest.approx(3.0, abs=3 * faceted)
     assert free.distance_mm.mean() < faceted
@@ -88,51 +88,49 @@ def model():
     return spectrum_model()
 
 
-def test_a_scan_that_only_slides_along_a_head_of_the_model_is_at_no_distance(model):
+def test_sliding_along_the_surface_has_no_distance(model):
     part = linear_fit.identity_part(model)
-    wanted = np.random.default_rng(2).standard_normal(len(part.basis))
-    truth = heads(model, wanted[None])[0, part.rows]
-    pose = shifted(0.3, -0.2, 1.0, (0.4, 1.9, -0.3))
-    points = transform_points(pose, spread(part, truth, 3000, 3))
-    # The registration it starts from lies on the surface, but its vertices have slid: correspondence is wrong.
+    coefficients = np.random.default_rng(2).standard_normal(len(part.basis))
+    truth = heads(model, coefficients[None])[0, part.rows]
+    pose = rigid(0.3, -0.2, 1.0, (0.4, 1.9, -0.3))
+    points = transform_points(pose, surface_points(part, truth, 3000, 3))
+    # The initial guess is on the surface, but its vertices have slid: correspondence is wrong.
     slid = transform_points(pose, truth + np.random.default_rng(4).normal(0, 1e-3, truth.shape))
-    begin = linear_fit.fit_correspondence(part, slid, [12])
-    found = fit_scan(part, points, begin)[0]
-    assert begin[0].distance_mm.mean() > 0.3
-    assert found.converged
-    assert found.distance_mm.max() < 1e-3
-    np.testing.assert_allclose(found.coefficients, wanted, atol=1e-2)
+    guess = linear_fit.fit_correspondence(part, slid, [12])
+    fit = fit_scan(part, points, guess)[0]
+    assert guess[0].distance_mm.mean() > 0.3
+    assert fit.converged
+    assert fit.distance_mm.max() < 1e-3
+    np.testing.assert_allclose(fit.coefficients, coefficients, atol=1e-2)
 
 
-def test_the_fit_ends_where_least_squares_over_the_same_distances_ends(model):
+def test_fits_reach_the_least_squares_minimum(model):
     part = linear_fit.identity_part(model)
     rng = np.random.default_rng(5)
-    truth = part.shape(rng.standard_normal(12)) + rng.normal(0, 4e-4, part.rest.shape)  # of no model
-    points = spread(part, truth, 800, 6)
-    begin = linear_fit.fit_correspondence(part, truth, [4])
-    found = fit_scan(part, points, begin)[0]
-    assert found.converged
+    truth = part.shape(rng.standard_normal(12)) + rng.normal(0, 4e-4, part.rest.shape)  # outside the model
+    points = surface_points(part, truth, 800, 6)
+    guess = linear_fit.fit_correspondence(part, truth, [4])
+    fit = fit_scan(part, points, guess)[0]
+    assert fit.converged
 
-    def residual(unknown):
-        pose = shifted(*unknown[7:], unknown[4:7]) @ begin[0].T_model_world
-        return 1e3 * closest_points(transform_points(pose, points), part.shape(unknown[:4]), part.triangles)[0]
+    def residual(variables):
+        pose = rigid(*variables[7:], variables[4:7]) @ guess[0].T_model_world
+        return 1e3 * closest_points(transform_points(pose, points), part.shape(variables[:4]), part.triangles)[0]
 
     reference = least_squares(
-        residual, np.r_[begin[0].coefficients, np.zeros(6)], x_scale=np.r_[np.ones(4), 1e-2 * np.ones(6)]
+        residual, np.r_[guess[0].coefficients, np.zeros(6)], x_scale=np.r_[np.ones(4), 1e-2 * np.ones(6)]
     )
-    mean_square = (found.distance_mm**2).mean()
-    assert (
-        mean_square < 0.995 * (residual(np.r_[begin[0].coefficients, np.zeros(6)]) ** 2).mean()
-    )  # it did go somewhere
+    mean_square = (fit.distance_mm**2).mean()
+    assert mean_square < 0.995 * (residual(np.r_[guess[0].coefficients, np.zeros(6)]) ** 2).mean()  # the fit improved
     assert mean_square == pytest.approx(2 * reference.cost / len(points), rel=5e-3)
 
 
-def test_equal_seeds_make_equal_fits(model):
+def test_fits_are_deterministic(model):
     part = linear_fit.identity_part(model)
-    points = spread(part, part.rest, 6000, 7)  # more than a fit takes: some are drawn
-    begin = linear_fit.fit_correspondence(
+    points = surface_points(part, part.rest, 6000, 7)  # more than a fit uses
+    guess = linear_fit.fit_correspondence(
         part, part.rest + 1e-3 * np.random.default_rng(8).standard_normal(part.rest.shape), [4]
     )
-    one, two = (fit_scan(part, points, begin, seed=9)[0] for _ in range(2))
+    one, two = (fit_scan(part, points, guess, seed=9)[0] for _ in range(2))
     np.testing.assert_array_equal(one.coefficients, two.coefficients)
     assert len(one.distance_mm) == 6000

@@ -1,4 +1,4 @@
-"""A model out of registrations: the file, its manifest, and everything that is refused before any work."""
+"""Model building: the model file, its manifest, recipes, and input that is refused."""
 
 import json
 from dataclasses import fields, replace
@@ -20,9 +20,9 @@ from registration.model.gnm import GNM
 from registration.model.gnm_npz import AXES, GNMData
 from registration.types import Parameters, Registration
 from tests.conftest import SHARED, needs_shared
-from tests.coregister.next_model import known
+from tests.coregister.next_model import samples
 
-ACTS = ("smile", "jaw_open", "wink_left", "brows_up")
+EXPRESSIONS = ("smile", "jaw_open", "wink_left", "brows_up")
 CATEGORIES = {"smile": "flexing", "jaw_open": "jaw", "wink_left": "eyes", "brows_up": "eyebrows"}
 
 
@@ -37,7 +37,7 @@ def own_recipe() -> ModelRecipe:
 
 @pytest.fixture(scope="module")
 def subjects(anatomy, model) -> list[TrainingSubject]:
-    return known.people(anatomy, model, range(500, 508), ACTS)
+    return samples.subjects(anatomy, model, range(500, 508), EXPRESSIONS)
 
 
 @pytest.fixture(scope="module")
@@ -65,7 +65,7 @@ def test_all_23_fields_come_back_from_the_file(built: BuiltModel, files: Path, m
     assert sizes == [len(again.vertex_identity_basis), len(again.expression_basis)]
 
 
-def test_what_is_not_built_is_the_previous_models(built: BuiltModel, model):
+def test_everything_else_is_the_previous_models(built: BuiltModel, model):
     rebuilt = ("template", "identity", "expression", "joint_regressor")
     for field in fields(GNMData):
         if not any(word in field.name for word in rebuilt) and field.name != "extra":
@@ -78,84 +78,90 @@ def test_what_is_not_built_is_the_previous_models(built: BuiltModel, model):
     assert np.array_equal(built.data.vertex_identity_basis[-3:], model.vertex_identity_basis[-3:])
 
 
-def test_the_built_model_is_symmetric_mirrors_its_eyes_and_tells_its_joints(built: BuiltModel):
+def test_the_built_model_is_symmetric_and_its_regressor_gives_its_joints(built: BuiltModel):
     data = built.data
     for symmetric in (data.template_vertex_positions, data.template_joint_positions):
-        twins = symmetric[[0, 1, 3, 2] if len(symmetric) == 4 else data.mirror_indices] * (-1, 1, 1)
-        assert np.abs(twins - symmetric).max() <= 1e-7
+        mirror_images = symmetric[[0, 1, 3, 2] if len(symmetric) == 4 else data.mirror_indices] * (-1, 1, 1)
+        assert np.abs(mirror_images - symmetric).max() <= 1e-7
     left, right = (
         data.expression_basis[[n.startswith(f"{side}_eye_region") for n in data.expression_names.tolist()]]
         for side in ("left", "right")
     )
     assert len(left) and np.abs(right - left[:, data.mirror_indices] * (-1, 1, 1)).max() <= 1e-7
-    told = data.joint_regressor @ data.template_vertex_positions
-    assert np.abs(told - data.template_joint_positions).max() < 1e-6
-    told = np.einsum("jv,kvc->kjc", data.joint_regressor, data.vertex_identity_basis[:-3])
-    assert np.abs(told - data.joint_identity_basis[:-3]).max() < 1e-6
-    # Eyeballs turn about joints that went with them.
+    positions = data.joint_regressor @ data.template_vertex_positions
+    assert np.abs(positions - data.template_joint_positions).max() < 1e-6
+    basis = np.einsum("jv,kvc->kjc", data.joint_regressor, data.vertex_identity_basis[:-3])
+    assert np.abs(basis - data.joint_identity_basis[:-3]).max() < 1e-6
+    # The eye joints move with the eyeballs.
     for side, ball in enumerate(regions.eyeballs(data)):
-        moved = data.vertex_identity_basis[:-3][:, ball].mean(1)
-        assert np.abs(moved - data.joint_identity_basis[:-3, 2 + side]).max() < 1e-6
+        translation = data.vertex_identity_basis[:-3][:, ball].mean(1)
+        assert np.abs(translation - data.joint_identity_basis[:-3, 2 + side]).max() < 1e-6
 
 
-def _off_mm(data: GNMData, basis: np.ndarray, targets: list[np.ndarray]) -> float:
-    """rms over the skin of what least squares leave of displacements."""
+def _residual_mm(data: GNMData, basis: np.ndarray, targets: list[np.ndarray]) -> float:
+    """rms residual of displacements from a basis over the skin, by least squares."""
     skin = regions.exterior(data)
     flat = basis[:, skin].reshape(len(basis), -1).astype(np.float64).T
-    wanted = np.stack([target[skin].ravel() for target in targets], 1).astype(np.float64)
-    left = wanted - flat @ np.linalg.lstsq(flat, wanted, rcond=None)[0]
-    return float(1e3 * np.sqrt(3 * np.mean(left**2)))
+    right = np.stack([target[skin].ravel() for target in targets], 1).astype(np.float64)
+    residual = right - flat @ np.linalg.lstsq(flat, right, rcond=None)[0]
+    return float(1e3 * np.sqrt(3 * np.mean(residual**2)))
 
 
-def test_the_built_model_holds_what_it_was_built_from(built: BuiltModel, subjects, model):
-    """Neutrals, aligned as for the build, against the previous model with as many components; 99 % of expressions."""
+def test_the_built_model_represents_its_training_data(built: BuiltModel, subjects, model):
+    """Neutrals better than the previous model with as many components; expressions to 99 % of their energy."""
     heads = np.stack([subject.neutral.vertices for subject in subjects])
     aligned = align_neutrals(heads, np.ones(heads.shape[:2], np.float32), [s.name for s in subjects], model)
-    acts = [mesh.vertices - subject.neutral.vertices for subject in subjects for mesh in subject.expressions]
-    off = {}
+    displacements = [mesh.vertices - subject.neutral.vertices for subject in subjects for mesh in subject.expressions]
+    residual_mm = {}
     for name, data in (("previous", model), ("next", built.data)):
-        own = np.array(built.manifest["identity"]["components"])
-        away = [head - data.template_vertex_positions for head in aligned.vertices]
-        off[name] = _off_mm(data, data.vertex_identity_basis[:own], away), _off_mm(data, data.expression_basis, acts)
-    print(f"identity, expression: {off} mm")
-    assert off["next"][0] < 0.5 * off["previous"][0]
-    # Each region keeps its share, and the blends between them a little less.
-    energy = _off_mm(built.data, np.zeros((1, *acts[0].shape)), acts) ** 2
-    assert off["next"][1] ** 2 < 0.012 * energy
+        count = np.array(built.manifest["identity"]["components"])
+        deviations = [head - data.template_vertex_positions for head in aligned.vertices]
+        residual_mm[name] = (
+            _residual_mm(data, data.vertex_identity_basis[:count], deviations),
+            _residual_mm(data, data.expression_basis, displacements),
+        )
+    print(f"identity, expression: {residual_mm} mm")
+    assert residual_mm["next"][0] < 0.5 * residual_mm["previous"][0]
+    # Every region keeps its fraction of the energy; transitions between regions a little less.
+    energy = _residual_mm(built.data, np.zeros((1, *displacements[0].shape)), displacements) ** 2
+    assert residual_mm["next"][1] ** 2 < 0.012 * energy
 
 
-def test_the_manifest_tells_how_it_came_about(built: BuiltModel, files: Path, subjects, model):
-    told = json.loads(files.with_name("next.manifest.json").read_text())
-    assert told == built.manifest
-    assert [s["subject"] for s in told["subjects"]] == [s.name for s in subjects] and told["rejected"] == []
-    assert {s["expressions"] for s in told["subjects"]} == {4} and told["subjects"][0]["weight_of_each"] == 0.25
-    assert told["inputs"]["previous"] == gnm_npz.content_hash(model) and len(told["inputs"]) == 8 * 5 + 1
-    assert told["identity"]["share_previous"] == 0.2 and 0.99 <= told["identity"]["share_kept"] <= 1
-    assert told["identity"]["samples"] == 16 and told["identity"]["weight_of_each"] == 0.5
-    assert told["identity"]["shares_tried_mm"] == {} and told["config"]["identity"]["mirrored"] is True
-    assert told["identity"]["carried"] == ["eye_000", "eye_001", "eye_002"]
-    assert told["categories"] == dict.fromkeys(sorted(CATEGORIES.values()), 8)
-    assert sum(told["demographics"]["age"].values()) == 8 and told["demographics"]["gender"] == {"female": 4, "male": 4}
-    assert told["figures"]["lid_gap_change_mm"]["worst"] < 0.2 and 0 < told["figures"]["drift_mm"] < 10
-    assert told["versions"]["numpy"] == np.__version__ and told["config"]["identity"]["shrinkage"] == 0.2
+def test_the_manifest_contains_inputs_settings_and_metrics(built: BuiltModel, files: Path, subjects, model):
+    manifest = json.loads(files.with_name("next.manifest.json").read_text())
+    assert manifest == built.manifest
+    assert [s["subject"] for s in manifest["subjects"]] == [s.name for s in subjects] and manifest["rejected"] == []
+    assert {s["expressions"] for s in manifest["subjects"]} == {4} and manifest["subjects"][0]["weight_of_each"] == 0.25
+    assert manifest["inputs"]["previous"] == gnm_npz.content_hash(model) and len(manifest["inputs"]) == 8 * 5 + 1
+    assert manifest["identity"]["share_previous"] == 0.2 and 0.99 <= manifest["identity"]["share_kept"] <= 1
+    assert manifest["identity"]["samples"] == 16 and manifest["identity"]["weight_of_each"] == 0.5
+    assert manifest["identity"]["shares_tried_mm"] == {} and manifest["config"]["identity"]["mirrored"] is True
+    assert manifest["identity"]["carried"] == ["eye_000", "eye_001", "eye_002"]
+    assert manifest["categories"] == dict.fromkeys(sorted(CATEGORIES.values()), 8)
+    assert sum(manifest["demographics"]["age"].values()) == 8 and manifest["demographics"]["gender"] == {
+        "female": 4,
+        "male": 4,
+    }
+    assert manifest["figures"]["lid_gap_change_mm"]["worst"] < 0.2 and 0 < manifest["figures"]["drift_mm"] < 10
+    assert manifest["versions"]["numpy"] == np.__version__ and manifest["config"]["identity"]["shrinkage"] == 0.2
 
 
-def test_coefficients_and_landmarks_lie_beside_the_file(built: BuiltModel, files: Path):
-    with np.load(files.with_name("next.expressions.npz")) as beside:
-        names, mean, covariance = beside["names"], beside["mean"], beside["covariance"]
+def test_coefficients_and_landmark_schemes_are_written_beside_the_file(built: BuiltModel, files: Path):
+    with np.load(files.with_name("next.expressions.npz")) as arrays:
+        names, mean, covariance = arrays["names"], arrays["mean"], arrays["covariance"]
     assert names.tolist() == built.data.expression_names[: len(names)].tolist()
     assert mean.shape == (len(names),) and covariance.shape == (len(names),) * 2
     assert np.linalg.eigvalsh(covariance).min() > -1e-9
     assert sorted(landmarks.schemes_beside(files, len(built.data.template_vertex_positions))) == ["68", "dense", "oral"]
 
 
-def test_building_twice_gives_the_same(built: BuiltModel, subjects, model):
-    again = build_model(iter_again(subjects), model, true_meshes(), categories=CATEGORIES)
+def test_building_is_deterministic(built: BuiltModel, subjects, model):
+    again = build_model(_Reread(subjects), model, true_meshes(), categories=CATEGORIES)
     assert again.manifest == built.manifest
 
 
-class iter_again:
-    """Subjects as a loop reads them from disk: anew each time."""
+class _Reread:
+    """Subjects that are iterated again each time, as when they are read from disk."""
 
     def __init__(self, subjects: list[TrainingSubject]):
         self._subjects = subjects
@@ -164,60 +170,61 @@ class iter_again:
         return iter(list(self._subjects))
 
 
-def test_a_built_model_is_built_upon(built: BuiltModel, subjects):
+def test_a_built_model_can_be_the_previous_model(built: BuiltModel, subjects):
     again = build_model(subjects[:5], built.data)
     for names in (again.data.identity_names.tolist(), again.data.expression_names.tolist()):
         assert len(set(names)) == len(names)
     assert again.data.identity_names.tolist()[-3:] == ["eye_000", "eye_001", "eye_002"]
     assert again.data.expression_names.tolist()[-1] == built.data.expression_names.tolist()[-1] == "pupils_000"
     assert again.manifest["inputs"]["previous"] == built.manifest["content_id"]
-    # Joints that are told anew round after round stay where they are.
+    # Regressors that are rebuilt round after round keep the joints.
     one, two = built.data, again.data
-    told = two.joint_regressor @ one.template_vertex_positions
-    assert 1e3 * np.abs(told - one.template_joint_positions).max() < 0.5
+    positions = two.joint_regressor @ one.template_vertex_positions
+    assert 1e3 * np.abs(positions - one.template_joint_positions).max() < 0.5
 
 
-def test_the_previous_models_share_is_chosen_and_told(subjects, model):
+def test_shrinkage_is_cross_validated_and_reported(subjects, model):
     neutrals = [replace(subject, expressions=()) for subject in subjects]
-    told = build_model(neutrals, model, with_identity(max_components=10)).manifest["identity"]
-    tried = {float(share): rms for share, rms in told["shares_tried_mm"].items()}
-    assert len(tried) == 20 and told["share_previous"] == min(tried, key=tried.__getitem__)
-    assert told["components"] == 10 and 0 < tried[told["share_previous"]] < tried[0.0] < 10
+    manifest = build_model(neutrals, model, with_identity(max_components=10)).manifest["identity"]
+    scores = {float(shrinkage): rms for shrinkage, rms in manifest["shares_tried_mm"].items()}
+    assert len(scores) == 20 and manifest["share_previous"] == min(scores, key=scores.__getitem__)
+    assert manifest["components"] == 10 and 0 < scores[manifest["share_previous"]] < scores[0.0] < 10
 
 
-def test_without_expressions_the_previous_basis_stays(subjects, model):
+def test_without_expressions_the_previous_basis_is_kept(subjects, model):
     built = build_model([replace(subject, expressions=()) for subject in subjects], model)
     assert np.array_equal(built.data.expression_basis, model.expression_basis)
     assert built.coefficients is None and "previous" in built.manifest["expression"]
 
 
-def test_spoiled_meshes_are_left_out_and_named(subjects, model):
+def test_outliers_are_rejected_by_name(subjects, model):
     rng = np.random.default_rng(0)
-    spoiled = list(subjects)
+    damaged = list(subjects)
     noise = rng.normal(0, 2e-3, subjects[2].neutral.vertices.shape)
-    spoiled[2] = replace(subjects[2], neutral=known.mesh("neutral", subjects[2].neutral.vertices + noise, model))
-    bad = known.mesh("smile", subjects[5].expressions[0].vertices + noise, model)
-    spoiled[5] = replace(subjects[5], expressions=(bad, *subjects[5].expressions[1:]))
-    built = build_model(spoiled, model)
-    names = [one["name"] for one in built.manifest["rejected"]]
+    damaged[2] = replace(subjects[2], neutral=samples.mesh("neutral", subjects[2].neutral.vertices + noise, model))
+    bad = samples.mesh("smile", subjects[5].expressions[0].vertices + noise, model)
+    damaged[5] = replace(subjects[5], expressions=(bad, *subjects[5].expressions[1:]))
+    built = build_model(damaged, model)
+    names = [row["name"] for row in built.manifest["rejected"]]
     assert names == [subjects[2].name, f"{subjects[5].name}, smile"]
-    told = {one["subject"]: one for one in built.manifest["subjects"]}
-    assert len(told) == 7 and told[subjects[5].name]["expressions"] == 3
-    assert told[subjects[5].name]["weight_of_each"] == pytest.approx(1 / 3)
+    rows = {row["subject"]: row for row in built.manifest["subjects"]}
+    assert len(rows) == 7 and rows[subjects[5].name]["expressions"] == 3
+    assert rows[subjects[5].name]["weight_of_each"] == pytest.approx(1 / 3)
 
 
-def test_skin_that_no_camera_saw_follows_the_previous_model(subjects, model):
+def test_unobserved_skin_follows_the_previous_model(subjects, model):
     behind = model.template_vertex_positions[:, 2] < -0.02
-    broken = []
+    partial = []
     for subject in subjects:
         vertices = subject.neutral.vertices + np.float32(0.05) * behind[:, None]
-        broken.append(replace(subject, neutral=known.mesh("neutral", vertices, model, ~behind), expressions=()))
-    built = build_model(broken, model)
+        partial.append(replace(subject, neutral=samples.mesh("neutral", vertices, model, ~behind), expressions=()))
+    built = build_model(partial, model)
     clean = build_model([replace(subject, expressions=()) for subject in subjects], model)
-    away = np.linalg.norm(built.data.template_vertex_positions - clean.data.template_vertex_positions, axis=1)
+    difference = np.linalg.norm(built.data.template_vertex_positions - clean.data.template_vertex_positions, axis=1)
     skin = regions.exterior(model)
-    print(f"unseen {1e3 * away[skin & behind].mean():.2f} mm, seen {1e3 * away[skin & ~behind].mean():.2f} mm off")
-    assert away[skin & behind].mean() < 6e-3 and away[skin & ~behind].mean() < 1e-3
+    unobserved, observed = (difference[skin & part].mean() for part in (behind, ~behind))
+    print(f"unobserved {1e3 * unobserved:.2f} mm, observed {1e3 * observed:.2f} mm off")
+    assert unobserved < 6e-3 and observed < 1e-3
     assert built.manifest["filled"] == {"neutrals": 8, "expressions": 0}
 
 
@@ -246,12 +253,12 @@ def _foreign(subject: TrainingSubject) -> TrainingSubject:
 
 
 def _fewer(subject: TrainingSubject) -> TrainingSubject:
-    act = subject.expressions[1]
-    act = replace(act, vertices=act.vertices[:-1], confidence=act.confidence[:-1])
-    return replace(subject, expressions=(subject.expressions[0], act))
+    mesh = subject.expressions[1]
+    mesh = replace(mesh, vertices=mesh.vertices[:-1], confidence=mesh.confidence[:-1])
+    return replace(subject, expressions=(subject.expressions[0], mesh))
 
 
-def _unsure(subject: TrainingSubject) -> TrainingSubject:
+def _out_of_range(subject: TrainingSubject) -> TrainingSubject:
     return replace(subject, neutral=replace(subject.neutral, confidence=2 * subject.neutral.confidence))
 
 
@@ -260,19 +267,19 @@ def _unknown(subject: TrainingSubject) -> TrainingSubject:
 
 
 @pytest.mark.parametrize(
-    "spoil, what, got",
+    "damage, what, got",
     [
         (lambda s: replace(s, neutral=None), "no neutral", "4 expressions"),
         (_nan, "not finite", "1 NaN"),
         (_foreign, "another topology", "another order"),
         (_fewer, "another topology", "21912 vertices"),
-        (_unsure, "out of range", "2.0"),
+        (_out_of_range, "out of range", "2.0"),
         (_unknown, "label is unknown", "sneeze"),
     ],
 )
-def test_bad_subjects_are_refused_by_name(subjects, model, spoil, what, got):
+def test_invalid_subjects_are_refused_by_name(subjects, model, damage, what, got):
     with pytest.raises(InputError) as caught:
-        build_model([*subjects[:3], spoil(subjects[3])], model, categories=CATEGORIES)
+        build_model([*subjects[:3], damage(subjects[3])], model, categories=CATEGORIES)
     assert what in caught.value.what and subjects[3].name in caught.value.where and got in caught.value.got
     assert caught.value.expected and caught.value.fix
 
@@ -292,7 +299,7 @@ def test_too_few_samples_are_refused(subjects, model):
         build_model([subjects[0], subjects[0]], model)
 
 
-def test_a_registration_without_its_pose(model):
+def test_unposing_a_registration(model):
     function, rng = GNM(model), np.random.default_rng(0)
     pose = function.neutral()
     parameters = replace(
@@ -303,13 +310,13 @@ def test_a_registration_without_its_pose(model):
         scale=torch.tensor(1.1),
     )
     offsets = torch.as_tensor(rng.normal(0, 1e-3, model.template_vertex_positions.shape).astype(np.float32))
-    still = replace(parameters, rotations=pose.rotations, translation=pose.translation)
+    at_rest = replace(parameters, rotations=pose.rotations, translation=pose.translation)
     registration = _registration(parameters, offsets, function)
-    found = unpose(registration, function)
-    np.testing.assert_allclose(found, function(still, offsets).numpy(), atol=1e-7)
+    unposed = unpose(registration, function)
+    np.testing.assert_allclose(unposed, function(at_rest, offsets).numpy(), atol=1e-7)
     # Posing it again gives the registration.
     joints = parameters.scale * function.joints(parameters.identity)
-    again = function.pose(torch.as_tensor(found), joints, axis_angle_to_matrix(parameters.rotations))
+    again = function.pose(torch.as_tensor(unposed), joints, axis_angle_to_matrix(parameters.rotations))
     np.testing.assert_allclose(again + parameters.translation, registration.vertices, atol=2e-6)
 
 
@@ -332,13 +339,13 @@ def _registration(parameters: Parameters, offsets: torch.Tensor, function: GNM) 
 
 
 @needs_shared
-def test_the_official_schema_of_another_model_is_kept(tmp_path: Path):
-    """Float16 bases and all: neutrals drawn from the file itself."""
+def test_data_types_of_the_previous_model_are_kept(tmp_path: Path):
+    """Such as float16 bases. Neutrals are random heads of the file itself."""
     model = gnm_npz.read(SHARED / "data" / "gnm" / "gnm_head_reconstructed.npz")
     rng = np.random.default_rng(0)
-    heads = known.heads(model, rng.normal(size=(6, len(known.head_components(model)))))
+    heads = samples.heads(model, rng.normal(size=(6, len(samples.head_components(model)))))
     subjects = [
-        TrainingSubject(name=str(k), neutral=known.mesh("neutral", head, model)) for k, head in enumerate(heads)
+        TrainingSubject(name=str(k), neutral=samples.mesh("neutral", head, model)) for k, head in enumerate(heads)
     ]
     built = build_model(subjects, model)
     gnm_npz.write(built.data, tmp_path / "next.npz")

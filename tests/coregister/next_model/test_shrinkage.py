@@ -1,4 +1,4 @@
-"""The previous model's share by cross-validation, against doing it at full length."""
+"""Cross-validated shrinkage against explicit models of every fold."""
 
 import numpy as np
 import pytest
@@ -9,52 +9,55 @@ from registration.geometry.pca import principal_components
 SIZE = 60
 
 
-def _chosen(samples: np.ndarray, previous: np.ndarray, components: int) -> float:
+def _best(samples: np.ndarray, previous: np.ndarray, components: int) -> float:
     rows = np.concatenate([samples, previous])
     rms = cross_validated_shrinkage(rows @ rows.T, [np.arange(len(samples))], [True], components)
     return SHRINKAGE_GRID[int(rms.argmin())]
 
 
-@pytest.mark.parametrize("share", (0.0, 0.35, 0.95))
-def test_products_tell_what_building_anew_without_each_group_tells(share):
+@pytest.mark.parametrize("shrinkage", (0.0, 0.35, 0.95))
+def test_products_give_the_residuals_of_explicit_models(shrinkage):
     rng = np.random.default_rng(0)
     samples, previous = rng.normal(size=(13, SIZE)) + 5, rng.normal(size=(7, SIZE))
     rows = np.concatenate([samples, previous])
-    found = cross_validated_shrinkage(rows @ rows.T, [np.arange(13)], [True], 6, (share,))
+    rms = cross_validated_shrinkage(rows @ rows.T, [np.arange(13)], [True], 6, (shrinkage,))
     squares = 0.0
     for fold in range(FOLDS):
-        out = np.arange(13) % FOLDS == fold
-        mean = samples[~out].mean(0)
-        kept = samples[~out] - mean
-        stream = ShrunkCovariance(kept, np.ones(len(kept)), len(kept) - 1, previous, share)
+        excluded = np.arange(13) % FOLDS == fold
+        mean = samples[~excluded].mean(0)
+        kept = samples[~excluded] - mean
+        stream = ShrunkCovariance(kept, np.ones(len(kept)), len(kept) - 1, previous, shrinkage)
         basis = principal_components(stream, centred=False, most=6).components
-        for test in samples[out] - mean:
+        for test in samples[excluded] - mean:
             squares += ((test - np.linalg.lstsq(basis.T, test, rcond=None)[0] @ basis) ** 2).sum()
-    assert found[0] == pytest.approx(np.sqrt(squares / 13), rel=1e-5)
+    assert rms[0] == pytest.approx(np.sqrt(squares / 13), rel=1e-5)
 
 
-def test_parts_about_zero_are_left_out_together_with_those_about_a_mean():
+def test_both_parts_of_a_subject_are_excluded_together():
     rng = np.random.default_rng(1)
     even, odd, previous = np.zeros((11, SIZE)), np.zeros((11, SIZE)), np.zeros((4, SIZE))
     even[:, :30], odd[:, 30:] = rng.normal(size=(11, 30)) + 2, rng.normal(size=(11, 30))
     previous[:, :30] = rng.normal(size=(4, 30))
     rows = np.concatenate([even, odd, previous])
     both = cross_validated_shrinkage(rows @ rows.T, [np.arange(11), np.arange(11, 22)], [True, False], 100, (0.2,))
-    # All components there are: the remainders of both parts add up, for nothing of one part is in the other's span.
+    # With all components the residuals of both parts add up, since their spans are orthogonal.
     squares = 0.0
     for fold in range(FOLDS):
-        out = np.arange(11) % FOLDS == fold
-        mean = even[~out].mean(0)
-        for test, span in ((even[out] - mean, np.concatenate([even[~out] - mean, previous])), (odd[out], odd[~out])):
+        excluded = np.arange(11) % FOLDS == fold
+        mean = even[~excluded].mean(0)
+        for test, span in (
+            (even[excluded] - mean, np.concatenate([even[~excluded] - mean, previous])),
+            (odd[excluded], odd[~excluded]),
+        ):
             squares += ((test - test @ np.linalg.pinv(span) @ span) ** 2).sum()
     assert both[0] == pytest.approx(np.sqrt(squares / 11), rel=1e-6)
 
 
-def test_few_samples_of_the_previous_model_leave_it_much_and_many_others_little():
+def test_few_samples_of_the_previous_model_give_much_shrinkage_and_many_others_little():
     rng = np.random.default_rng(2)
     model = rng.normal(size=(15, SIZE)) * 0.8 ** np.arange(15)[:, None]
     other = rng.normal(size=(6, SIZE))
     few = rng.normal(size=(8, 15)) @ model
-    assert _chosen(few, model, 10) >= 0.5
+    assert _best(few, model, 10) >= 0.5
     many = rng.normal(size=(200, 6)) @ other
-    assert _chosen(many, model, 6) <= 0.1
+    assert _best(many, model, 6) <= 0.1
