@@ -28,7 +28,7 @@ from coregister.evaluate.specificity import specificity_mm
 from coregister.first_model import build as bootstrap
 from coregister.next_model.build import build_model
 from coregister.next_model.training_data import NEUTRAL, TrainingMesh, TrainingSubject
-from coregister.stopping_rule import Rule
+from coregister.stopping_rule import StoppingRule
 from coregister.synthetic.capture import Studio
 from registration.capture.scan import read_truth
 from registration.geometry.closest_point import barycentric_points
@@ -137,7 +137,7 @@ def main() -> None:
             RegisterOptions(recipe=options.recipe, seed=options.seed),
             components=COMPONENTS,
             samples=SAMPLES,
-            rule=Rule(rounds=options.rounds, failures=1.0, early=False),
+            rule=StoppingRule(max_rounds=options.rounds, max_failure_rate=1.0, early_stopping=False),
         )
         farm = options.out / "farm"
         url = default_url(farm)

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from coregister.next_model.build import BuiltModel, build_model
     from coregister.next_model.recipes import ModelRecipe, load_model_recipe
     from coregister.next_model.training_data import TrainingMesh, TrainingSubject
-    from coregister.stopping_rule import Rule as StoppingRule
+    from coregister.stopping_rule import StoppingRule
 
 __all__ = [
     "BuiltModel",

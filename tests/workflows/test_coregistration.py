@@ -17,7 +17,7 @@ import workflows.steps.stabilize
 import workflows.steps.subject
 from coregister.next_model.build import build_model
 from coregister.next_model.recipes import DEFAULT_MODEL_RECIPE, load_model_recipe
-from coregister.stopping_rule import Rule
+from coregister.stopping_rule import StoppingRule
 from registration.errors import InputError
 from registration.model import gnm_npz
 from registration.options import RegisterOptions
@@ -35,7 +35,7 @@ from workflows.pages import model
 from workflows.records.dataset import read_dataset, split
 from workflows.records.training_subjects import RegisteredSubjects
 
-TWICE = Rule(rounds=2, failures=1.0, early=False)
+TWICE = StoppingRule(max_rounds=2, max_failure_rate=1.0, early_stopping=False)
 
 
 @pytest.fixture
@@ -92,7 +92,7 @@ def test_two_rounds_without_those_who_are_held_out(dataset, finds, tmp_path):
         *("gnm_head.npz", "gnm_head.manifest.json", "gnm_head.expressions.npz", "head_sparse_68.txt"),
         *("index.html", "step.json"),
     }
-    assert record["verdict"] == {"go_on": False, "reason": "all 2 rounds done"}
+    assert record["verdict"] == {"proceed": False, "reason": "all 2 rounds done"}
     assert list(record["models"]) == list(record["generalization_mm"]) == ["model 0", "model 1", "model 2"]
     assert record["sources"] == {"p3": "true meshes", "p4": "true meshes"} and record["at"] == 2
     first, last = (json.loads((out / f"it0{k}/model/gnm_head.manifest.json").read_text()) for k in range(2))
@@ -117,7 +117,7 @@ def test_python_builds_the_same_model_from_the_same_registrations(dataset, finds
     contents = {}
     for name in (DEFAULT_MODEL_RECIPE, "true_meshes"):
         out = tmp_path / name
-        record = go(dataset, out, rule=Rule(rounds=1), model_recipe=name)
+        record = go(dataset, out, rule=StoppingRule(max_rounds=1), model_recipe=name)
         run = out / "it00" / "registrations"
         names = record["plan"]["split"]["training"]
         tags = {subject: found.tags(subject) for subject in names}
@@ -190,8 +190,8 @@ def test_one_failing_capture_does_not_stop_the_rest(dataset, finds, tmp_path):
     finds.outcomes = {"p0/smile": RuntimeError("out of luck"), "p1/neutral": ValueError("odd")}
     write_person(dataset / "p0" / "neutral", dataset / "p5", 5)
     with pytest.raises(JobFailed, match="it00: 3 of 8 captures failed"):
-        go(dataset, tmp_path / "out", rule=Rule(rounds=1))
-    state = go(dataset, tmp_path / "out", rule=Rule(rounds=1, failures=0.5))
+        go(dataset, tmp_path / "out", rule=StoppingRule(max_rounds=1))
+    state = go(dataset, tmp_path / "out", rule=StoppingRule(max_rounds=1, max_failure_rate=0.5))
     assert len(finds.made) == 5  # p0's neutral, and both of p2 and p5
     manifest = json.loads((tmp_path / "out/it00/model/gnm_head.manifest.json").read_text())
     assert [one["subject"] for one in manifest["subjects"]] == ["p0", "p2", "p5"]
@@ -204,7 +204,7 @@ def test_a_spoiled_registration_is_named(capture, finds, tmp_path):
     dataset = write_people(capture, tmp_path / "dataset", 9, acts=())
     rough = np.random.default_rng(0).normal(0, 8e-3, (1163, 3))
     finds.outcomes["p2/neutral"] = lambda vertices: vertices + rough
-    state = go(dataset, tmp_path / "out", rule=Rule(rounds=1))
+    state = go(dataset, tmp_path / "out", rule=StoppingRule(max_rounds=1))
     (rejected,) = state["rounds"][0]["build"]["rejected"]
     assert rejected["name"] == "p2" and state["rounds"][0]["decide"]["failed"] == 1
     for page in ("it00/model/index.html", "index.html"):
@@ -229,7 +229,7 @@ def test_neutrals_alone_will_do_and_bare_captures_are_measured_by_registrations(
                 (capture / "ground_truth.npz").unlink()
 
     finds.__class__ = type("Bare", (Finds,), {"__call__": with_truth})
-    state = go(dataset, tmp_path / "out", rule=Rule(rounds=1))
+    state = go(dataset, tmp_path / "out", rule=StoppingRule(max_rounds=1))
     assert state["sources"] == {"p3": "true meshes", "p4": "registrations"}
     assert state["rounds"][0]["stabilize"]["out"] is None
     manifest = json.loads((tmp_path / "out/it00/model/gnm_head.manifest.json").read_text())
@@ -312,7 +312,7 @@ def test_datasets_that_cannot_be_used_are_refused(dataset, finds, tmp_path, spoi
         ({"held_out": 1.5}, "fraction to hold out"),
         ({"held_out": 0.9}, "too few subjects to build"),
         ({"held_out": Path("nobody.txt")}, "cannot be read"),
-        ({"rule": Rule(rounds=0)}, "There is no round"),
+        ({"rule": StoppingRule(max_rounds=0)}, "There is no round"),
         ({"model": Path("none.npz")}, ""),
     ],
 )

@@ -60,7 +60,7 @@ def coregister(
         fit: How captures are registered.
         farm: Where the jobs are executed.
     """
-    from coregister.stopping_rule import Rule
+    from coregister.stopping_rule import StoppingRule
     from registration.progress import shown
     from workflows.engine.process import migrate
     from workflows.farm.coregistration import coregister, submit_coregistration
@@ -76,7 +76,7 @@ def coregister(
         model_recipe=rounds.model_recipe,
         held_out=_fraction_or_file(rounds.held_out),
         components=rounds.components or None,
-        rule=Rule(rounds=rounds.iterations, early=not rounds.all_iterations),
+        rule=StoppingRule(max_rounds=rounds.iterations, early_stopping=not rounds.all_iterations),
     )
     folder = farm.farm_folder(out)
     url = farm.url_for(folder)

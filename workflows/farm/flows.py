@@ -9,7 +9,7 @@ import json
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
-from coregister.stopping_rule import Verdict
+from coregister.stopping_rule import StoppingVerdict
 from registration.storage.records import structure, to_json
 from workflows.engine.jobs import (
     EXPRESSION_PRIORITY,
@@ -95,7 +95,7 @@ async def coregister(scope: "FlowScope", *, plan: str) -> dict[str, Any]:
     training, model = list(record.split.training), str(record.model)
     held_out = await _hold_out(scope, record)
     models, rounds = {FIRST_MODEL: model}, list[RoundProducts]()
-    for number in range(record.rule.rounds):
+    for number in range(record.rule.max_rounds):
         name = f"it{number:02d}"
         folder = f"{record.out}/{name}"
         run = f"{folder}/registrations"
@@ -145,18 +145,18 @@ async def coregister(scope: "FlowScope", *, plan: str) -> dict[str, Any]:
         )
         rounds.append(RoundProducts(name=name, stabilize=stabilized, build=built, evaluate=evaluated))
         verdict = await _end_round(scope, name, plan, held_out, rounds)
-        if not verdict.go_on:
+        if not verdict.proceed:
             break
     return {"rounds": len(rounds), "model": model, "reason": verdict.reason}
 
 
 async def _end_round(
     scope: "FlowScope", name: str, plan: str, held_out: HoldOutResult, rounds: Sequence[RoundProducts]
-) -> Verdict:
+) -> StoppingVerdict:
     """The stopping rule's verdict, in the record."""
     arguments = {"plan": plan, "people": held_out.to_json(), "rounds": to_json(rounds)}
     value = await _run_step(scope, f"{name}/decide", table.END_ROUND, **arguments)
-    verdict: Verdict = structure(value, Verdict, where=f"{name}/decide", title="verdict")
+    verdict: StoppingVerdict = structure(value, StoppingVerdict, where=f"{name}/decide", title="verdict")
     return verdict
 
 
@@ -201,7 +201,7 @@ async def _register(
     done = await scope.run(flows)
     total = sum(len(plan.captures[name]) for name in names)
     failed = total - sum(result["usable"] for result in done.values())
-    if failed > plan.rule.failures * total:
+    if failed > plan.rule.max_failure_rate * total:
         raise scope.park(f"{part}: {failed} of {total} captures failed; inspect them, then `gnmreg retry`")
 
 

@@ -5,7 +5,7 @@ from pathlib import Path
 
 from coregister.evaluate.linear_fit import identity_part
 from coregister.next_model.recipes import DEFAULT_MODEL_RECIPE, ModelRecipe, load_model_recipe
-from coregister.stopping_rule import Rule
+from coregister.stopping_rule import StoppingRule
 from registration.errors import InputError
 from registration.model import gnm_npz
 from registration.model.gnm_npz import GNMData
@@ -28,7 +28,7 @@ def make_plan(
     held_out: float | Path | None = None,
     components: Sequence[int] | None = None,
     samples: int = 200,
-    rule: Rule | None = None,
+    rule: StoppingRule | None = None,
 ) -> CoregistrationPlan:
     """Plan rounds of registration and model building over a dataset (docs/coregistration.md).
 
@@ -61,7 +61,7 @@ def make_plan(
         model_recipe=load_model_recipe(model_recipe),
         components=tuple(components or COMPONENTS),
         samples=samples,
-        rule=rule or Rule(),
+        rule=rule or StoppingRule(),
         split=division,
         captures={name: tuple(capture.root.name for capture in source.subjects[name].captures) for name in names},
         without_truth=tuple(name for name in division.held_out if not has_truths(source.subjects[name], data)),
@@ -73,8 +73,8 @@ def make_plan(
 
 def _check(plan: CoregistrationPlan, data: GNMData, requested: bool) -> None:
     """Refuse what a later step would refuse."""
-    if plan.rule.rounds < 1:
-        raise InputError("There is no round", where="iterations", expected="at least 1", got=plan.rule.rounds)
+    if plan.rule.max_rounds < 1:
+        raise InputError("There is no round", where="iterations", expected="at least 1", got=plan.rule.max_rounds)
     if list(plan.components) != sorted(set(plan.components)) or plan.components[0] < 1:
         raise InputError(
             "The numbers of components are out of order",

@@ -35,7 +35,7 @@ def write_coregistration_page(record: Mapping[str, Any]) -> str:
 def _lead(verdict: Mapping[str, Any] | None) -> str:
     if verdict is None:
         return "The first round is not done yet."
-    return ("It goes on: " if verdict["go_on"] else "It ended: ") + str(verdict["reason"]) + "."
+    return ("Continued: " if verdict["proceed"] else "Ended: ") + str(verdict["reason"]) + "."
 
 
 def _round(number: int, row: Mapping[str, Any], record: Mapping[str, Any], components: str) -> dict[str, Any]:

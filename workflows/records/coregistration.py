@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from coregister.next_model.recipes import ModelRecipe
-from coregister.stopping_rule import Round, Rule, Verdict
+from coregister.stopping_rule import RoundMetrics, StoppingRule, StoppingVerdict
 from registration.options import RegisterOptions
 from registration.storage.files import atomic_write_text, refuse_foreign
 from registration.storage.hashing import versions
@@ -43,7 +43,7 @@ class CoregistrationPlan(
     model_recipe: ModelRecipe
     components: tuple[int, ...]  # numbers of components that models are evaluated with
     samples: int  # random heads of each model, for specificity
-    rule: Rule
+    rule: StoppingRule
     split: Split
     captures: Mapping[str, tuple[str, ...]]  # subject -> folders of captures, the neutral's first
     without_truth: tuple[str, ...]  # held-out subjects whose captures have no true meshes
@@ -69,7 +69,7 @@ class RoundRecord(RoundProducts):
     """A round, with what the stopping rule was applied to."""
 
     register: Mapping[str, Mapping[str, CaptureResult]]  # subject -> capture -> its registration
-    decide: Round
+    decide: RoundMetrics
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -86,7 +86,7 @@ class CoregistrationState(
     generalization_mm: Curves = field(default_factory=dict)
     specificity_mm: Curves = field(default_factory=dict)
     at: int = 0  # the number of components that the stopping rule uses
-    verdict: Verdict | None = None
+    verdict: StoppingVerdict | None = None
     versions: Mapping[str, str] = field(default_factory=versions)
 
 

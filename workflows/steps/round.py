@@ -5,7 +5,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from coregister.stopping_rule import Round, decide
+from coregister.stopping_rule import RoundMetrics, apply_stopping_rule
 from registration.progress import Progress
 from registration.storage.records import structure, to_json
 from workflows.pages.coregistration import write_coregistration_page
@@ -39,7 +39,7 @@ def end_round(
         progress: unused; the step is short.
 
     Returns:
-        A `Verdict` as JSON.
+        A `StoppingVerdict` as JSON.
 
     Raises:
         InputError: the plan, an argument or a subject's record is malformed.
@@ -80,18 +80,18 @@ def apply_verdict(state: CoregistrationState, products: Sequence[RoundProducts])
         generalization_mm=latest.generalization_mm,
         specificity_mm=latest.specificity_mm,
         at=latest.at,
-        verdict=decide(first_mm, [round_.decide for round_ in rounds], plan.rule),
+        verdict=apply_stopping_rule(first_mm, [round_.decide for round_ in rounds], plan.rule),
     )
 
 
 def _metrics(
     product: RoundProducts, register: Mapping[str, Mapping[str, CaptureResult]], latest: EvaluateResult, number: int
-) -> Round:
+) -> RoundMetrics:
     """What the stopping rule needs of a round. All models are evaluated alike, in the latest evaluation."""
     generalization_mm = latest.generalization_mm[model_name(number)][str(latest.at)]
     assert generalization_mm is not None
     failed = sum(not capture.usable for captures in register.values() for capture in captures.values())
-    return Round(
+    return RoundMetrics(
         generalization_mm=generalization_mm,
         drift_mm=product.build.drift_mm,
         registered=product.build.registered,

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from coregister.next_model.recipes import few_registrations
-from coregister.stopping_rule import Rule
+from coregister.stopping_rule import StoppingRule
 from registration.options import RegisterOptions
 from tests.workflows.farm.inline import Inline
 from workflows.engine.jobs import Job
@@ -72,10 +72,10 @@ def test_without_a_neutral_nothing_else_is_registered() -> None:
 
 
 class Rounds:
-    """Answers of the steps of a coregistration; `go_on` says after which rounds it goes on."""
+    """Answers of the steps of a coregistration; `proceed` says after which rounds another one follows."""
 
-    def __init__(self, go_on: Sequence[bool], broken: Sequence[str] = ()) -> None:
-        self.go_on, self.broken = list(go_on), broken
+    def __init__(self, proceed: Sequence[bool], broken: Sequence[str] = ()) -> None:
+        self.proceed, self.broken = list(proceed), broken
 
     def __call__(self, job: Job) -> dict[str, Any]:
         if any(part in job.id for part in self.broken):
@@ -94,7 +94,7 @@ class Rounds:
                 input_hash="h", out="/o", components=(2,), at=2, generalization_mm={}, specificity_mm={}
             ).to_json()
         if job.step == "end round":
-            return {"go_on": self.go_on[len(job.arguments["rounds"]) - 1], "reason": "no gain"}
+            return {"proceed": self.proceed[len(job.arguments["rounds"]) - 1], "reason": "no gain"}
         return {}
 
 
@@ -109,7 +109,7 @@ def plan(tmp_path: Path) -> Path:
         model_recipe=few_registrations(),
         components=(2,),
         samples=0,
-        rule=Rule(rounds=3, failures=0.2),
+        rule=StoppingRule(max_rounds=3, max_failure_rate=0.2),
         split=Split(training=tuple(names[:4]), held_out=tuple(names[4:]), how=""),
         captures={name: ("rest", "smile") for name in names},
         without_truth=tuple(names[4:]),

@@ -40,14 +40,14 @@ def test_a_run_without_rounds_has_a_page_already():
 
 def test_rounds_link_to_their_results_and_failures_are_listed():
     curves = {"model 0": {"5": 1.5}, "model 1": {"5": 1.25}}
-    verdict = {"go_on": False, "reason": "no gain"}
+    verdict = {"proceed": False, "reason": "no gain"}
     page = write_coregistration_page(
         EMPTY | {"rounds": [a_round("it 00")], "generalization_mm": curves, "at": 5, "verdict": verdict, "lost": ["z<"]}
     )
     links = [link for link in re.findall(r'href="([^"]*)"', page) if not link.startswith("#")]
     folders = ("model", "evaluation", "registrations/stabilized")
     assert links == [f"it%2000/{folder}/index.html" for folder in folders]
-    for text in ("1.500 mm with 5 components", "<td>1.250</td>", "0.250", "It ended: no gain.", "z&lt;", "<svg"):
+    for text in ("1.500 mm with 5 components", "<td>1.250</td>", "0.250", "Ended: no gain.", "z&lt;", "<svg"):
         assert text in page, text
     for text in ("s&lt;1&gt;, smile", "&lt;off&gt;", "r&amp;r"):
         assert text in page, text

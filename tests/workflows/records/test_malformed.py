@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from coregister.next_model.recipes import few_registrations
-from coregister.stopping_rule import Rule
+from coregister.stopping_rule import StoppingRule
 from registration.errors import InputError
 from registration.model import gnm_npz
 from registration.options import RegisterOptions
@@ -45,7 +45,7 @@ PLAN = CoregistrationPlan(
     model_recipe=few_registrations(),
     components=(2,),
     samples=0,
-    rule=Rule(),
+    rule=StoppingRule(),
     split=Split(training=("ann",), held_out=("bob",), how="by the list"),
     captures={"ann": ("rest",), "bob": ("rest",)},
     without_truth=(),
