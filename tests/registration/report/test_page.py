@@ -164,13 +164,13 @@ def test_number_curves_have_a_panel_a_title_and_a_band_where_one_is_known():
 def test_remarks_name_what_was_left_out_and_what_lies_too_deep():
     row = {"template_vertices": 3, "template_max_mm": 1.0, "vertices_beyond_0.3mm": 2, "max_excess_mm": 0.83}
     figures = {
-        "notes": ["landmarks 2-6 of scheme 68 lie elsewhere than the model's: left out"],
+        "notes": ["landmarks 2-6 of scheme 68 do not fit the model's: excluded"],
         "views_not_trusted": {"cam03": "silhouette 35 px off the other views"},
         "intersections": {"pairs": {"tongue in gums": row, "ears in skin": {**row, "vertices_beyond_0.3mm": 0}}},
     }
     page = write_report(some_inputs(registration=a_registration(figures=figures)))
     assert "<li>View cam03 hardly counts: silhouette 35 px off the other views.</li>" in page
-    assert "<li>Landmarks 2-6 of scheme 68 lie elsewhere" in page
+    assert "<li>Landmarks 2-6 of scheme 68 do not fit" in page
     assert "<li>Tongue in gums: 2 vertices deeper than in the template, by up to 0.830 mm.</li>" in page
     assert "Ears in skin" not in page
     assert "<ul>" not in write_report(some_inputs())
