@@ -3,6 +3,7 @@
 import asyncio
 import json
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +17,7 @@ import workflows.steps.register
 import workflows.steps.stabilize
 import workflows.steps.subject
 from coregister.next_model.build import build_model
-from coregister.next_model.recipes import DEFAULT_MODEL_RECIPE, load_model_recipe
+from coregister.next_model.recipes import DEFAULT_MODEL_RECIPE, ModelRecipe, load_model_recipe, true_meshes
 from coregister.stopping_rule import StoppingRule
 from registration.errors import InputError
 from registration.model import gnm_npz
@@ -111,12 +112,17 @@ def test_two_rounds_without_those_who_are_held_out(dataset, finds, tmp_path):
     assert record["rounds"][0]["decide"]["registered"] == 6 and record["rounds"][0]["decide"]["failed"] == 0
 
 
+def own_recipe() -> ModelRecipe:
+    recipe = true_meshes()
+    return replace(recipe, name="own_recipe", identity=replace(recipe.identity, mirrored=False))
+
+
 def test_python_builds_the_same_model_from_the_same_registrations(dataset, finds, tmp_path):
     """`build_model` without a recipe, the step of `gnmreg coregister` without one, and each with the same one."""
     data, found = gnm_npz.read(MODEL), read_dataset(dataset)
     contents = {}
-    for name in (DEFAULT_MODEL_RECIPE, "true_meshes"):
-        out = tmp_path / name
+    for name in (DEFAULT_MODEL_RECIPE, "true_meshes", f"{__name__}:own_recipe"):
+        out = tmp_path / name.rpartition(":")[2]
         record = go(dataset, out, rule=StoppingRule(max_rounds=1), model_recipe=name)
         run = out / "it00" / "registrations"
         names = record["plan"]["split"]["training"]
@@ -126,9 +132,9 @@ def test_python_builds_the_same_model_from_the_same_registrations(dataset, finds
         built = build_model(subjects, data, recipe, categories=found.categories)
         manifest = json.loads((out / "it00/model/gnm_head.manifest.json").read_text())
         assert built.manifest == manifest and manifest["content_id"] == record["rounds"][0]["build"]["content_id"]
-        assert manifest["config"]["name"] == name
+        assert manifest["config"]["name"] == out.name
         contents[name] = manifest["content_id"]
-    assert contents[DEFAULT_MODEL_RECIPE] != contents["true_meshes"]
+    assert len(set(contents.values())) == 3
 
 
 @pytest.mark.parametrize("where", ["registering", "building", "evaluating"])
@@ -309,6 +315,8 @@ def test_datasets_that_cannot_be_used_are_refused(dataset, finds, tmp_path, spoi
         ({"components": (2, 60)}, "too few subjects for so many components"),
         ({"components": (4, 2)}, "out of order"),
         ({"options": RegisterOptions(recipe="magic")}, ""),
+        ({"model_recipe": "magic"}, "no such model recipe"),
+        ({"model_recipe": "no_module:recipe"}, "no such model recipe"),
         ({"held_out": 1.5}, "fraction to hold out"),
         ({"held_out": 0.9}, "too few subjects to build"),
         ({"held_out": Path("nobody.txt")}, "cannot be read"),
