@@ -6,7 +6,7 @@ from typing import Annotated
 
 from tyro.conf import Positional, arg
 
-from workflows.cli.options import FitOptions, Folder, ModelFile, RunOptions
+from workflows.cli.options import Folder, JobOptions, ModelFile, RunOptions
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -20,8 +20,8 @@ class RoundOptions:
         model_recipe: Settings of model building. few_registrations: vertices weighted by area, covariance shrinkage
             towards the previous model chosen by cross-validation. true_meshes: for meshes in exact correspondence.
             Or the import path of a function that returns a ModelRecipe, as in my_module:my_recipe.
-        held_out: Subjects to evaluate models on: a fraction of them such as 0.2, or a file with one subject
-            folder's name on each line.
+        held_out: Subjects to evaluate models on: a fraction such as 0.2, sampled with --seed, or a file with one
+            subject folder's name on each line.
         components: Numbers of identity components to evaluate models with; the largest is compared between rounds.
     """
 
@@ -35,7 +35,7 @@ class RoundOptions:
     components: Annotated[tuple[int, ...], arg(metavar="K", help_behavior_hint="(default: 5 10 20 40)")] = ()
 
 
-_FIT, _ROUNDS, _RUN = FitOptions(), RoundOptions(), RunOptions()
+_FIT, _ROUNDS, _RUN = JobOptions(), RoundOptions(), RunOptions()
 
 
 def coregister(
@@ -44,7 +44,7 @@ def coregister(
     model: ModelFile,
     out: Folder,
     rounds: RoundOptions = _ROUNDS,
-    fit: FitOptions = _FIT,
+    fit: JobOptions = _FIT,
     farm: RunOptions = _RUN,
 ) -> int:
     """Build a head model from a dataset in rounds: register, build, evaluate.
@@ -64,7 +64,7 @@ def coregister(
     from registration.progress import shown
     from workflows.engine.process import migrate
     from workflows.farm.coregistration import coregister, submit_coregistration
-    from workflows.farm.local import gpus_here
+    from workflows.farm.local import local_gpus
     from workflows.farm.plan import make_plan
     from workflows.records.coregistration import PAGE
 
@@ -84,7 +84,7 @@ def coregister(
         print(f"{submit_coregistration(url, plan)} is in the queue; see gnmreg status")
         return 0
     migrate(url)
-    gpus = gpus_here(None) if fit.variant == "cuda" else ()
+    gpus = local_gpus() if fit.variant == "cuda" else ()
     with shown() as progress:
         result = coregister(plan, url=url, folder=folder, workers=farm.workers, gpus=gpus, progress=progress)
     state = result.state

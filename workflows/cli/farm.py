@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 from tyro.conf import Positional, arg
 
 from registration.errors import InputError
-from workflows.cli.options import NOT_SET, FarmOptions, FitOptions, JobId, Port, RunName, RunOptions
+from workflows.cli.options import NOT_SET, FarmOptions, JobId, JobOptions, Port, RunName, RunOptions
 
 if TYPE_CHECKING:
     from workflows.engine.client import QueueClient
@@ -21,7 +21,7 @@ CAPTURES_PER_DAY = 10_000  # the throughput that status compares with
 REFRESH_S = 2.0
 MAX_REASONS = MAX_IDS = 20  # that are listed
 QueueName = Literal["gpu", "rebuild"]
-_FARM, _RUN, _FIT = FarmOptions(), RunOptions(), FitOptions()
+_FARM, _RUN, _FIT = FarmOptions(), RunOptions(), JobOptions()
 
 
 def worker(
@@ -97,7 +97,7 @@ def batch(
     model: Annotated[str, arg(metavar="NPZ|URL")],
     out: Annotated[str, arg(metavar="DIR|URL")],
     run: Annotated[str | None, arg(metavar="RUN", help_behavior_hint="(default: the name of the store)")] = None,
-    fit: FitOptions = _FIT,
+    fit: JobOptions = _FIT,
     farm: RunOptions = _RUN,
 ) -> int:
     """Register many independent captures through the queue.
@@ -113,7 +113,7 @@ def batch(
     from registration.progress import shown
     from workflows.engine.process import migrate
     from workflows.farm.batch import batch_jobs, submit_batch
-    from workflows.farm.local import LocalFarm, gpus_here, run_until_done
+    from workflows.farm.local import LocalFarm, local_gpus, run_until_done
 
     jobs = batch_jobs(captures, model=model, out=out, run=run, options=fit.register_options())
     folder = farm.farm_folder(out)
@@ -125,7 +125,7 @@ def batch(
     if not farm.local:
         return 0
     roots = (*jobs.roots, str(folder.resolve()))
-    gpus = gpus_here(None) if fit.variant == "cuda" else ()
+    gpus = local_gpus() if fit.variant == "cuda" else ()
     machine = LocalFarm(url=url, folder=folder, roots=roots, workers=farm.workers, gpus=gpus)
     with shown() as progress:
         result = run_until_done(machine, jobs.run, progress)
@@ -199,7 +199,7 @@ def debug(
         print(f"in the farm: {row.failure['status']}: {row.failure['reason']}")
     with shown() as progress:
         result = debug(row, out, progress, port=port if view else None)
-    print(f"{result.told}\n{out}", flush=True)
+    print(f"{result.summary}\n{out}", flush=True)
     if result.page is not None:
         print(f"Open {result.page.url} in a browser; stop with Ctrl-C.", flush=True)
         result.page.wait()

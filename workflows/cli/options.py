@@ -6,11 +6,11 @@ imported here, so that help stays fast.
 
 import os
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, fields
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated
 
-from tyro.conf import Positional, arg
+from tyro.conf import Positional, Suppress, arg
 
 from registration.errors import InputError
 from registration.options import RegisterOptions
@@ -39,25 +39,14 @@ OptionalModel = Annotated[Path | None, arg(metavar="NPZ", help_behavior_hint=NOT
 
 
 @dataclass(frozen=True, kw_only=True)
-class FitOptions:
-    """How captures are registered, wherever that is computed.
+class JobOptions(RegisterOptions):
+    """How jobs register captures: as in this process, but with the landmark files next to the model."""
 
-    Attributes:
-        recipe: Schedule of the fit. preview: seconds, small images. draft: minutes; shows whether a capture can be
-            used. studio: full quality. in_model: the model's parameters alone, without free offsets.
-        views: Use only this many views of each capture, spread around the head.
-        seed: Seed of the random number generators.
-        variant: Render on the CPU (llvm) or on NVIDIA GPUs (cuda).
-    """
-
-    recipe: Annotated[str, arg(metavar="NAME")] = "draft"
-    views: Annotated[int | None, arg(metavar="N", help_behavior_hint="(default: all)")] = None
-    seed: Seed = 0
-    variant: Literal["llvm", "cuda"] = "llvm"
+    landmark_files: Annotated[Mapping[str, Path], Suppress] = field(default_factory=dict)
 
     def register_options(self) -> RegisterOptions:
-        """Return the options of the registrations."""
-        return RegisterOptions(recipe=self.recipe, views=self.views, seed=self.seed, variant=self.variant)
+        """Return the library's options, whose type is part of input hashes."""
+        return RegisterOptions(**{item.name: getattr(self, item.name) for item in fields(RegisterOptions)})
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -1,4 +1,4 @@
-"""A batch: many captures, each registered by itself, as jobs of one run."""
+"""A batch: many independent captures, registered as the jobs of one run."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -16,11 +16,11 @@ from workflows.steps.job_options import to_job
 
 @dataclass(frozen=True, kw_only=True)
 class Batch:
-    """What goes into the queue."""
+    """The jobs of a run."""
 
     run: str
     jobs: tuple[Job, ...]
-    roots: tuple[str, ...]  # below which all its places lie
+    roots: tuple[str, ...]  # folders and URLs that contain all paths of the jobs
 
 
 def batch_jobs(
@@ -45,27 +45,27 @@ def batch_jobs(
             options cannot be used by a worker.
     """
     shared = {"model": _absolute(model), "store": _absolute(out), "options": to_json(to_job(options))}
-    places = [place for word in captures for place in _listed(word)]
-    if not places:
-        raise _wrong("There is nothing to register", where="CAPTURE", expected="captures", got="none")
+    locations = [location for word in captures for location in _expand(word)]
+    if not locations:
+        raise _input_error("There is nothing to register", where="CAPTURE", expected="captures", got="none")
     if not is_remote(model) and not local_path(model).is_file():
-        raise _wrong("The model is missing", where=model, expected="a GNM NPZ file", got="no such file")
+        raise _input_error("The model is missing", where=model, expected="a GNM NPZ file", got="no such file")
     name = run or PurePosixPath(out.rstrip("/")).name
-    names = _names([_absolute(place) for place in places])
+    by_key = _keys([_absolute(location) for location in locations])
     jobs = tuple(
         Job(
             id=check_id(f"{name}/{key}"),
             step=table.REGISTER_STORED,
-            arguments={"capture": place, "key": key, **shared},
+            arguments={"capture": location, "key": key, **shared},
         )
-        for key, place in names.items()
+        for key, location in by_key.items()
     )
-    inputs = {place.rpartition("/")[0] for place in (*names.values(), _absolute(model))}
+    inputs = {location.rpartition("/")[0] for location in (*by_key.values(), _absolute(model))}
     return Batch(run=check_id(name), jobs=jobs, roots=(*sorted(inputs), _absolute(out)))
 
 
 def submit_batch(url: str, batch: Batch) -> int:
-    """Put the jobs and their driver into the queue at `url`; what is there already stays. Returns how many jobs."""
+    """Put the jobs and their driver into the queue at `url`; existing ones are kept. Returns the number of jobs."""
     from workflows.engine.client import QueueClient
 
     queue = QueueClient(url)
@@ -73,41 +73,42 @@ def submit_batch(url: str, batch: Batch) -> int:
         count = queue.submit(batch.jobs)
         driver = FlowJob(id=batch.run, flow="batch", queue=DRIVER)
         queue.submit([driver])
-        queue.requeue([batch.run])  # it waits for what is new, if it had ended
+        queue.requeue([batch.run])  # a driver that had ended waits for the new jobs
     finally:
         queue.close()
     return count
 
 
-def _listed(word: str) -> list[str]:
+def _expand(word: str) -> list[str]:
     if not word.startswith("@"):
         return [word]
     file = Path(word[1:])
     try:
         return [line.strip() for line in file.read_text("utf-8").splitlines() if line.strip()]
     except (OSError, UnicodeDecodeError) as error:
-        expected = "a path or URL a line"
-        raise _wrong("The list of captures cannot be read", where=file, expected=expected, got=error) from None
+        expected = "one path or URL on each line"
+        raise _input_error("The list of captures cannot be read", where=file, expected=expected, got=error) from None
 
 
-def _names(places: Sequence[str]) -> Mapping[str, str]:
-    """Key -> place. A key is a place's last two folders, whatever else is in the batch: so it is always the same."""
-    for place in places:
-        if not is_remote(place) and not (local_path(place) / "capture.toml").is_file():
-            raise _wrong("A capture cannot be found", where=place, expected="a folder with capture.toml", got="none")
-    names: dict[str, str] = {}
-    for place in places:
-        key = "/".join(PurePosixPath(place).parts[-2:])
-        if key in names:
+def _keys(locations: Sequence[str]) -> Mapping[str, str]:
+    """Key -> location. The key is the last two folders: it does not depend on the other captures of the batch."""
+    for location in locations:
+        if not is_remote(location) and not (local_path(location) / "capture.toml").is_file():
+            expected = "a folder with capture.toml"
+            raise _input_error("A capture cannot be found", where=location, expected=expected, got="none")
+    by_key: dict[str, str] = {}
+    for location in locations:
+        key = "/".join(PurePosixPath(location).parts[-2:])
+        if key in by_key:
             expected = "captures that differ in the names of their last two folders"
-            raise _wrong("Two captures cannot be told apart", where=place, expected=expected, got=names[key])
-        names[key] = place
-    return names
+            raise _input_error("Two captures have the same key", where=location, expected=expected, got=by_key[key])
+        by_key[key] = location
+    return by_key
 
 
-def _absolute(place: str) -> str:
-    return place.rstrip("/") if is_remote(place) else str(local_path(place).resolve())
+def _absolute(location: str) -> str:
+    return location.rstrip("/") if is_remote(location) else str(local_path(location).resolve())
 
 
-def _wrong(what: str, *, where: object, expected: str, got: object) -> InputError:
+def _input_error(what: str, *, where: object, expected: str, got: object) -> InputError:
     return InputError(what, where=redact(str(where)), expected=expected, got=got, fix="correct the command")

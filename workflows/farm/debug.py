@@ -1,4 +1,4 @@
-"""A job of the farm once more, in the foreground: its inputs fetched, every stage drawn."""
+"""A job of the farm repeated in the foreground, with its inputs downloaded and an image of every stage."""
 
 from collections.abc import Mapping
 from contextlib import ExitStack
@@ -19,69 +19,75 @@ from workflows.steps.table import REGISTER, REGISTER_STORED, STEPS
 if TYPE_CHECKING:
     from workflows.web.fit_page import FitPage
 
-PICTURES = "stages"
+IMAGES = "stages"
 INPUTS = "inputs"
 
 
-def debug(row: JobRow, out: Path, progress: Progress, *, port: int | None = None) -> "Debugged":
-    """Run a job's step again here, with its results below `out` instead of where they belong.
+def debug(row: JobRow, out: Path, progress: Progress, *, port: int | None = None) -> "DebugResult":
+    """Execute a job's step in this process, with its results below `out`.
 
-    Registrations leave a picture and the mesh of the fit at its start and after each stage in `out/stages`, and their
-    folder in `out/registration`; a capture from a URL is kept in `out/inputs`. With `port`, a page shows the fit there
-    while it runs, and until it is closed.
+    Registrations write an image and the mesh of the fit at its start and after each stage into `out/stages`, and their
+    folder to `out/registration`; a capture from a URL is kept in `out/inputs`.
+
+    Args:
+        row: the job.
+        out: a new or empty folder.
+        progress: where to report to.
+        port: of a page that shows the fit until it is closed; None: no page.
 
     Raises:
-        InputError: no job but a flow, `out` holds something, a page of what is no registration, or whatever the step
-            itself refuses.
+        InputError: the row is a flow, `out` is not empty, a page is requested for another step than a registration,
+            or an error of the step itself.
     """
     if row.kind != "job":
-        raise _wrong(row.id, expected="a job", got="a flow: see its jobs with `gnmreg status`")
+        raise _input_error(row.id, expected="a job", got="a flow: see its jobs with `gnmreg status`")
     if out.exists() and any(out.iterdir()):
-        raise _wrong(str(out), expected="a new or empty folder", got="one that holds something")
+        raise _input_error(str(out), expected="a new or empty folder", got="one with files in it")
     validate_arguments(row.spec, STEPS, roots=("/", "s3:/"))  # the operator chose it: any path will do
     name, arguments = row.spec["step"], row.spec["arguments"]
     if name in (REGISTER, REGISTER_STORED):
         return _register(arguments, out, progress, port)
     if port is not None:
-        raise _wrong(row.id, expected="a registration, to be viewed", got=f"the step {name!r}: leave out --view")
+        raise _input_error(row.id, expected="a registration", got=f"the step {name!r}, which --view cannot show")
     step = STEPS[name]
     changed = {"out": str(out / "product")} if "out" in step.path_arguments else {}
-    return Debugged(told=str(function_of(step.function)(**{**arguments, **changed}, progress=progress)))
+    return DebugResult(summary=str(function_of(step.function)(**{**arguments, **changed}, progress=progress)))
 
 
 @dataclass(frozen=True, kw_only=True)
-class Debugged:
-    """What came of it, and the page if there is one."""
+class DebugResult:
+    """The step's result, and the page if there is one."""
 
-    told: str
+    summary: str  # the result as text
     page: "FitPage | None" = None
 
 
-def _register(arguments: Mapping[str, Any], out: Path, progress: Progress, port: int | None) -> Debugged:
+def _register(arguments: Mapping[str, Any], out: Path, progress: Progress, port: int | None) -> DebugResult:
     from registration.pipeline import register
 
-    place = str(arguments["capture"])
-    if is_remote(place):
-        progress.note(f"fetching {place}")
-        fetch_folder(place, out / INPUTS / local_path(place).name)
-        place = str(out / INPUTS / local_path(place).name)
+    location = str(arguments["capture"])
+    if is_remote(location):
+        copy = out / INPUTS / local_path(location).name
+        progress.note(f"downloading {location}")
+        fetch_folder(location, copy)
+        location = str(copy)
     neutral = arguments.get("neutral")
-    with ExitStack() as until_done, fetch_capture(place) as capture:
+    with ExitStack() as on_failure, fetch_capture(location) as capture:
         model = fetch_model(str(arguments["model"]))
-        page = None if port is None else _page(out / PICTURES, capture, model, port, progress)
+        page = None if port is None else _page(out / IMAGES, capture, model, port, progress)
         if page is not None:
-            until_done.callback(page.close)
+            on_failure.callback(page.close)
         result = register(
             capture,
             model,
             out / REGISTRATION,
             from_job(arguments.get("options")),
             neutral=None if neutral is None else Path(neutral),
-            pictures=out / PICTURES,
+            pictures=out / IMAGES,
             progress=progress,
         )
-        until_done.pop_all()  # the page stays
-    return Debugged(told=f"{result.status}: {result.reason}", page=page)
+        on_failure.pop_all()  # the page stays open
+    return DebugResult(summary=f"{result.status}: {result.reason}", page=page)
 
 
 def _page(stages: Path, capture: Path, model: Path, port: int, progress: Progress) -> "FitPage":
@@ -94,5 +100,7 @@ def _page(stages: Path, capture: Path, model: Path, port: int, progress: Progres
     return page
 
 
-def _wrong(where: str, *, expected: str, got: str) -> InputError:
-    return InputError("This cannot be debugged", where=where, expected=expected, got=got, fix="choose another")
+def _input_error(where: str, *, expected: str, got: str) -> InputError:
+    return InputError(
+        "The job cannot be debugged", where=where, expected=expected, got=got, fix="choose another job or folder"
+    )

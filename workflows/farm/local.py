@@ -5,7 +5,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -131,10 +131,8 @@ class _Processes:
         )
 
 
-def gpus_here(requested: Sequence[int] | None) -> tuple[int, ...]:
-    """Return the GPUs to use: the requested ones, or all that the driver lists."""
-    if requested:
-        return tuple(requested)
+def local_gpus() -> tuple[int, ...]:
+    """Return the numbers of the GPUs that the driver lists."""
     try:
         listed = subprocess.run(["nvidia-smi", "-L"], capture_output=True, text=True, check=True, timeout=30).stdout
     except (OSError, subprocess.SubprocessError):

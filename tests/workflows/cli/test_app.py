@@ -1,114 +1,19 @@
-import importlib
-import inspect
-import re
-import subprocess
-import sys
+"""Commands hand their arguments to the library once, and report bad input without a traceback."""
+
 from pathlib import Path
 from types import SimpleNamespace
-from typing import get_args
 
 import pytest
 
-import workflows.cli
 import workflows.steps.subject
 from registration import pipeline
-from registration.fit.recipes import RECIPES
 from registration.options import RegisterOptions
 from tests.conftest import FIXTURES
 from tests.registration.capture.small import make
-from workflows.cli.app import COMMANDS, main
-from workflows.cli.farm import QueueName
-from workflows.engine.jobs import GPU, REBUILD
+from workflows.cli.app import main
 from workflows.records.subject import CaptureRow, SubjectRecord
 
-CLI = Path(workflows.cli.__file__).parent
 TINY_MODEL = FIXTURES / "tiny_gnm.npz"
-HEAVY = {"torch", "mitsuba", "drjit", "numpy", "scipy", "cv2", "pycolmap", "kornia", "trimesh", "matplotlib", "viser"}
-HEAVY |= {"dbos", "sqlalchemy", "jinja2"}
-
-
-@pytest.mark.parametrize("command", ["", "capture", "dataset", "model", "store", *COMMANDS])
-def test_every_command_explains_itself(command: str, capsys: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(SystemExit) as stop:
-        main([*command.split(), "--help"])
-    assert stop.value.code == 0
-    assert f"usage: gnmreg {command}".strip() in capsys.readouterr().out
-
-
-@pytest.mark.parametrize("command", COMMANDS)
-def test_help_explains_every_option_where_it_is_shown(
-    command: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setenv("COLUMNS", "1000")
-    with pytest.raises(SystemExit):
-        main([*command.split(), "--help"])
-    text = re.sub(r"[│ ]*\n[│ ] {10,}(?=\w)", " ", capsys.readouterr().out)  # help below a long option
-    rows = re.findall(r"^[│ ]{2,}((?:--?[a-z]|[A-Z]+ ).*)$", text, re.MULTILINE)
-    assert len(rows) > (command != "model fetch")
-    assert all(re.search(r"[a-z] [a-z]", row) for row in rows), rows  # words, not only a name and a default
-    assert not re.search(r"(?i)\bas for\b|default: \)", text)
-
-
-def test_the_overview_lists_every_command_once_in_its_group(capsys: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(SystemExit):
-        main(["-h"])
-    text = capsys.readouterr().out
-    listed = re.findall(r"^  (\w+(?: \w+)?)  +\S", text, re.MULTILINE)
-    assert listed == [*COMMANDS]
-    assert re.findall(r"^([A-Z][a-z]+)$", text, re.MULTILINE) == ["Capture", "Register", "Model", "Farm"]
-
-
-def test_every_function_of_the_command_modules_is_a_command() -> None:
-    modules = [importlib.import_module(f"workflows.cli.{path.stem}") for path in CLI.glob("[!_]*.py")]
-    public = {
-        function
-        for module in modules
-        if module.__name__ not in ("workflows.cli.app", "workflows.cli.options")
-        for name, function in inspect.getmembers(module, inspect.isfunction)
-        if function.__module__ == module.__name__ and not name.startswith("_")
-    }
-    assert public == {*COMMANDS.values()}
-
-
-def test_summaries_fit_into_the_overview() -> None:
-    summaries = {name: (inspect.getdoc(command) or "").splitlines()[0] for name, command in COMMANDS.items()}
-    assert {name: text for name, text in summaries.items() if not 20 < len(text) <= 80} == {}
-
-
-@pytest.mark.parametrize("words", ["registr", "capture synht", "capture"])
-def test_unknown_commands_show_what_there_is(words: str, capsys: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(SystemExit) as stop:
-        main(words.split())
-    error = capsys.readouterr().err
-    assert stop.value.code == 2
-    assert "capture synth" in error and ("similar: " in error) == (words != "capture")
-
-
-def test_recipes_and_queues_in_the_help_are_those_that_exist(
-    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setenv("COLUMNS", "300")
-    for command in ("register", "subject", "batch", "coregister"):
-        with pytest.raises(SystemExit):
-            main([command, "--help"])
-        row = re.search(r"--recipe.*?--views", capsys.readouterr().out, re.DOTALL)
-        assert row and all(f"{name}: " in row[0] for name in RECIPES)
-    assert set(get_args(QueueName)) == {GPU, REBUILD}
-
-
-@pytest.mark.parametrize("command", ["", "register", "coregister", "worker"])
-def test_help_imports_nothing_heavy(command: str) -> None:
-    code = """
-import sys
-from workflows.cli.app import main
-try:
-    main([*sys.argv[1:], "--help"])
-finally:
-    print("MODULES", *sys.modules, file=sys.stderr)
-"""
-    run = subprocess.run([sys.executable, "-c", code, *command.split()], capture_output=True, text=True, check=True)
-    assert "usage: gnmreg" in run.stdout
-    assert HEAVY.isdisjoint(run.stderr.split("MODULES")[1].split())
 
 
 @pytest.mark.parametrize(
@@ -123,7 +28,9 @@ def test_wrong_arguments_stop_with_code_2(arguments: str, capsys: pytest.Capture
 
 
 @pytest.mark.parametrize("pair", ["68", "68=", "=file.txt"])
-def test_input_error_is_told_without_a_traceback(pair: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_input_errors_are_printed_without_a_traceback(
+    pair: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     out = tmp_path / "out"
     assert main(["register", str(tmp_path), "--model", "m.npz", "--out", str(out), "--landmarks", pair]) == 2
     error = capsys.readouterr().err
@@ -146,11 +53,11 @@ def test_input_error_is_told_without_a_traceback(pair: str, tmp_path: Path, caps
         ("--target nose/nose-hump-incr=nan", "weight is out of range"),
     ],
 )
-def test_bad_studios_are_told_before_any_work(
+def test_bad_studios_are_refused_before_any_work(
     flags: str, what: str, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "empty"))
-    monkeypatch.setenv("PIP_NO_INDEX", "1")  # neither model nor population can be had: they must not be asked for
+    monkeypatch.setenv("PIP_NO_INDEX", "1")  # neither model nor population is available: they must not be needed
     assert main(["capture", "synth", str(tmp_path / "capture"), *flags.split()]) == 2
     error = capsys.readouterr().err
     assert what in error and "fix:" in error and "Traceback" not in error
@@ -171,7 +78,7 @@ def test_a_seed_is_a_number(tmp_path: Path, capsys: pytest.CaptureFixture[str]) 
     assert "--seed" in capsys.readouterr().err
 
 
-def test_model_info_tells_and_draws(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_model_info_prints_and_draws(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     picture = tmp_path / "model.png"
     assert main(["model", "info", str(TINY_MODEL), "--out", str(picture)]) == 0
     assert "vertices" in capsys.readouterr().out
@@ -186,7 +93,7 @@ def test_model_info_tells_and_draws(tmp_path: Path, capsys: pytest.CaptureFixtur
         "evaluate {missing} --capture {missing}",
     ],
 )
-def test_missing_input_is_told_and_nothing_is_written(
+def test_missing_input_is_refused_and_nothing_is_written(
     command: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     missing, out = tmp_path / "missing", tmp_path / "out.png"
@@ -216,11 +123,11 @@ def test_unknown_recipes_stop_with_code_2(command: str, tmp_path: Path, capsys: 
     assert not out.exists()
 
 
-def test_capture_check_tells_and_draws(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_capture_check_prints_and_draws(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     capture, sheet = make(tmp_path / "capture"), tmp_path / "sheet.png"
     assert main(["capture", "check", str(capture), "--out", str(sheet)]) == 0
-    told = capsys.readouterr().out
-    assert "5 views, all checks passed" in told and str(sheet) in told
+    text = capsys.readouterr().out
+    assert "5 views, all checks passed" in text and str(sheet) in text
     assert sheet.read_bytes().startswith(b"\x89PNG")
 
 
@@ -234,7 +141,7 @@ def test_capture_degrade_applies_the_faults(tmp_path: Path, capsys: pytest.Captu
 
 
 @pytest.mark.parametrize("pair", ["cam03", "cam03=", "=black"])
-def test_malformed_breaks_are_told(pair: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_malformed_faults_are_refused(pair: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["capture", "degrade", str(tmp_path / "source"), str(tmp_path / "target"), "--break", pair]) == 2
     error = capsys.readouterr().err
     assert "VIEW=FAULT" in error and pair in error and "fix:" in error and "Traceback" not in error
@@ -258,21 +165,21 @@ def test_unknown_presets_stop_with_code_2(tmp_path: Path, capsys: pytest.Capture
 
 
 @pytest.mark.parametrize("status, code", [("converged", 0), ("stopped", 0), ("failed", 1)])
-def test_register_passes_every_argument_on(
+def test_register_hands_over_every_argument(
     status: str, code: int, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """The library's own work is tested in tests/register; here only what the command hands over and makes of it."""
-    heard = {}
+    """The library's own work is tested in tests/registration/register; here only arguments, output and exit code."""
+    received = {}
 
-    def listen(capture: Path, model: Path, out: Path, options: RegisterOptions, **settings) -> SimpleNamespace:
-        heard.update(settings, capture=capture, model=model, out=out, options=options)
+    def record(capture: Path, model: Path, out: Path, options: RegisterOptions, **settings) -> SimpleNamespace:
+        received.update(settings, capture=capture, model=model, out=out, options=options)
         return SimpleNamespace(status=status, reason="because")
 
-    monkeypatch.setattr(pipeline, "register", listen)
+    monkeypatch.setattr(pipeline, "register", record)
     flags = "--recipe studio --views 7 --seed 3 --neutral N --deterministic --force --variant cuda --landmarks 68=a 5=b"
     assert main(["register", "C", "--model", "M.npz", "--out", "O", *flags.split()]) == code
-    heard.pop("progress").note("told")
-    assert heard == {
+    received.pop("progress").note("a message")
+    assert received == {
         "capture": Path("C"),
         "model": Path("M.npz"),
         "out": Path("O"),
@@ -287,9 +194,9 @@ def test_register_passes_every_argument_on(
             landmark_files={"68": Path("a"), "5": Path("b")},
         ),
     }
-    told = capsys.readouterr()
-    assert told.out == f"{status}: because\nO\n"
-    assert "told" in told.err
+    printed = capsys.readouterr()
+    assert printed.out == f"{status}: because\nO\n"
+    assert "a message" in printed.err
 
 
 @pytest.mark.parametrize(
@@ -302,24 +209,24 @@ def test_register_passes_every_argument_on(
         (("error", "skipped"), 2),
     ],
 )
-def test_subject_passes_every_argument_on(
+def test_subject_hands_over_every_argument(
     statuses: tuple, code: int, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """The loop itself is tested in test_subject.py."""
-    heard = {}
+    received = {}
 
-    def listen(subject: Path, model: Path, out: Path, options: RegisterOptions, **settings) -> SubjectRecord:
-        heard.update(settings, subject=subject, model=model, out=out, options=options)
+    def record(subject: Path, model: Path, out: Path, options: RegisterOptions, **settings) -> SubjectRecord:
+        received.update(settings, subject=subject, model=model, out=out, options=options)
         rows = tuple(
             CaptureRow(name=f"c{i}", expression="", status=s, reason="because") for i, s in enumerate(statuses)
         )
         return SubjectRecord(subject="anna", model="ab", recipe="draft", neutral="c0", rows=rows)
 
-    monkeypatch.setattr(workflows.steps.subject, "register_subject", listen)
+    monkeypatch.setattr(workflows.steps.subject, "register_subject", record)
     flags = "--recipe studio --views 7 --seed 3 --neutral N --deterministic --force --variant cuda --landmarks 68=a 5=b"
     assert main(["subject", "S", "--model", "M.npz", "--out", "O", *flags.split()]) == code
-    heard.pop("progress").note("told")
-    assert heard == {
+    received.pop("progress").note("a message")
+    assert received == {
         "subject": Path("S"),
         "model": Path("M.npz"),
         "out": Path("O"),
@@ -334,9 +241,9 @@ def test_subject_passes_every_argument_on(
             landmark_files={"68": Path("a"), "5": Path("b")},
         ),
     }
-    told = capsys.readouterr()
-    assert told.out == f"c0: {statuses[0]}: because\nc1: {statuses[1]}: because\nO/index.html\n"
-    assert "told" in told.err
+    printed = capsys.readouterr()
+    assert printed.out == f"c0: {statuses[0]}: because\nc1: {statuses[1]}: because\nO/index.html\n"
+    assert "a message" in printed.err
 
 
 def test_missing_subject(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -348,7 +255,7 @@ def test_missing_subject(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> 
     assert list(tmp_path.iterdir()) == []
 
 
-def test_an_interrupt_is_told_without_a_traceback(
+def test_an_interrupt_is_reported_without_a_traceback(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     def interrupt(*args, **options) -> None:

@@ -1,4 +1,4 @@
-"""What an operator types, on a queue without workers; `--local` with real registrations is in the slow tests."""
+"""Commands of an operator on a queue without workers; `--local` with real registrations is in the slow tests."""
 
 import os
 import re
@@ -29,19 +29,19 @@ def captures(tmp_path: Path) -> Path:
 
 
 def batch(captures: Path, *more: str) -> int:
-    places = [str(captures / name / "rest") for name in ("ann", "bob")]
+    folders = [str(captures / name / "rest") for name in ("ann", "bob")]
     out = str(captures.parent / "out")
-    return main(["batch", *places, *more, "--model", str(synthetic.MODEL), "--out", out, "--folder", str(captures)])
+    return main(["batch", *folders, *more, "--model", str(synthetic.MODEL), "--out", out, "--folder", str(captures)])
 
 
-def test_a_batch_in_the_queue_its_status_and_its_end(captures: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_batch_is_submitted_shown_cancelled_and_requeued(captures: Path, capsys: pytest.CaptureFixture[str]) -> None:
     folder = ["--folder", str(captures)]
     assert main(["migrate", *folder]) == 0
     assert batch(captures) == 0 and "out: 2 captures are in the queue" in capsys.readouterr().out
     assert batch(captures) == 0
     assert main(["status", *folder]) == 0
-    told = capsys.readouterr().out
-    assert "jobs: 2 (2 waiting)" in told and "flows: 1 (1 waiting)" in told and "of 10,000" in told
+    text = capsys.readouterr().out
+    assert "jobs: 2 (2 waiting)" in text and "flows: 1 (1 waiting)" in text and "of 10,000" in text
     assert main(["logs", "out/ann/rest", *folder]) == 0
     assert "out/ann/rest: waiting" in capsys.readouterr().out
     assert main(["cancel", "out/ann", *folder]) == 0
@@ -54,13 +54,13 @@ def test_a_batch_in_the_queue_its_status_and_its_end(captures: Path, capsys: pyt
     assert "jobs: 2 (2 waiting)" in capsys.readouterr().out
 
 
-def test_what_cannot_be_a_batch_is_refused(captures: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_unusable_batches_are_refused(captures: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert batch(captures) == 2
     assert "There is no queue" in capsys.readouterr().err
     main(["migrate", "--folder", str(captures)])
     for more, words in (
         (str(captures / "nobody"), "cannot be found"),
-        (str(captures / "ann" / "rest"), "cannot be told apart"),
+        (str(captures / "ann" / "rest"), "have the same key"),
         (f"@{captures}/none", "cannot be read"),
     ):
         assert batch(captures, more) == 2
@@ -88,32 +88,32 @@ def test_a_password_is_never_printed(tmp_path: Path, monkeypatch: pytest.MonkeyP
         assert "secret" not in done.stdout + done.stderr and "127.0.0.1" in done.stderr
 
 
-def test_store_verify_tells_by_its_exit_code(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_store_verify_fails_on_altered_files(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     store = Store(tmp_path)
-    made = store.produce("a", wanted="w", make=lambda folder: {"n": (folder / "f").write_text("x")})
+    artifact = store.produce("a", wanted="w", make=lambda folder: {"n": (folder / "f").write_text("x")})
     assert main(["store", "verify", str(tmp_path)]) == 0
     assert "1 artifacts; 0 files missing, 0 altered, 0 orphaned; 0 manifests unreadable" in capsys.readouterr().out
-    (tmp_path / "a" / made.attempt / "f").write_text("y")
+    (tmp_path / "a" / artifact.attempt / "f").write_text("y")
     assert main(["store", "verify", str(tmp_path)]) == 1
-    assert f"altered: a/{made.attempt}/f" in capsys.readouterr().out
+    assert f"altered: a/{artifact.attempt}/f" in capsys.readouterr().out
 
 
-def test_names_of_a_batch_tell_captures_apart(captures: Path) -> None:
-    places = [f"{captures}/ann/rest", f"{captures}/bob/rest", "s3://bucket/c/cyd/rest"]
-    made = batch_jobs(places, model=str(synthetic.MODEL), out="s3://bucket/results/june")
-    assert [job.id for job in made.jobs] == ["june/ann/rest", "june/bob/rest", "june/cyd/rest"]
-    assert "s3://bucket/results/june" in made.roots and f"{captures}/ann" in made.roots
+def test_jobs_are_named_by_the_last_two_folders(captures: Path) -> None:
+    locations = [f"{captures}/ann/rest", f"{captures}/bob/rest", "s3://bucket/c/cyd/rest"]
+    jobs = batch_jobs(locations, model=str(synthetic.MODEL), out="s3://bucket/results/june")
+    assert [job.id for job in jobs.jobs] == ["june/ann/rest", "june/bob/rest", "june/cyd/rest"]
+    assert "s3://bucket/results/june" in jobs.roots and f"{captures}/ann" in jobs.roots
 
 
 @pytest.mark.slow
-def test_a_local_farm_registers_and_is_interrupted_and_goes_on(tmp_path: Path) -> None:
-    """Ctrl-C ends all processes; the same command does the rest, and no finished capture again."""
+def test_a_local_farm_is_interrupted_and_resumes(tmp_path: Path) -> None:
+    """Ctrl-C ends all processes; the same command registers the rest, and no finished capture again."""
     for name in ("neutral", "smile"):
         synthetic.make(tmp_path / "captures" / name, name)
     (tmp_path / "captures" / "bad").mkdir()
     (tmp_path / "captures" / "bad" / "capture.toml").write_text("x = 1")
-    places = [str(tmp_path / "captures" / name) for name in ("bad", "neutral", "smile")]
-    command = [sys.executable, "-m", "workflows.cli", "batch", *places, "--model", str(synthetic.MODEL)]
+    folders = [str(tmp_path / "captures" / name) for name in ("bad", "neutral", "smile")]
+    command = [sys.executable, "-m", "workflows.cli", "batch", *folders, "--model", str(synthetic.MODEL)]
     command += ["--out", str(tmp_path / "out"), "--local", "--workers", "1"]
     pipe = subprocess.PIPE
     first = subprocess.Popen(command, cwd=ROOT, stderr=pipe, stdout=pipe, text=True, preexec_fn=interruptible)
@@ -128,37 +128,37 @@ def test_a_local_farm_registers_and_is_interrupted_and_goes_on(tmp_path: Path) -
     second = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=600)
     assert second.returncode == 1 and "jobs: 3 (2 done, 1 failed)" in second.stdout, second.stdout + second.stderr
     assert 'capture.toml lacks "subject"' in second.stdout
-    found = Store(tmp_path / "out").verify()
-    assert found.is_sound and found.artifacts == 2 and not _processes_of(str(tmp_path))
+    report = Store(tmp_path / "out").verify()
+    assert report.is_sound and report.artifacts == 2 and not _processes_of(str(tmp_path))
 
 
 def _done(url: str) -> bool:
     try:
         return QueueReader(url).counts("out").get("done", 0) > 0
-    except Exception:  # there is no queue yet
+    except Exception:  # the queue does not exist yet
         return False
 
 
 def _processes_of(word: str) -> list[int]:
     """Processes whose command line names a folder."""
-    found = []
+    pids = []
     for path in Path("/proc").glob("[0-9]*"):
         try:
             if word in (path / "cmdline").read_text() and int(path.name) != os.getpid():
-                found.append(int(path.name))
+                pids.append(int(path.name))
         except OSError:
             continue
-    return [pid for pid in found if alive(pid)]
+    return [pid for pid in pids if alive(pid)]
 
 
-def test_a_batch_that_ended_waits_again_for_what_is_added(captures: Path) -> None:
+def test_a_batch_that_ended_waits_for_added_captures(captures: Path) -> None:
     main(["migrate", "--folder", str(captures)])
     url = default_url(captures)
     settings = {"model": str(synthetic.MODEL), "out": str(captures.parent / "out")}
     assert submit_batch(url, batch_jobs([f"{captures}/ann/rest"], run="r", **settings)) == 1
     queue, reader = QueueClient(url), QueueReader(url)
     queue.cancel("r")
-    places = [f"{captures}/{name}/rest" for name in ("ann", "bob")]
-    assert submit_batch(url, batch_jobs(places, run="r", **settings)) == 2
+    folders = [f"{captures}/{name}/rest" for name in ("ann", "bob")]
+    assert submit_batch(url, batch_jobs(folders, run="r", **settings)) == 2
     assert reader.rows(["r"])["r"].state == "waiting"
     assert reader.counts("r") == {"cancelled": 1, "waiting": 1}

@@ -52,8 +52,8 @@ def test_a_registration_is_made_again_with_pictures_and_out_of_the_way(
         "register": {"out": "/results/e", "neutral": "/results/n"},
         "register stored": {"store": "/s", "key": "k"},
     }
-    told = debug(row(step, **arguments, **places[step]), tmp_path / "out", Silent())
-    assert told.told == "failed: so it is" and told.page is None
+    result = debug(row(step, **arguments, **places[step]), tmp_path / "out", Silent())
+    assert result.summary == "failed: so it is" and result.page is None
     (call,) = calls
     assert call["capture"] == Path("/c/e") and call["model"] == Path("/m.npz")
     assert call["out"] == tmp_path / "out" / "registration" and call["pictures"] == tmp_path / "out" / "stages"
@@ -94,7 +94,7 @@ def test_a_page_ends_with_the_registration_that_was_refused(monkeypatch: pytest.
         urllib.request.urlopen(f"http://127.0.0.1:{ports[0]}", timeout=10)
 
 
-def test_what_cannot_be_debugged_is_refused(calls: list[dict[str, Any]], tmp_path: Path) -> None:
+def test_jobs_that_cannot_be_debugged_are_refused(calls: list[dict[str, Any]], tmp_path: Path) -> None:
     (tmp_path / "full").mkdir()
     (tmp_path / "full" / "x").write_text("mine")
     for wrong, out in (
@@ -105,6 +105,6 @@ def test_what_cannot_be_debugged_is_refused(calls: list[dict[str, Any]], tmp_pat
     ):
         with pytest.raises(InputError):
             debug(wrong, out, Silent())
-    with pytest.raises(InputError, match="a registration, to be viewed"):
+    with pytest.raises(InputError, match="--view cannot show"):
         debug(row(step="stabilize", run="/r", model="/m.npz", out="/o"), tmp_path / "out", Silent(), port=0)
     assert not calls and not (tmp_path / "out").exists()
