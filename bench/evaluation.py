@@ -37,7 +37,7 @@ def held_out_subjects(
 ) -> list[HeldOutSubject]:
     """Return random subjects with expressions and points of the true face."""
     rng = np.random.default_rng(_HELD_OUT_SEED)
-    performed = [expressions.named(name) for name in EXPRESSIONS]
+    performed = [expressions.expression_by_name(name) for name in EXPRESSIONS]
     face = data.triangles[(regions.group(data, "hockey_mask") > 0.5)[data.triangles].all(1)]
     subjects = []
     for number in range(count):
@@ -48,7 +48,7 @@ def held_out_subjects(
             HeldOutSubject(
                 subject=f"person_{number}",
                 neutral=neutral,
-                expressions=np.stack([expressions.perform(head, one, neutral, joints) for one in performed]),
+                expressions=np.stack([expressions.apply_expression(head, one, neutral, joints) for one in performed]),
                 categories=tuple(expression.category for expression in performed),
                 tags=person.tags,
                 scan=barycentric_points(neutral, face, triangles, barycentric),

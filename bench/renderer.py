@@ -25,11 +25,11 @@ from rich.console import Console
 from rich.table import Table
 
 from coregister.first_model.build import bootstrap
-from coregister.synthetic.capture import label_shares
+from coregister.synthetic.capture import label_weights
 from registration.model import gnm_npz
 from registration.model.atlas import texture_atlas
 from registration.render import backend
-from registration.render.studio.rig import rig
+from registration.render.studio.rig import RigOptions, make_rig
 from registration.types import Pixels
 
 REPEATS = 7
@@ -60,9 +60,10 @@ class Case:
         data = gnm_npz.read(bootstrap())
         head = data.template_vertex_positions.astype(np.float64)
         centre = (head.min(0) + head.max(0)) / 2
-        cameras = rig(views, (side, side), 0, centre=centre, head_height_m=float(np.ptp(head[:, 1])))
+        options = RigOptions(cameras=views, size_px=(side, side))
+        cameras = make_rig(options, centre=centre, head_height_m=float(np.ptp(head[:, 1])))
         self.triangles = triangles = data.triangles.astype(np.int64)
-        shares = label_shares(data)[:, :CLASSES]
+        shares = label_weights(data)[:, :CLASSES]
         self.corner_uvs = texture_atlas(data)
         self.renderer = Renderer(triangles, self.corner_uvs, shares.astype(np.float32))
         self.all = Pixels.all_of(cameras, device)

@@ -59,7 +59,7 @@ def perform(anatomy: HeadAssembly, seed: int, names: tuple[str, ...] = NAMES) ->
         act = EXPRESSIONS[name]
         units = {unit: weight * rng.uniform(*_STRENGTH) for unit, weight in act.units.items()}
         varied = Expression(category=act.category, units=units, gaze_deg=act.gaze_deg, tongue=act.tongue)
-        heads.append(expressions.perform(anatomy, varied, neutral, joints))
+        heads.append(expressions.apply_expression(anatomy, varied, neutral, joints))
     return Performed(name=f"synth_{seed:04d}", neutral=neutral, labels=names, vertices=np.stack(heads))
 
 

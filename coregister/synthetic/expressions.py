@@ -1,5 +1,5 @@
-"""Named expressions of synthetic subjects, in the ten categories of the capture protocol
-[GNM, Data Foundation & Acquisition]."""
+"""Named expressions of synthetic subjects, in the categories of the capture protocol [GNM, Data Foundation &
+Acquisition]."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -15,10 +15,10 @@ from registration.errors import InputError
 
 @dataclass(frozen=True, kw_only=True)
 class Expression:
-    """One static expression: weights of MakeHuman's face units, where the eyes look, what the tongue does."""
+    """One static expression: weights of MakeHuman's face units, gaze direction and tongue pose."""
 
     category: str
-    units: Mapping[str, float] = field(default_factory=dict)
+    units: Mapping[str, float] = field(default_factory=dict)  # by name of the face unit
     gaze_deg: tuple[float, float] = (0.0, 0.0)  # to the subject's left, up
     tongue: Mapping[str, float] = field(default_factory=dict)  # arguments of `tongue.displacement`
 
@@ -28,7 +28,7 @@ def _both(*units: str, weight: float = 1.0) -> dict[str, float]:
 
 
 def _looking(direction: str, weight: float = 1.0) -> dict[str, float]:
-    """The lids go with the eyes."""
+    """Return the units of the lids that accompany a gaze direction."""
     inner, outer = ("Right", "Left") if direction == "Left" else ("Left", "Right")
     if direction in ("Up", "Down"):
         return _both(f"eyeLook{direction}", weight=weight)
@@ -78,11 +78,15 @@ EXPRESSIONS: Mapping[str, Expression] = {
 }
 
 
-def named(name: str) -> Expression:
-    """The expression of this name. Raises InputError, with the names there are, if there is none."""
+def expression_by_name(name: str) -> Expression:
+    """Return the expression of this name.
+
+    Raises:
+        InputError: there is none; the message lists all names.
+    """
     if name not in EXPRESSIONS:
         raise InputError(
-            "there is no such expression",
+            "There is no such expression",
             where="expression",
             expected=", ".join(EXPRESSIONS),
             got=name,
@@ -91,18 +95,28 @@ def named(name: str) -> Expression:
     return EXPRESSIONS[name]
 
 
-def perform(
-    anatomy: HeadAssembly, expression: Expression, vertices: Float[np.ndarray, "V 3"], joints: Float[np.ndarray, "J 3"]
+def apply_expression(
+    assembly: HeadAssembly, expression: Expression, vertices: Float[np.ndarray, "V 3"], joints: Float[np.ndarray, "J 3"]
 ) -> Float[np.ndarray, "V 3"]:
-    """A neutral head's vertices (m, with its joints, not turned against the template) with an expression on it."""
-    source, rows = anatomy.source, anatomy.slices
+    """Return a neutral head's vertices with an expression applied.
+
+    Args:
+        assembly: the rules by which parts follow MakeHuman's base mesh.
+        expression: what to apply.
+        vertices: of the neutral head, aligned with the template; metres.
+        joints: of the neutral head, metres.
+
+    Returns:
+        Vertices, metres; lids stay outside the eyeballs.
+    """
+    source, rows = assembly.source, assembly.slices
     result = vertices.copy()
     if expression.units:
         delta = sum(weight * source.target(f"faceunits/{unit}") for unit, weight in expression.units.items())
-        result += anatomy.expression_displacement(np.asarray(delta))
+        result += assembly.expression_displacement(np.asarray(delta))
     if expression.tongue:
-        rest = anatomy.template[rows["tongue"]]
-        out = anatomy.tongue_displacement(source.target("faceunits/tongueOut"))[rows["tongue"]]
+        rest = assembly.template[rows["tongue"]]
+        out = assembly.tongue_displacement(source.target("faceunits/tongueOut"))[rows["tongue"]]
         result[rows["tongue"]] += tongue.displacement(rest, out, **expression.tongue)
     left, up = expression.gaze_deg
     gaze = Rotation.from_euler("yx", [left, -up], degrees=True)

@@ -1,4 +1,4 @@
-"""Synthetic subjects before the studio's cameras: a person from the population, an expression, a capture folder."""
+"""Captures of synthetic subjects: a sampled person with an expression, rendered in the studio."""
 
 from collections.abc import Mapping
 from dataclasses import replace
@@ -9,22 +9,22 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from coregister.first_model import assembly, build, makehuman, population
-from coregister.first_model.assembly import HeadAssembly
+from coregister.first_model import build, makehuman, population
+from coregister.first_model.assembly import HeadAssembly, build_assembly
 from coregister.first_model.population import SyntheticPerson
 from coregister.synthetic import expressions
-from coregister.synthetic.capture import Studio, check, write_capture
+from coregister.synthetic.capture import Studio, check_studio, render_capture
 from registration.errors import InputError
 from registration.model import gnm_npz
 from registration.model.landmarks import schemes_beside
-from registration.render.studio.skin import Look
+from registration.render.studio.skin import SkinAppearance
 
-_TURN_DEG = 4.0  # standard deviation of a subject's head in the studio, about each axis
-_SHIFT = 8e-3  # metres
-_MOST_WEIGHT = 2.0  # of a target; MakeHuman draws them for 1
+_ROTATION_STD_DEG = 4.0  # of a head in the studio, about each axis
+_TRANSLATION_STD_M = 8e-3
+_MAX_WEIGHT = 2.0  # of a target; MakeHuman's are designed for 1
 
 
-def capture(
+def synthesize_capture(
     root: Path,
     *,
     seed: int = 0,
@@ -34,53 +34,72 @@ def capture(
     tags: Mapping[str, Any] | None = None,
     studio: Studio | None = None,
 ) -> Path:
-    """Photograph the subject that a seed draws and write a native capture folder; returns `root`.
+    """Render a sampled subject with an expression and write a native capture folder.
 
-    `spanned` draws from the people that the first model's identity basis is made of; otherwise subjects are asymmetric
-    and of any adult age and build, which the basis does not span. `targets` sets weights of MakeHuman targets by name;
-    `tags` are told besides the subject's own. One seed is one subject, with one look (the studio's own is not used), in
-    whatever expression. Raises InputError for unknown names, settings out of range, an existing folder, and where
-    MakeHuman's head cannot be had.
+    Args:
+        root: the folder to write; must not exist.
+        seed: determines the subject, in all its expressions, and its appearance.
+        expression: name of the expression.
+        spanned: whether to sample from the people of the first model's identity basis; otherwise subjects are
+            asymmetric and of any adult age and build, outside the basis.
+        targets: weights of MakeHuman targets by name, which replace the sampled ones.
+        tags: tags of the capture besides the subject's.
+        studio: the settings; its `look` is replaced by the subject's.
+
+    Returns:
+        `root`.
+
+    Raises:
+        InputError: unknown names, settings out of range, an existing folder, or MakeHuman's head cannot be downloaded.
     """
     studio = studio or Studio()
-    check(root, studio)
-    act = expressions.named(expression)
-    person = subject(seed, spanned=spanned, targets=targets)
+    check_studio(root, studio)
+    performed = expressions.expression_by_name(expression)
+    person = sample_subject(seed, spanned=spanned, targets=targets)
     model = build.bootstrap()
-    made = _anatomy()
-    moves = {name: made.source.target(name) for name in person.weights}
-    vertices, joints = made.assemble(person, moves)
-    vertices = expressions.perform(made, act, vertices, joints)
+    assembly = _assembly()
+    displacements = {name: assembly.source.target(name) for name in person.weights}
+    vertices, joints = assembly.assemble(person, displacements)
+    vertices = expressions.apply_expression(assembly, performed, vertices, joints)
     rng = np.random.default_rng([seed, *expression.encode()])
-    turn = Rotation.from_rotvec(rng.normal(0, np.radians(_TURN_DEG), 3))
-    middle = made.eye_centres.mean(0)
-    vertices = turn.apply(vertices - middle) + middle + rng.normal(0, _SHIFT, 3)
+    rotation = Rotation.from_rotvec(rng.normal(0, np.radians(_ROTATION_STD_DEG), 3))
+    pivot = assembly.eye_centres.mean(0)
+    vertices = rotation.apply(vertices - pivot) + pivot + rng.normal(0, _TRANSLATION_STD_M, 3)
     data = gnm_npz.read(model)
-    return write_capture(
+    return render_capture(
         root,
         data=data,
         vertices=vertices,
         schemes=schemes_beside(model, len(data.template_vertex_positions)),
         subject=f"synth_{seed:04d}",
         expression=expression,
-        tags={**person.tags, "category": act.category, **(tags or {})},
-        studio=replace(studio, look=_look(seed, person)),
+        tags={**person.tags, "category": performed.category, **(tags or {})},
+        studio=replace(studio, look=_appearance(seed, person)),
     )
 
 
-def _look(seed: int, person: SyntheticPerson) -> Look:
-    look = Look.drawn(seed)
-    return replace(look, stubble=0.0) if person.tags["gender"] == "female" else look
+def _appearance(seed: int, person: SyntheticPerson) -> SkinAppearance:
+    appearance = SkinAppearance.sample(seed)
+    return replace(appearance, stubble=0.0) if person.tags["gender"] == "female" else appearance
 
 
-def subject(seed: int, *, spanned: bool = False, targets: Mapping[str, float] | None = None) -> SyntheticPerson:
-    """The person that a seed draws. Raises InputError for targets that there are not and for numbers out of range."""
+def sample_subject(seed: int, *, spanned: bool = False, targets: Mapping[str, float] | None = None) -> SyntheticPerson:
+    """Sample a person.
+
+    Args:
+        seed: determines the person.
+        spanned: whether to sample from the people of the first model's identity basis.
+        targets: weights of MakeHuman targets by name, which replace the sampled ones.
+
+    Raises:
+        InputError: an unknown target, or a number out of range.
+    """
     if seed < 0:
-        raise _wrong("The seed is out of range", "seed", "a whole number from 0", seed)
+        raise _input_error("The seed is out of range", "seed", "a whole number from 0", seed)
     for name, weight in (targets or {}).items():
-        if not abs(weight) <= _MOST_WEIGHT:  # nor NaN
-            raise _wrong("A target's weight is out of range", name, f"-{_MOST_WEIGHT} to {_MOST_WEIGHT}", weight)
-    source = _anatomy().source
+        if not abs(weight) <= _MAX_WEIGHT:  # also true of NaN
+            raise _input_error("A target's weight is out of range", name, f"-{_MAX_WEIGHT} to {_MAX_WEIGHT}", weight)
+    source = _assembly().source
     rng = np.random.default_rng(seed)
     sample = population.sample_spanned_person if spanned else population.sample_unspanned_person
     person = sample(source, rng)
@@ -89,10 +108,10 @@ def subject(seed: int, *, spanned: bool = False, targets: Mapping[str, float] | 
     return replace(person, weights={**person.weights, **(targets or {})})
 
 
-def _wrong(what: str, where: object, expected: object, got: object) -> InputError:
-    return InputError(what, where=where, expected=expected, got=got, fix="change it")
+def _input_error(what: str, where: object, expected: object, got: object) -> InputError:
+    return InputError(what, where=where, expected=expected, got=got, fix="change this argument")
 
 
 @lru_cache(maxsize=1)
-def _anatomy() -> HeadAssembly:
-    return assembly.build_assembly(makehuman.read(makehuman.fetch()), population.mean_person())
+def _assembly() -> HeadAssembly:
+    return build_assembly(makehuman.read(makehuman.fetch()), population.mean_person())

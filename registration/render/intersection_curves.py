@@ -154,7 +154,7 @@ def _halve(
     before, after, active = mi.Float(0), mi.Float(1), mi.Bool(True)
     for _ in range(_HALVINGS):
         middle = 0.5 * (before + after)
-        hit = scene.cast(centre, ray(middle), active, coherent=False)
+        hit = scene.cast_rays(centre, ray(middle), active, coherent=False)
         active &= hit.is_valid()
         part = dr.gather(mi.UInt32, parts, hit.prim_index, active)
         is_first, is_second = active & (part == first), active & (part == second)

@@ -112,7 +112,7 @@ class Renderer:
 
     def _move(self, vertices: Tensor) -> None:
         """Put the vertices here; what was drawn of others is forgotten."""
-        if self._scene.move(vertices):
+        if self._scene.update_vertices(vertices):
             self._last = None
 
     def _surface(self, vertices: Tensor, texture: Tensor | None, texture_size: int = 0) -> Surface:
@@ -131,7 +131,7 @@ class Renderer:
         )
 
     def _cast(self, pixels: PixelList, offset: tuple[float, float], which: mi.UInt32 | None = None) -> Hits:
-        hit = self._scene.cast(*pixels.rays(offset, which), mi.Bool(True), coherent=True)
+        hit = self._scene.cast_rays(*pixels.rays(offset, which), mi.Bool(True), coherent=True)
         is_hit = hit.is_valid()
         depth, seen = dr.select(is_hit, hit.t, dr.inf), dr.select(is_hit, hit.prim_index, NO_FACE)
         b1, b2 = hit.prim_uv.x, hit.prim_uv.y

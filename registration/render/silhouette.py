@@ -246,7 +246,7 @@ def _beyond(
 ) -> tuple[mi.PreliminaryIntersection3f, mi.Bool]:
     """What the rays just outside the edges meet, and whether the edges are seen."""
     x = samples.x + samples.normal * (_STEP * camera.fx)
-    hit = scene.cast(camera.centre, camera.direction(x.x, x.y), mi.Bool(True), coherent=False)
+    hit = scene.cast_rays(camera.centre, camera.direction(x.x, x.y), mi.Bool(True), coherent=False)
     return hit, ~(hit.is_valid() & (hit.t < samples.depth * (1 - _DEPTH_TOLERANCE)))
 
 

@@ -52,9 +52,12 @@ def synth(
         studio: The synthetic studio.
     """
     targets = weights(target)
-    from coregister.synthetic.subject import capture
+    from coregister.synthetic.subject import synthesize_capture
 
-    print(capture(out, seed=seed, expression=expression, spanned=spanned, targets=targets, studio=studio.studio(seed)))
+    root = synthesize_capture(
+        out, seed=seed, expression=expression, spanned=spanned, targets=targets, studio=studio.studio(seed)
+    )
+    print(root)
     return 0
 
 

@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from coregister.synthetic import expressions, subject
-from coregister.synthetic.capture import Studio, check
+from coregister.synthetic.capture import Studio, check_studio
 from registration.errors import InputError
 from registration.progress import Progress, Silent
 from registration.storage.hashing import to_jsonable, versions
@@ -40,7 +40,7 @@ class Population:
 def synth_dataset(
     out: Path, population: Population, *, jobs: int = 1, progress: Progress | None = None
 ) -> DatasetRecord:
-    """Photograph a population (`coregister.synthetic.subject.capture`, people of any age and build) into `out`.
+    """Render a population into `out`: people of any adult age and build, by `subject.synthesize_capture`.
 
     `out/SUBJECT/EXPRESSION` are captures, each whole or not there; called again it goes on where it was interrupted.
     `out/dataset.json` tells the seeds, who is held out, and whether all is there. Held-out subjects' captures have the
@@ -86,7 +86,7 @@ def synth_dataset(
 def photograph(**settings: Any) -> str:
     """One capture. Returns its trouble, "" if there was none."""
     try:
-        subject.capture(**settings)
+        subject.synthesize_capture(**settings)
     except InputError as error:
         return error.line
     except Exception as error:
@@ -98,7 +98,7 @@ def _make_record(population: Population) -> DatasetRecord:
     """The record of a dataset of which captures are still missing."""
     return DatasetRecord(
         complete=False,
-        categories={name: expressions.named(name).category for name in population.expressions},
+        categories={name: expressions.expression_by_name(name).category for name in population.expressions},
         seeds=population.seeds,
         held_out=population.held,
         expressions=population.expressions,
@@ -116,9 +116,9 @@ def _write(out: Path, record: DatasetRecord) -> DatasetRecord:
 
 
 def _check(population: Population) -> None:
-    check(Path("/nowhere/at/all"), population.studio)
+    check_studio(Path("/nowhere/at/all"), population.studio)
     for name in population.expressions:
-        expressions.named(name)
+        expressions.expression_by_name(name)
     acts = population.expressions
     if NEUTRAL in acts or len(set(acts)) < len(acts):
         raise _input_error(

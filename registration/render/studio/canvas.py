@@ -1,4 +1,4 @@
-"""The texels of a model's atlas and where they lie on its template: what a painter paints on."""
+"""The texels of a model's atlas as points of its template, for procedural textures."""
 
 from dataclasses import dataclass
 
@@ -16,33 +16,38 @@ from registration.types import Camera
 
 @dataclass(frozen=True, kw_only=True)
 class Canvas:
-    """T texels of a square texture that are covered by faces."""
+    """The T texels of a square texture that faces cover."""
 
     size: int
     texel: Int[np.ndarray, "T"]  # row * size + column; row 0 is at v = 1
-    corners: Int[np.ndarray, "T 3"]  # vertices
-    weights: Float[np.ndarray, "T 3"]
+    corners: Int[np.ndarray, "T 3"]  # vertices of the face
+    weights: Float[np.ndarray, "T 3"]  # barycentric
 
     def interpolate(self, values: Float[np.ndarray, "V *D"]) -> Float[np.ndarray, "T *D"]:
-        """Vertices' values at the covered texels, float32."""
+        """Interpolate vertices' values at the covered texels, in float32."""
         values = values.astype(np.float32)
         trailing = (1,) * (values.ndim - 1)
         parts = [self.weights[:, k].reshape(-1, *trailing) * values[self.corners[:, k]] for k in range(3)]
         return parts[0] + parts[1] + parts[2]
 
-    def only(self, kept: Bool[np.ndarray, "V"]) -> "Canvas":
-        """The texels of the faces whose vertices are all kept."""
+    def select(self, kept: Bool[np.ndarray, "V"]) -> "Canvas":
+        """Return the texels of the faces whose vertices are all kept."""
         rows = kept[self.corners].all(1)
         return Canvas(size=self.size, texel=self.texel[rows], corners=self.corners[rows], weights=self.weights[rows])
 
 
-def canvas(data: GNMData, size: int = 2048) -> Canvas:
-    """The canvas of a model's texture atlas."""
+def make_canvas(data: GNMData, size: int = 2048) -> Canvas:
+    """Return the canvas of a model's texture atlas.
+
+    Args:
+        data: the head model.
+        size: side of the texture, texels.
+    """
     uvs = texture_atlas(data).astype(np.float64).reshape(-1, 2)
-    # A flat mesh at z = 1 seen by a camera whose pixels are the texels.
+    # The atlas as a mesh in the plane z = 1, rasterized by a camera whose pixels are the texels.
     flat = np.column_stack([uvs[:, 0], 1 - uvs[:, 1], np.ones(len(uvs))])
-    page = Camera(width_px=size, height_px=size, intrinsics=np.diag([size, size, 1.0]), T_cam_world=np.eye(4))
-    face, weights = rasterize(flat, np.arange(len(flat)).reshape(-1, 3), page)
+    camera = Camera(width_px=size, height_px=size, intrinsics=np.diag([size, size, 1.0]), T_cam_world=np.eye(4))
+    face, weights = rasterize(flat, np.arange(len(flat)).reshape(-1, 3), camera)
     texel = np.flatnonzero(face.ravel() >= 0)
     return Canvas(
         size=size,
@@ -52,8 +57,18 @@ def canvas(data: GNMData, size: int = 2048) -> Canvas:
     )
 
 
-def texture_of(size: int, texel: Int[np.ndarray, "T"], colours: Float[np.ndarray, "T 3"]) -> Float[np.ndarray, "R R 3"]:
-    """A texture of some texels; the others take the nearest one's colour, so that no look-up meets a gap."""
+def fill_texture(
+    size: int, texel: Int[np.ndarray, "T"], colours: Float[np.ndarray, "T 3"]
+) -> Float[np.ndarray, "R R 3"]:
+    """Return a texture with the colours of some texels; all others take the colour of the nearest one.
+
+    Bilinear look-ups at the border of a chart then meet no gap.
+
+    Args:
+        size: R.
+        texel: row * size + column of the texels.
+        colours: of these texels.
+    """
     texture = np.zeros((size * size, 3), np.float32)
     texture[texel] = colours
     empty = np.ones(size * size, np.uint8)
@@ -66,24 +81,24 @@ def texture_of(size: int, texel: Int[np.ndarray, "T"], colours: Float[np.ndarray
     return texture[source[labels]].reshape(size, size, 3)
 
 
-def softened(data: GNMData, values: Float[np.ndarray, "V"], rounds: int) -> Float[np.ndarray, "V"]:
-    """Vertices' values averaged with their neighbours', so many times."""
+def smoothed(data: GNMData, values: Float[np.ndarray, "V"], iterations: int) -> Float[np.ndarray, "V"]:
+    """Average vertices' values repeatedly with the mean of their neighbours."""
     a, b = edges(data.triangles).vertices.T
     count = np.bincount(a, minlength=len(values)) + np.bincount(b, minlength=len(values))
-    for _ in range(rounds):
+    for _ in range(iterations):
         total = np.bincount(a, values[b], len(values)) + np.bincount(b, values[a], len(values))
         values = (values + total / np.maximum(count, 1)) / 2
     return values
 
 
-def soft_group(data: GNMData, name: str, rounds: int = 1) -> Float[np.ndarray, "V"]:
-    """A vertex group with softened borders; zero if the model has no such group."""
+def soft_group(data: GNMData, name: str, iterations: int = 1) -> Float[np.ndarray, "V"]:
+    """Return a vertex group with a smoothed border; zero if the model has no such group."""
     if name not in data.vertex_group_names.tolist():
         return np.zeros(len(data.template_vertex_positions))
-    return softened(data, group(data, name).astype(np.float64), rounds)
+    return smoothed(data, group(data, name).astype(np.float64), iterations)
 
 
 def smoothstep(low: float, high: float, x: Float[np.ndarray, "*N"]) -> Float[np.ndarray, "*N"]:
-    """0 below `low`, 1 above `high`, smooth between; the other way round if `low` is the larger."""
+    """Return 0 below `low`, 1 above `high`, and a cubic between; decreasing if `low` is the larger."""
     t = np.clip((x - low) / (high - low), 0, 1)
     return t * t * (3 - 2 * t)

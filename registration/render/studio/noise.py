@@ -1,4 +1,4 @@
-"""Noise in space: a value for every point (m), whatever surface it lies on; equal for equal points and seeds."""
+"""Procedural noise of points in space (m); equal for equal points and seeds."""
 
 from __future__ import annotations  # mi.Float exists only once a variant is chosen
 
@@ -11,47 +11,59 @@ from jaxtyping import Float
 
 
 class SolidNoise:
-    """Noise at some points. A Mitsuba variant must be active."""
+    """Noise at fixed points. A Mitsuba variant must be active."""
 
     def __init__(self, points: Float[np.ndarray, "P 3"]):
-        # Lattice cells are found by truncation: all coordinates must be positive.
+        # Lattice cells are computed by truncation, which needs positive coordinates.
         self._points = [mi.Float(points[:, k].astype(np.float32) + np.float32(8.0)) for k in range(3)]
 
     def smooth(
         self, size_m: float, seed: int, *, octaves: int = 1, stretch: tuple[float, float, float] = (1.0, 1.0, 1.0)
     ) -> Float[np.ndarray, "P"]:
-        """Gradient noise (Perlin 2002) with bumps of about this size, each octave half the last; deviation about 1."""
+        """Return gradient noise [Perlin 2002] with a standard deviation of about 1.
+
+        Args:
+            size_m: of the features; each further octave halves it.
+            seed: of the noise.
+            octaves: number of superposed frequencies.
+            stretch: factor of the feature size along x, y, z.
+        """
         total, weight, squares = mi.Float(0), 1.0, 0.0
         for octave in range(octaves):
             scale = 2.0**octave / size_m
-            place = [p * dr.opaque(mi.Float, scale / s) for p, s in zip(self._points, stretch, strict=True)]
-            total += weight * _gradient_noise(place, seed * 31 + octave)
+            position = [p * dr.opaque(mi.Float, scale / s) for p, s in zip(self._points, stretch, strict=True)]
+            total += weight * _gradient_noise(position, seed * 31 + octave)
             squares += weight**2
             weight *= 0.6
         return np.array(total) * np.float32(1 / (0.19 * np.sqrt(squares)))
 
     def dots(self, spacing_m: float, seed: int) -> tuple[Float[np.ndarray, "P"], Float[np.ndarray, "P"]]:
-        """Distance (m) to the nearest of random points, one in each cube of this size, and that point's own number.
+        """Return cellular noise [Worley 1996]: distances to the nearest feature point, and random numbers.
 
-        Cellular noise (Worley 1996); the number is uniform in [0, 1).
+        Args:
+            spacing_m: each cube of this size has one random feature point.
+            seed: of the feature points.
+
+        Returns:
+            The distance (m), and a number of the nearest feature point, uniform in [0, 1).
         """
-        place = [p * dr.opaque(mi.Float, 1 / spacing_m) for p in self._points]
-        first = [mi.UInt32(p) - 1 for p in place]
-        best, own = mi.Float(9), mi.Float(0)
+        position = [p * dr.opaque(mi.Float, 1 / spacing_m) for p in self._points]
+        first = [mi.UInt32(p) - 1 for p in position]
+        best, best_number = mi.Float(9), mi.Float(0)
         for steps in product((0, 1, 2), repeat=3):
             cell = [c + step for c, step in zip(first, steps, strict=True)]
             bits = _hash(cell, seed)
             offsets = [mi.Float((bits >> shift) & 1023) / 1024 for shift in (0, 10, 20)]
-            d = [mi.Float(c) + o - p for c, o, p in zip(cell, offsets, place, strict=True)]
+            d = [mi.Float(c) + o - p for c, o, p in zip(cell, offsets, position, strict=True)]
             squared = d[0] * d[0] + d[1] * d[1] + d[2] * d[2]
             number = mi.Float(_mix(bits + 0x9E3779B9) >> 8) / (1 << 24)
-            own = dr.select(squared < best, number, own)
+            best_number = dr.select(squared < best, number, best_number)
             best = dr.minimum(best, squared)
-        return np.array(dr.sqrt(best)) * np.float32(spacing_m), np.array(own)
+        return np.array(dr.sqrt(best)) * np.float32(spacing_m), np.array(best_number)
 
 
 def _mix(bits: mi.UInt32) -> mi.UInt32:
-    """A 32-bit integer hash (Wellons 2018, `lowbias32`)."""
+    """Hash a 32-bit integer: `lowbias32` of [Wellons 2018]."""
     bits = (bits ^ (bits >> 16)) * 0x7FEB352D
     bits = (bits ^ (bits >> 15)) * 0x846CA68B
     return bits ^ (bits >> 16)
@@ -62,9 +74,9 @@ def _hash(cell: list[mi.UInt32], seed: int) -> mi.UInt32:
     return _mix(cell[2] + _mix(cell[1] + _mix(cell[0] + start)))
 
 
-def _gradient_noise(place: list[mi.Float], seed: int) -> mi.Float:
-    cell = [mi.UInt32(p) for p in place]
-    local = [p - mi.Float(c) for p, c in zip(place, cell, strict=True)]
+def _gradient_noise(position: list[mi.Float], seed: int) -> mi.Float:
+    cell = [mi.UInt32(p) for p in position]
+    local = [p - mi.Float(c) for p, c in zip(position, cell, strict=True)]
     fade = [t * t * t * (t * (t * 6 - 15) + 10) for t in local]
     values = {}
     for steps in product((0, 1), repeat=3):

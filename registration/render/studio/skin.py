@@ -1,7 +1,7 @@
-"""A painted head: linear albedo in the model's atlas, made from solid noise at *template* positions.
+"""Procedural linear albedo of a head in the model's atlas, from solid noise at *template* positions.
 
-A solid texture has no seams and sticks to the surface under every identity and expression. Skin takes its colour from
-two pigments, melanin and haemoglobin (after Tsumura et al. 2003), each with its own variation.
+A solid texture has no seams and stays fixed to the surface under every identity and expression. The colour of skin
+depends on two pigments, melanin and haemoglobin, after [Tsumura 2003], each with its own variation.
 """
 
 from dataclasses import dataclass
@@ -12,15 +12,15 @@ from scipy.spatial import cKDTree
 
 from registration.model.gnm_npz import GNMData
 from registration.model.regions import exterior, group
-from registration.render.studio.canvas import Canvas, smoothstep, soft_group, softened, texture_of
+from registration.render.studio.canvas import Canvas, fill_texture, smoothed, smoothstep, soft_group
 from registration.render.studio.eyes import SIDES, eye_frame, paint_eye
 from registration.render.studio.noise import SolidNoise
 
 _UNPIGMENTED = np.array([0.86, 0.78, 0.70])
 _MELANIN = np.array([0.46, 0.76, 1.08])  # absorption per unit
 _BLOOD = np.array([0.10, 0.66, 0.60])
-_LIPS = np.array([0.80, 0.66, 0.80])  # what their thinner skin takes from the light besides
-_FLUSHED = {  # groups with more blood, and how much
+_LIPS = np.array([0.80, 0.66, 0.80])  # further attenuation by the thinner skin of the lips
+_FLUSH = {  # additional blood by vertex group
     "nose_region": 0.22,
     "left_cheek_region": 0.12,
     "right_cheek_region": 0.12,
@@ -31,31 +31,31 @@ _FLUSHED = {  # groups with more blood, and how much
     "left_orbital_region": 0.08,
     "right_orbital_region": 0.08,
 }
-_STUBBLED = ("chin_region", "upper_lip_region", "lower_lip_region", "left_cheek_region", "right_cheek_region")
-_LASHES_M = (0.0026, 0.0016)  # from the eyeball: where lids begin to be dark, and are
-_BROW_M = 0.0042  # half its height where it is fullest
+_BEARD_REGIONS = ("chin_region", "upper_lip_region", "lower_lip_region", "left_cheek_region", "right_cheek_region")
+_LASHES_M = (0.0026, 0.0016)  # distance from the eyeball where lids begin to darken, and where they are dark
+_BROW_M = 0.0042  # largest half height of a brow
 _BROW_HAIRS, _HAIR_M, _STRAND_M = 380, 0.0070, 0.00016  # number, length, half a hair's width
 
 
 @dataclass(frozen=True, kw_only=True)
-class Look:
-    """What a head is painted with. Colours are linear albedo."""
+class SkinAppearance:
+    """Colour and details of a head. Colours are linear albedo."""
 
     seed: int = 0
     melanin: float = 0.7  # 0.2 very light to 2.2 very dark
     blood: float = 0.30
-    unevenness: float = 1.0  # of the pigments; 0 is porcelain
+    unevenness: float = 1.0  # variation of the pigments; 0: none
     freckles: float = 0.35  # 0 to 1
     stubble: float = 0.25  # 0 to 1
     hair: tuple[float, float, float] = (0.055, 0.032, 0.018)
     iris: tuple[float, float, float] = (0.16, 0.21, 0.20)
 
     @classmethod
-    def drawn(cls, seed: int) -> "Look":
-        """One of many people."""
+    def sample(cls, seed: int) -> "SkinAppearance":
+        """Sample the appearance of a person."""
         rng = np.random.default_rng([seed, 5])
         melanin = float(rng.uniform(0.25, 2.0))
-        fair = rng.random() < 0.6 * max(0.0, 1 - melanin / 0.8)  # light hair and eyes go with light skin
+        fair = rng.random() < 0.6 * max(0.0, 1 - melanin / 0.8)  # light hair and eyes are correlated with light skin
         darkness = rng.uniform(0.6, 1.4)
         hair = np.array([0.16, 0.10, 0.045] if fair else [0.045, 0.027, 0.016]) * darkness
         brown, light = np.array([0.085, 0.045, 0.02]), np.array([0.16, 0.21, 0.22]) * rng.uniform(0.7, 1.2, 3)
@@ -70,30 +70,39 @@ class Look:
         )
 
 
-def scalp(data: GNMData) -> Float[np.ndarray, "V"]:
-    """How far (m) a vertex of the template lies inside the hairline; negative outside it.
+def depth_inside_hairline(data: GNMData) -> Float[np.ndarray, "V"]:
+    """Return the distance of the template's vertices from the hairline inside it, metres; negative outside.
 
-    Hair grows on the outer skin clear of the face mask and the ears: above the ears' lower rim behind them, above their
-    upper rim before them.
+    Hair grows on exterior skin outside the face mask and the ears: behind the ears above their lower end, in front of
+    them above their upper end.
     """
     points = data.template_vertex_positions.astype(np.float64)
     face, ears = (group(data, name) > 0.5 for name in ("hockey_mask", "ears"))
-    reach = cKDTree(points[face]).query(points)[0] - 0.002
+    depth = cKDTree(points[face]).query(points)[0] - 0.002
     if ears.any():
-        reach = np.minimum(reach, cKDTree(points[ears]).query(points)[0] - 0.006)
+        depth = np.minimum(depth, cKDTree(points[ears]).query(points)[0] - 0.006)
         low, high = points[ears].min(0), points[ears].max(0)
         sideburn = smoothstep((low[2] + high[2]) / 2, high[2], points[:, 2])
-        reach = np.minimum(reach, points[:, 1] - low[1] - sideburn * (0.8 * (high[1] - low[1])))
-    return np.where(exterior(data) & ~face & ~ears, reach, np.minimum(reach, -0.002))
+        depth = np.minimum(depth, points[:, 1] - low[1] - sideburn * (0.8 * (high[1] - low[1])))
+    return np.where(exterior(data) & ~face & ~ears, depth, np.minimum(depth, -0.002))
 
 
-def paint(data: GNMData, page: Canvas, look: Look) -> Float[np.ndarray, "R R 3"]:
-    """The head's linear albedo on the canvas of its atlas. A Mitsuba variant must be active."""
+def paint_head(data: GNMData, canvas: Canvas, look: SkinAppearance) -> Float[np.ndarray, "R R 3"]:
+    """Return the head's texture. A Mitsuba variant must be active.
+
+    Args:
+        data: the head model.
+        canvas: of its atlas.
+        look: colours and details.
+
+    Returns:
+        Linear albedo.
+    """
     template = data.template_vertex_positions
-    colours = np.zeros((page.size * page.size, 3), np.float32)
+    colours = np.zeros((canvas.size * canvas.size, 3), np.float32)
     names = data.mesh_component_names.tolist()
     for name in names:
-        part = page.only(group(data, name) > 0.5)
+        part = canvas.select(group(data, name) > 0.5)
         points = part.interpolate(template)
         if name in SIDES:
             colours[part.texel] = paint_eye(eye_frame(data, name), points, look.iris, look.seed)
@@ -101,10 +110,12 @@ def paint(data: GNMData, page: Canvas, look: Look) -> Float[np.ndarray, "R R 3"]
             colours[part.texel] = _skin(data, part, points, look)
         else:
             colours[part.texel] = _mouth(data, part, points, look.seed)
-    return texture_of(page.size, page.texel, colours[page.texel])
+    return fill_texture(canvas.size, canvas.texel, colours[canvas.texel])
 
 
-def _skin(data: GNMData, page: Canvas, points: Float[np.ndarray, "T 3"], look: Look) -> Float[np.ndarray, "T 3"]:
+def _skin(
+    data: GNMData, canvas: Canvas, points: Float[np.ndarray, "T 3"], look: SkinAppearance
+) -> Float[np.ndarray, "T 3"]:
     noise, seed, uneven = SolidNoise(points), 100 * look.seed, look.unevenness
     melanin = 1 + uneven * (
         0.10 * noise.smooth(0.055, seed + 1)
@@ -122,23 +133,23 @@ def _skin(data: GNMData, page: Canvas, points: Float[np.ndarray, "T 3"], look: L
     melanin += _moles(noise, seed)
     blood = look.blood * np.clip(blood, 0.2, 2.5)
     flush = sum(
-        (more * soft_group(data, name, 14) for name, more in _FLUSHED.items()),
+        (amount * soft_group(data, name, 14) for name, amount in _FLUSH.items()),
         np.zeros(len(data.template_vertex_positions)),
     )
-    blood += page.interpolate(flush) * (1 + 0.25 * uneven * noise.smooth(0.012, seed + 7))
-    lips = _lips(data, page)
+    blood += canvas.interpolate(flush) * (1 + 0.25 * uneven * noise.smooth(0.012, seed + 7))
+    lips = _lips(data, canvas)
     wrinkles = noise.smooth(0.0011, seed + 8, octaves=2)
     blood = blood * (1 - lips) + lips * (1.05 + 0.12 * wrinkles)
     melanin = melanin * (1 - lips) + lips * (0.9 * look.melanin + 0.10)
-    lining = page.interpolate(1.0 * ~exterior(data)) * (1 - page.interpolate(soft_group(data, "eye_sockets", 1)))
+    lining = canvas.interpolate(1.0 * ~exterior(data)) * (1 - canvas.interpolate(soft_group(data, "eye_sockets", 1)))
     blood += 0.9 * lining
     colour = _UNPIGMENTED * np.exp(-melanin[:, None] * _MELANIN - blood[:, None] * _BLOOD)
     colour *= 1 - lips[:, None] * (1 - _LIPS)
     colour *= _pores(noise, seed, uneven * (1 - lips))[:, None]
     for cover, darkness in (
-        (_stubble(data, page, noise, look), 0.75),
+        (_stubble(data, canvas, noise, look), 0.75),
         (_lashes(data, points), 0.85),
-        (_brows(data, page, points, look.seed), 0.9),
+        (_brows(data, canvas, points, look.seed), 0.9),
     ):
         colour += (cover * darkness)[:, None] * (np.array(look.hair) - colour)
     return colour.astype(np.float32)
@@ -158,37 +169,37 @@ def _moles(noise: SolidNoise, seed: int) -> Float[np.ndarray, "T"]:
 
 
 def _pores(noise: SolidNoise, seed: int, strength: Float[np.ndarray, "T"]) -> Float[np.ndarray, "T"]:
-    """What shade is left by pores of half a millimetre and the fine lines between them."""
+    """Return the shading factor of pores of half a millimetre and the fine lines between them."""
     distance, number = noise.dots(0.0014, seed + 23)
     pore = smoothstep(0.00048, 0.00010, distance) * (0.35 + 0.65 * number)
     grain = noise.smooth(0.0009, seed + 24, octaves=2)
     return np.clip(1 - strength * (0.20 * pore + 0.028 * grain), 0.3, 1.2)
 
 
-def _lips(data: GNMData, page: Canvas) -> Float[np.ndarray, "T"]:
+def _lips(data: GNMData, canvas: Canvas) -> Float[np.ndarray, "T"]:
     both = np.maximum(group(data, "upper_lip"), group(data, "lower_lip")).astype(np.float64)
-    # The mouth's lining continues the lips, so that they do not fade where they meet.
+    # The oral lining continues the lips, so that they do not fade where they meet.
     inner = np.maximum(both, group(data, "mouth_sock"))
-    return smoothstep(0.32, 0.68, page.interpolate(softened(data, inner, 3)))
+    return smoothstep(0.32, 0.68, canvas.interpolate(smoothed(data, inner, 3)))
 
 
-def _stubble(data: GNMData, page: Canvas, noise: SolidNoise, look: Look) -> Float[np.ndarray, "T"]:
+def _stubble(data: GNMData, canvas: Canvas, noise: SolidNoise, look: SkinAppearance) -> Float[np.ndarray, "T"]:
     if look.stubble <= 0:
-        return np.zeros(len(page.texel), np.float32)
-    beard = np.max([soft_group(data, name, 6) for name in _STUBBLED], axis=0)
+        return np.zeros(len(canvas.texel), np.float32)
+    beard = np.max([soft_group(data, name, 6) for name in _BEARD_REGIONS], axis=0)
     lips = np.max([soft_group(data, name, 2) for name in ("upper_lip", "lower_lip")], axis=0)
-    beard = softened(data, beard * (1 - np.clip(3 * lips, 0, 1)), 4) * (1 - np.clip(3 * lips, 0, 1))
+    beard = smoothed(data, beard * (1 - np.clip(3 * lips, 0, 1)), 4) * (1 - np.clip(3 * lips, 0, 1))
     distance, number = noise.dots(0.0011, 100 * look.seed + 25)
     hairs = smoothstep(0.00042, 0.00012, distance) * (0.4 + 0.6 * number)
-    return look.stubble * page.interpolate(beard) * (0.25 + 0.75 * hairs) * 0.8
+    return look.stubble * canvas.interpolate(beard) * (0.25 + 0.75 * hairs) * 0.8
 
 
 def _lashes(data: GNMData, points: Float[np.ndarray, "T 3"]) -> Float[np.ndarray, "T"]:
-    """A dark line on the lids where they near the eyeball, fuller above the eye."""
+    """Return the coverage of a dark line where the lids touch the eyeball, thicker above the eye."""
     cover = np.zeros(len(points), np.float32)
     for side in SIDES:
         frame = eye_frame(data, side)
-        height, _, angle = frame.polar(points.astype(np.float64))
+        height, _, angle = frame.cylindrical(points.astype(np.float64))
         gap = np.linalg.norm(points - frame.centre, axis=1) - frame.radius
         above = smoothstep(-0.1, 0.35, np.sin(angle))
         line = smoothstep(*_LASHES_M, gap) * (height > 0)
@@ -196,8 +207,8 @@ def _lashes(data: GNMData, points: Float[np.ndarray, "T 3"]) -> Float[np.ndarray
     return cover
 
 
-def _brows(data: GNMData, page: Canvas, points: Float[np.ndarray, "T 3"], seed: int) -> Float[np.ndarray, "T"]:
-    """Short strokes along an arc through each brow region, drawn in the arc's own plane."""
+def _brows(data: GNMData, canvas: Canvas, points: Float[np.ndarray, "T 3"], seed: int) -> Float[np.ndarray, "T"]:
+    """Return the coverage of short strokes along an arc through each brow region, in the arc's unrolled plane."""
     cover = np.zeros(len(points), np.float32)
     template = data.template_vertex_positions.astype(np.float64)
     for number, (name, sign) in enumerate((("left_brow_region", 1.0), ("right_brow_region", -1.0))):
@@ -206,46 +217,46 @@ def _brows(data: GNMData, page: Canvas, points: Float[np.ndarray, "T 3"], seed: 
             continue
         degree = min(2, len(np.unique(region[:, 0].round(4))) - 1)
         arc, depth = np.polyfit(region[:, 0], region[:, 1], degree), np.polyfit(region[:, 0], region[:, 2], degree)
-        low, high = np.percentile(region[:, 0], (4, 80))  # the region reaches farther out than the hairs
+        low, high = np.percentile(region[:, 0], (4, 80))  # the region extends beyond the hairs
         x = np.linspace(low - _HAIR_M, high + _HAIR_M, 96)
         y = np.polyval(arc, x) + 0.12 * np.ptp(region[:, 1])
         along = np.r_[0, np.cumsum(np.linalg.norm(np.diff([x, y, np.polyval(depth, x)], axis=1), axis=0))]
         along -= np.interp(low, x, along)
-        near = np.flatnonzero(page.interpolate(soft_group(data, name, 2)) > 0.02)
-        own = points[near] * (sign, 1, 1)
-        flat = np.stack([np.interp(own[:, 0], x, along), own[:, 1] - np.interp(own[:, 0], x, y)], 1)
+        near = np.flatnonzero(canvas.interpolate(soft_group(data, name, 2)) > 0.02)
+        local = points[near] * (sign, 1, 1)
+        flat = np.stack([np.interp(local[:, 0], x, along), local[:, 1] - np.interp(local[:, 0], x, y)], 1)
         strokes = _strokes(flat, np.interp(high, x, along), np.random.default_rng([seed, 6, number]))
-        cover[near] = np.maximum(cover[near], strokes * ((own[:, 0] > x[0]) & (own[:, 0] < x[-1])))
+        cover[near] = np.maximum(cover[near], strokes * ((local[:, 0] > x[0]) & (local[:, 0] < x[-1])))
     return cover
 
 
-def _strokes(places: Float[np.ndarray, "N 2"], length: float, rng: np.random.Generator) -> Float[np.ndarray, "N"]:
-    """How much hair covers places along and across a brow of some length (m)."""
+def _strokes(points: Float[np.ndarray, "N 2"], length: float, rng: np.random.Generator) -> Float[np.ndarray, "N"]:
+    """Return the coverage by hair of points (m) along and across a brow of a given length (m)."""
     s = rng.uniform(0.02, 0.93, _BROW_HAIRS)
     width = _BROW_M * np.sin(np.pi * np.clip(0.18 + 0.82 * s, 0, 1)) ** 0.7 * (1 - 0.45 * s)
     t = width * rng.uniform(-1, 1, _BROW_HAIRS)
-    # Upwards at the nose, then along the brow, and the upper hairs lean down onto the lower ones.
-    turn = np.radians(62 * (1 - s) ** 1.5 + 6 - 22 * s * (t / _BROW_M) + rng.normal(0, 9, _BROW_HAIRS))
-    reach = _HAIR_M * rng.uniform(0.6, 1.1, _BROW_HAIRS) * np.where(s < 0.1, 0.7, 1)
+    # Upwards at the nose, then along the brow; upper hairs lean towards the lower ones.
+    angle = np.radians(62 * (1 - s) ** 1.5 + 6 - 22 * s * (t / _BROW_M) + rng.normal(0, 9, _BROW_HAIRS))
+    hair_length = _HAIR_M * rng.uniform(0.6, 1.1, _BROW_HAIRS) * np.where(s < 0.1, 0.7, 1)
     step = np.linspace(0, 1, 40)
-    bend = turn[:, None] - np.radians(18) * step
-    x = (s * length)[:, None] + reach[:, None] * np.cumsum(np.cos(bend), 1) / 40
-    y = (t - 0.25 * width)[:, None] + reach[:, None] * np.cumsum(np.sin(bend), 1) / 40
+    bend = angle[:, None] - np.radians(18) * step
+    x = (s * length)[:, None] + hair_length[:, None] * np.cumsum(np.cos(bend), 1) / 40
+    y = (t - 0.25 * width)[:, None] + hair_length[:, None] * np.cumsum(np.sin(bend), 1) / 40
     taper = np.tile(1 - 0.75 * step, (_BROW_HAIRS, 1))
     strands = cKDTree(np.stack([x.ravel(), y.ravel()], 1))
-    distance, which = strands.query(places, distance_upper_bound=0.003)
+    distance, which = strands.query(points, distance_upper_bound=0.003)
     half = _STRAND_M * np.r_[taper.ravel(), 0.0][which]
     hair = smoothstep(1.0, 0.0, (distance - half) / 0.00030) * (half > 0)
     shadow = 0.32 * np.exp(-((np.minimum(distance, 0.01) / 0.0009) ** 2))
     return np.maximum(hair, shadow).astype(np.float32)
 
 
-def _mouth(data: GNMData, page: Canvas, points: Float[np.ndarray, "T 3"], seed: int) -> Float[np.ndarray, "T 3"]:
-    """Teeth, gums and tongue."""
+def _mouth(data: GNMData, canvas: Canvas, points: Float[np.ndarray, "T 3"], seed: int) -> Float[np.ndarray, "T 3"]:
+    """Return the albedo of teeth, gums and tongue."""
     noise = SolidNoise(points)
-    teeth = smoothstep(0.4, 0.6, page.interpolate(soft_group(data, "teeth", 0)))[:, None]
+    teeth = smoothstep(0.4, 0.6, canvas.interpolate(soft_group(data, "teeth", 0)))[:, None]
     stained = (1 + 0.05 * noise.smooth(0.006, 100 * seed + 30, octaves=2))[:, None]
     wet = (1 + 0.12 * noise.smooth(0.004, 100 * seed + 31, octaves=3))[:, None]
-    flesh = np.array([0.46, 0.17, 0.15]) * wet
+    mucosa = np.array([0.46, 0.17, 0.15]) * wet
     enamel = np.array([0.70, 0.64, 0.52]) * stained
-    return np.clip(flesh + teeth * (enamel - flesh), 0, 0.95).astype(np.float32)
+    return np.clip(mucosa + teeth * (enamel - mucosa), 0, 0.95).astype(np.float32)

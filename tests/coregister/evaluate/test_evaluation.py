@@ -250,12 +250,12 @@ def test_a_model_of_the_official_size_on_its_own_samples():
 def test_subjects_outside_the_first_models_span(anatomy, model, model_file):
     data, source = gnm_npz.read(model_file), anatomy.source
     rng = np.random.default_rng(12345)
-    performed = [expressions.named(name) for name in ("smile", "jaw_open", "brows_up")]
+    performed = [expressions.expression_by_name(name) for name in ("smile", "jaw_open", "brows_up")]
 
     def subject(number, draw):
         person = draw(source, rng)
         neutral, joints = anatomy.assemble(person, {name: source.target(name) for name in person.weights})
-        meshes = np.stack([expressions.perform(anatomy, expression, neutral, joints) for expression in performed])
+        meshes = np.stack([expressions.apply_expression(anatomy, each, neutral, joints) for each in performed])
         return HeldOutSubject(
             subject=f"{draw.__name__}_{number}",
             neutral=neutral,

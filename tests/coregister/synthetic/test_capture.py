@@ -7,10 +7,8 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from scipy.spatial.transform import Rotation
 
-from coregister.synthetic import capture as synth
-from coregister.synthetic.capture import LABELS, Studio, write_capture
+from coregister.synthetic.capture import LABELS, Studio, render_capture
 from registration.capture import native, triangulation
 from registration.capture.doctor import check_capture
 from registration.capture.pixels import read_image, read_labels, read_mask, read_normals
@@ -50,7 +48,7 @@ def vertices() -> np.ndarray:
 
 
 def make(root: Path, studio: Studio) -> Path:
-    return write_capture(
+    return render_capture(
         root,
         data=TINY,
         vertices=vertices(),
@@ -268,7 +266,7 @@ def test_vertices_that_are_not_the_models(tmp_path) -> None:
     broken[3, 1] = np.nan
     for wrong in (vertices()[:-1], broken):
         with pytest.raises(InputError, match="vertices"):
-            write_capture(
+            render_capture(
                 tmp_path / "x", data=TINY, vertices=wrong, schemes={}, subject="s", expression="e", studio=SMALL
             )
 
@@ -278,11 +276,3 @@ def test_a_folder_that_is_there_stays(tmp_path) -> None:
     with pytest.raises(InputError, match="exists"):
         make(tmp_path / "mine", SMALL)
     assert list((tmp_path / "mine").iterdir()) == []
-
-
-def test_the_pose_of_a_head_is_found() -> None:
-    turn = Rotation.from_rotvec([0.4, 2.0, -0.5]).as_matrix()
-    moved = TINY.template_vertex_positions.astype(np.float64) @ turn.T + (1, 2, 3)
-    rotation, translation = synth.pose(TINY, moved)
-    np.testing.assert_allclose(rotation, turn, atol=1e-6)
-    np.testing.assert_allclose(translation, (1, 2, 3), atol=1e-6)

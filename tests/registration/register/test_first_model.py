@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from coregister.first_model import build, makehuman
-from coregister.synthetic.subject import capture
+from coregister.synthetic.subject import synthesize_capture
 from registration.errors import InputError
 from registration.model import gnm_npz, regions
 from registration.pipeline import register
@@ -27,7 +27,7 @@ def model() -> Path:
 
 def test_neutral(model: Path, tmp_path: Path) -> None:
     """The demo's bound: scan to mesh on the face, mean, mm."""
-    root = capture(tmp_path / "capture", seed=8)
+    root = synthesize_capture(tmp_path / "capture", seed=8)
     register(root, model, tmp_path / "out")
     figures = read_manifest(tmp_path / "out").figures
     print(figures["scan_to_mesh"]["face"], figures["vertex_error"]["face"])
@@ -36,7 +36,7 @@ def test_neutral(model: Path, tmp_path: Path) -> None:
 
 def test_teeth_and_tongue_of_an_open_mouth(model: Path, tmp_path: Path) -> None:
     """Teeth and tongue have no offsets: images and the `oral` landmarks must determine them through the model."""
-    root = capture(tmp_path / "capture", seed=5, expression="jaw_open")
+    root = synthesize_capture(tmp_path / "capture", seed=5, expression="jaw_open")
     result = register(root, model, tmp_path / "out")
     error = errors_mm(result, root)
     data = gnm_npz.read(model)

@@ -17,14 +17,14 @@ from registration.model import gnm_npz
 from registration.model.atlas import texture_atlas
 from registration.model.regions import group, vertex_classes
 from registration.render import backend
-from registration.render.studio.canvas import canvas, smoothstep, texture_of
+from registration.render.studio.canvas import fill_texture, make_canvas, smoothstep
 from registration.render.studio.eyes import corneas, eye_frame
-from registration.render.studio.light import Sky, bake
+from registration.render.studio.light import Sky, bake_light
 from registration.render.studio.noise import SolidNoise
-from registration.render.studio.rig import FILL, LARGEST_PX, SPREAD_DEG, rig
-from registration.render.studio.scene import StudioScene, StudioSurface, subdivided, with_normals
-from registration.render.studio.shoot import HIDDEN, Quality, Sensor, distorted_pixels, shoot
-from registration.render.studio.skin import Look, paint, scalp
+from registration.render.studio.rig import HEAD_FRACTION, MAX_SIDE_PX, SPREAD_DEG, RigOptions, make_rig
+from registration.render.studio.scene import StudioScene, StudioSurface, subdivide, surface_normals
+from registration.render.studio.shoot import HIDDEN_CONFIDENCE, Quality, Sensor, distorted_pixels, render_views
+from registration.render.studio.skin import SkinAppearance, depth_inside_hairline, paint_head
 from registration.types import Camera
 from tests.conftest import FIXTURES
 
@@ -43,9 +43,9 @@ def head(data=TINY, texels=256, **settings) -> StudioSurface:
         vertices=data.template_vertex_positions.astype(np.float64),
         triangles=data.triangles.astype(np.int64),
         corner_uvs=texture_atlas(data),
-        texture=paint(data, canvas(data, texels), Look(**settings)),
+        texture=paint_head(data, make_canvas(data, texels), SkinAppearance(**settings)),
         classes=vertex_classes(data)[1],
-        clear=corneas(data),
+        transparent=corneas(data),
     )
 
 
@@ -79,7 +79,7 @@ def path_traced(surface: StudioSurface, camera: Camera, sky: Sky, samples: int) 
     """The same scene by Mitsuba's `path` integrator: its own meshes, textures, environment and camera."""
     import mitsuba as mi
 
-    kept = np.ones(len(surface.triangles), bool) if surface.clear is None else ~surface.clear
+    kept = np.ones(len(surface.triangles), bool) if surface.transparent is None else ~surface.transparent
     corners = surface.triangles[kept].ravel()
     texture = {"type": "bitmap", "bitmap": mi.Bitmap(surface.texture.astype(np.float32)), "raw": True}
     properties = mi.Properties()
@@ -87,7 +87,7 @@ def path_traced(surface: StudioSurface, camera: Camera, sky: Sky, samples: int) 
     mesh = mi.Mesh("head", len(corners), len(corners) // 3, properties, True, True)
     arrays = mi.traverse(mesh)
     arrays["vertex_positions"] = mi.Float(surface.vertices[corners].astype(np.float32).ravel())
-    arrays["vertex_normals"] = mi.Float(with_normals(surface)[corners].astype(np.float32).ravel())
+    arrays["vertex_normals"] = mi.Float(surface_normals(surface)[corners].astype(np.float32).ravel())
     uvs = surface.corner_uvs[kept].reshape(-1, 2) * (1, -1) + (0, 1)
     arrays["vertex_texcoords"] = mi.Float(uvs.astype(np.float32).ravel())
     arrays["faces"] = mi.UInt32(np.arange(len(corners), dtype=np.uint32))
@@ -143,7 +143,9 @@ def rms_255(view, reference: np.ndarray) -> float:
 @pytest.mark.parametrize("yaw", [0.2, -1.1])
 def test_pictures_equal_full_path_tracing(yaw):
     surface, sky, camera = head(), Sky(), plain_camera(yaw)
-    [view] = shoot([surface], [camera], sky=sky, quality=Quality(pixel_samples=6, light_rays=512, subdivisions=2))
+    [view] = render_views(
+        [surface], [camera], sky=sky, quality=Quality(pixel_samples=6, light_rays=512, subdivisions=2)
+    )
     reference = path_traced(surface, camera, sky, 512)
     assert rms_255(view, reference) < 5
     # The picture is no constant that any light would pass.
@@ -158,9 +160,9 @@ def test_pictures_of_eyes_under_corneas_equal_full_path_tracing():
     except InputError as error:
         pytest.skip(f"{error.what}: {error.got}")
     surface, sky = head(data, 1024), Sky()
-    assert surface.clear.sum() > 100
+    assert surface.transparent.sum() > 100
     for camera in (plain_camera(0.3), plain_camera(0.1, focal=1500.0, centre=np.array([0.03, 0.305, 0.1]))):
-        [view] = shoot([surface], [camera], sky=sky, quality=Quality(pixel_samples=6))
+        [view] = render_views([surface], [camera], sky=sky, quality=Quality(pixel_samples=6))
         difference = rms_255(view, path_traced(surface, camera, sky, 256))
         print(f"{difference:.2f} of 255")
         assert difference < 5
@@ -170,7 +172,7 @@ def test_light_on_a_ball_is_a_formula():
     """Nothing shades a ball: its irradiance over pi is brightness (1 + 2/3 contrast cos)."""
     sky = Sky(brightness=0.7, contrast=0.6, towards=(0.0, 2.0, 1.0), tint=(1.0, 0.8, 0.5))
     scene = StudioScene([ball()])
-    light = bake(scene, sky, rays=256, seed=3)
+    light = bake_light(scene, sky, rays=256, seed=3)
     towards = np.array([0, 2, 1]) / np.sqrt(5)
     expected = 0.7 * (1 + 2 / 3 * 0.6 * (scene.normals @ towards))[:, None] * [1, 0.8, 0.5]
     assert np.abs(light - expected).max() < 0.01
@@ -178,10 +180,10 @@ def test_light_on_a_ball_is_a_formula():
 
 def test_light_between_surfaces_bounces():
     """Inside a closed, white-free shell of albedo a no sky is seen; near a grey ball light of its colour arrives."""
-    alone = bake(StudioScene([ball()]), Sky(contrast=0.0, brightness=1.0))
+    alone = bake_light(StudioScene([ball()]), Sky(contrast=0.0, brightness=1.0))
     red = np.broadcast_to(np.array([0.9, 0.0, 0.0], np.float32), (4, 4, 3))
     scene = StudioScene([ball(), ball(0.5, (0.0, 0.0, -0.61), red)])
-    light = bake(scene, Sky(contrast=0.0, brightness=1.0))[: len(alone)]
+    light = bake_light(scene, Sky(contrast=0.0, brightness=1.0))[: len(alone)]
     near = scene.vertices[: len(alone), 2] < -0.09
     assert light[near, 1].mean() < 0.2 < 0.6 < light[near, 0].mean()
     assert np.abs(light[scene.vertices[: len(alone), 2] > 0.099] - 1).max() < 0.01
@@ -190,7 +192,7 @@ def test_light_between_surfaces_bounces():
 def test_normals_are_the_meshs():
     """At pixel centres, within one degree of angle-weighted normals at what the NumPy rasteriser finds there."""
     surface = head()
-    cameras = rig(3, (150, 200), 5, centre=HEAD_CENTRE, spread_deg=(80, 30))
+    cameras = make_rig(RigOptions(cameras=3, size_px=(150, 200), seed=5, spread_deg=(80, 30)), centre=HEAD_CENTRE)
     corners = surface.vertices[surface.triangles]
     area = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     normals = np.zeros_like(surface.vertices)
@@ -198,7 +200,7 @@ def test_normals_are_the_meshs():
     unit = area / np.linalg.norm(area, axis=1, keepdims=True)
     np.add.at(normals, surface.triangles.ravel(), (angles[..., None] * unit[:, None]).reshape(-1, 3))
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
-    for view in shoot([surface], cameras, quality=Quality(pixel_samples=1, light_rays=16)):
+    for view in render_views([surface], cameras, quality=Quality(pixel_samples=1, light_rays=16)):
         face, weights = rasterize(surface.vertices, surface.triangles, view.camera)
         hit = view.normals.any(-1)
         assert (hit == (face >= 0)).mean() > 0.999 and (hit == (view.labels > 0)).all()
@@ -222,8 +224,10 @@ def test_normals_are_the_meshs():
 
 def test_the_mask_is_coverage_through_the_lens():
     """A ball's silhouette is a cone: its share of the image is known, and its outline bends as OpenCV says."""
-    camera = replace(rig(1, (200, 200), 0, head_height_m=0.24)[0], distortion=(0.6, -2.0, 0.02, -0.01))
-    [view] = shoot([ball(fineness=6)], [camera], quality=Quality(pixel_samples=4, light_rays=4, subdivisions=0))
+    camera = replace(
+        make_rig(RigOptions(cameras=1, size_px=(200, 200)), head_height_m=0.24)[0], distortion=(0.6, -2.0, 0.02, -0.01)
+    )
+    [view] = render_views([ball(fineness=6)], [camera], quality=Quality(pixel_samples=4, light_rays=4, subdivisions=0))
     away = -camera.centre
     distance = np.linalg.norm(away)
     axis = away / distance
@@ -245,11 +249,11 @@ def test_clear_faces_show_in_masks_and_labels_alone():
     outer = replace(
         outer,
         classes=np.tile([0.0, 1.0], (len(outer.vertices), 1)).astype(np.float32),
-        clear=np.ones(len(outer.triangles), bool),
+        transparent=np.ones(len(outer.triangles), bool),
     )
     camera = plain_camera(0.0, centre=np.zeros(3))
     quality = Quality(pixel_samples=2, light_rays=64)
-    [alone], [both] = (shoot(surfaces, [camera], quality=quality) for surfaces in ([inner], [inner, outer]))
+    [alone], [both] = (render_views(surfaces, [camera], quality=quality) for surfaces in ([inner], [inner, outer]))
     np.testing.assert_allclose(both.rgb, alone.rgb, atol=1e-6)
     assert set(np.unique(both.labels)) == {0, 2} and both.mask.sum() > 1.4 * alone.mask.sum()
 
@@ -257,25 +261,26 @@ def test_clear_faces_show_in_masks_and_labels_alone():
 def test_landmarks_are_hidden_behind_the_head_and_outside_the_image():
     camera = plain_camera(0.0, centre=np.zeros(3))
     points = np.array([[0.0, 0, 0.1], [0.0, 0, -0.1], [0.0, 0.3, 0.0], [0.05, 0.0, 0.2]])
-    [view] = shoot([ball()], [camera], landmarks={"four": points}, quality=Quality(light_rays=4))
-    np.testing.assert_allclose(view.landmarks["four"][:, 2], [1, HIDDEN, HIDDEN, 1])
+    [view] = render_views([ball()], [camera], landmarks={"four": points}, quality=Quality(light_rays=4))
+    np.testing.assert_allclose(view.landmarks["four"][:, 2], [1, HIDDEN_CONFIDENCE, HIDDEN_CONFIDENCE, 1])
     np.testing.assert_allclose(view.landmarks["four"][:, :2], camera.project(points)[0], atol=1e-9)
 
 
 def test_equal_seeds_give_equal_pictures():
-    surface, cameras = head(), rig(2, (60, 80), 0, centre=HEAD_CENTRE, spread_deg=(40, 0))
+    surface = head()
+    cameras = make_rig(RigOptions(cameras=2, size_px=(60, 80), spread_deg=(40, 0)), centre=HEAD_CENTRE)
     sensor = Sensor(shot_noise=0.02, read_noise=0.005, exposure_spread=0.1, colour_spread=0.05)
 
     def pictures(seed):
-        return shoot([surface], cameras, sensor=sensor, quality=Quality(light_rays=64), seed=seed)
+        return render_views([surface], cameras, sensor=sensor, quality=Quality(light_rays=64), seed=seed)
 
     first, again, other = pictures(1), pictures(1), pictures(2)
     for a, b, c in zip(first, again, other, strict=True):
         for name in ("rgb", "mask", "normals", "labels"):
             assert (getattr(a, name) == getattr(b, name)).all()
         assert (a.rgb != c.rgb).mean() > 0.5 and (a.labels == c.labels).all()
-    assert (rig(5, seed=1)[0].T_cam_world == rig(5, seed=1)[0].T_cam_world).all()
-    assert (rig(5, seed=1)[0].T_cam_world != rig(5, seed=2)[0].T_cam_world).any()
+    first, again, other = (make_rig(RigOptions(cameras=5, seed=seed))[0].T_cam_world for seed in (1, 1, 2))
+    assert (first == again).all() and (first != other).any()
 
 
 def test_noise_and_gains_are_as_told():
@@ -283,7 +288,7 @@ def test_noise_and_gains_are_as_told():
     quality = Quality(pixel_samples=1, light_rays=4)
 
     def background(count, **settings):
-        views = shoot(
+        views = render_views(
             [ball(0.02)], [camera] * count, sensor=Sensor(**settings), background=(0.25, 0.25, 0.25), quality=quality
         )
         return np.stack([view.rgb[:30].reshape(-1, 3) for view in views])  # above the ball
@@ -297,8 +302,8 @@ def test_noise_and_gains_are_as_told():
 
 def test_subdivision_keeps_shape_and_everything_on_it():
     surface = head()
-    fine = subdivided(surface)
-    assert len(fine.triangles) == 4 * len(surface.triangles) and len(fine.clear) == len(fine.triangles)
+    fine = subdivide(surface)
+    assert len(fine.triangles) == 4 * len(surface.triangles) and len(fine.transparent) == len(fine.triangles)
 
     def area(s):
         a, b, c = s.vertices[s.triangles].transpose(1, 0, 2)
@@ -307,13 +312,13 @@ def test_subdivision_keeps_shape_and_everything_on_it():
     np.testing.assert_allclose(area(fine).reshape(4, -1).sum(0), area(surface), rtol=1e-9, atol=1e-15)
     rng = np.random.default_rng(0)
     values = rng.random((len(surface.vertices), 3))
-    moved = subdivided(replace(surface, vertices=values))
-    uvs = subdivided(replace(surface, corner_uvs=values[surface.triangles][..., :2]))
+    moved = subdivide(replace(surface, vertices=values))
+    uvs = subdivide(replace(surface, corner_uvs=values[surface.triangles][..., :2]))
     np.testing.assert_allclose(uvs.corner_uvs, moved.vertices[moved.triangles][..., :2], atol=1e-12)
 
 
 def test_the_rig_frames_the_head_from_where_it_should():
-    cameras = rig(22, (480, 720), 4)
+    cameras = make_rig(RigOptions(cameras=22, size_px=(480, 720), seed=4))
     out = np.stack([camera.centre for camera in cameras])
     yaw, pitch = (
         np.degrees(np.arctan2(out[:, 0], out[:, 2])),
@@ -327,23 +332,23 @@ def test_the_rig_frames_the_head_from_where_it_should():
         middle = camera.project(np.zeros((1, 3)))[0][0] / (480, 720)
         assert np.abs(middle - 0.5).max() < 0.03
         height = np.ptp(camera.project(tall)[0][:, 1]) / 720
-        assert FILL * np.cos(np.radians(34)) * 0.93 < height < FILL * 1.08
+        assert HEAD_FRACTION * np.cos(np.radians(34)) * 0.93 < height < HEAD_FRACTION * 1.08
     assert (
         len({camera.intrinsics[0, 0] for camera in cameras})
         == len({camera.intrinsics[0, 2] for camera in cameras})
         == 22
     )
-    turned = rig(1, R_world_head=np.diag([-1.0, 1, -1]), centre=np.array([1.0, 2, 3]))[0]
+    turned = make_rig(RigOptions(cameras=1), R_world_head=np.diag([-1.0, 1, -1]), centre=np.array([1.0, 2, 3]))[0]
     assert (turned.centre - (1, 2, 3))[2] < -1.1
 
 
 @pytest.mark.parametrize("count", [1, 2, 3, 5, 8, 22, 40])
 def test_rigs_of_any_size(count):
-    assert len(rig(count, (64, 48))) == count
+    assert len(make_rig(RigOptions(cameras=count, size_px=(64, 48)))) == count
 
 
 def test_the_lens_moves_corners_by_a_few_pixels():
-    for camera in rig(6, (480, 720), 1, True):
+    for camera in make_rig(RigOptions(cameras=6, size_px=(480, 720), seed=1, distortion=True)):
         corners = np.array([[1.0, 1], [479, 1], [1, 719], [479, 719]])
         straight = cv2.undistortPoints(
             corners[:, None], camera.intrinsics, np.array(camera.distortion), P=camera.intrinsics
@@ -355,20 +360,24 @@ def test_the_lens_moves_corners_by_a_few_pixels():
 @pytest.mark.parametrize(
     "settings",
     [
-        {"count": 0},
-        {"count": -3},
+        {"cameras": 0},
+        {"cameras": -3},
         {"size_px": (0, 100)},
         {"size_px": (100, -1)},
-        {"size_px": (LARGEST_PX + 1, 100)},
-        {"head_height_m": 0.0},
-        {"head_height_m": float("nan")},
+        {"size_px": (MAX_SIDE_PX + 1, 100)},
         {"spread_deg": (400.0, 10.0)},
     ],
 )
 def test_rigs_that_cannot_be(settings):
     with pytest.raises(InputError) as caught:
-        rig(**settings)
+        make_rig(RigOptions(**settings))
     assert "expected" in str(caught.value) and "fix" in str(caught.value)
+
+
+@pytest.mark.parametrize("height_m", [0.0, float("nan")])
+def test_a_rig_needs_a_positive_head_height(height_m):
+    with pytest.raises(InputError, match="height"):
+        make_rig(head_height_m=height_m)
 
 
 def test_noise_is_a_function_of_space():
@@ -385,7 +394,7 @@ def test_noise_is_a_function_of_space():
 
 def test_the_texture_has_no_seams():
     """Faces on both sides of a cut in the map show one colour along it."""
-    texture = paint(TINY, canvas(TINY, 1024), Look(freckles=0.0, stubble=0.0))
+    texture = paint_head(TINY, make_canvas(TINY, 1024), SkinAppearance(freckles=0.0, stubble=0.0))
     surface = replace(head(), texture=cv2.blur(texture, (5, 5)))
     scene = StudioScene([surface])
     from registration.geometry.topology import edges
@@ -416,7 +425,7 @@ def test_the_face_is_painted_where_it_is():
     albedo = StudioScene([surface]).vertex_albedo()
     frame = eye_frame(TINY, "left_eye")
     points = TINY.template_vertex_positions.astype(np.float64)
-    _, away, _ = frame.polar(points)
+    _, away, _ = frame.cylindrical(points)
     eye = group(TINY, "left_eye") > 0.5
     front = eye & (points[:, 2] > frame.centre[2])
     assert albedo[front & (away < 0.5 * frame.pupil_radius)].max() < 0.1
@@ -424,30 +433,30 @@ def test_the_face_is_painted_where_it_is():
     cheek = albedo[group(TINY, "left_cheek_region") > 0.5].mean(0)
     lip = albedo[group(TINY, "lower_lip") > 0.5].mean(0)
     assert lip[1] / lip[0] < 0.8 * cheek[1] / cheek[0]
-    dark = paint(TINY, canvas(TINY, 256), Look(melanin=2.0))
+    dark = paint_head(TINY, make_canvas(TINY, 256), SkinAppearance(melanin=2.0))
     assert dark.mean() < 0.6 * surface.texture.mean() and dark.min() >= 0 and surface.texture.max() <= 1
 
 
 def test_the_hairline_leaves_face_and_ears_free():
-    reach = scalp(TINY)
+    reach = depth_inside_hairline(TINY)
     points = TINY.template_vertex_positions
     assert (reach[(group(TINY, "hockey_mask") > 0.5) | (group(TINY, "ears") > 0.5)] < 0).all()
     assert reach[points[:, 1].argmax()] > 0.02 and (reach[points[:, 1] < 0.2] < 0).all()
 
 
 def test_looks_differ_and_stay_possible():
-    looks = [Look.drawn(seed) for seed in range(30)]
-    assert looks[3] == Look.drawn(3) and len({look.melanin for look in looks}) == 30
+    looks = [SkinAppearance.sample(seed) for seed in range(30)]
+    assert looks[3] == SkinAppearance.sample(3) and len({look.melanin for look in looks}) == 30
     for look in looks:
         assert 0.2 < look.melanin < 2.2 and 0 <= look.freckles <= 1 and 0 <= look.stubble <= 1
         assert all(0 < value < 0.5 for value in (*look.hair, *look.iris))
 
 
 def test_canvas_covers_every_face_and_fills_the_rest():
-    page = canvas(TINY, 256)
+    page = make_canvas(TINY, 256)
     points = page.interpolate(TINY.template_vertex_positions)
     assert np.isfinite(points).all() and (page.weights.sum(1) == pytest.approx(1, abs=1e-5))
-    texture = texture_of(256, page.texel, points)
+    texture = fill_texture(256, page.texel, points)
     assert (texture.reshape(-1, 3)[page.texel] == points).all()
     assert {tuple(row) for row in texture.reshape(-1, 3).tolist()} == {tuple(row) for row in points.tolist()}
     np.testing.assert_allclose(smoothstep(2.0, 1.0, np.array([0.5, 1.5, 2.5])), [1, 0.5, 0])

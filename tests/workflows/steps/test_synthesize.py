@@ -22,7 +22,7 @@ ACTS = ("smile", "jaw_open")
 
 
 class Photographs:
-    """Stands in for `subjects.capture`: a folder with what it was asked for and a truth drawn by the seed."""
+    """Stand-in for `synthesize_capture`: a folder with what it was asked for and a truth drawn by the seed."""
 
     def __init__(self) -> None:
         self.made: list[str] = []
@@ -44,7 +44,7 @@ class Photographs:
 @pytest.fixture
 def photographs(monkeypatch) -> Photographs:
     found = Photographs()
-    monkeypatch.setattr(subjects, "capture", found)
+    monkeypatch.setattr(subjects, "synthesize_capture", found)
 
     def here(function, calls, jobs) -> Iterator[tuple[str, str]]:
         yield from ((name, function(**call)) for name, call in calls.items())
