@@ -1,4 +1,4 @@
-"""What can be said about an image file without decoding its pixels."""
+"""Checks of image files without decoding their pixels: size, bit depth, truncation."""
 
 import os
 import struct
@@ -10,7 +10,7 @@ from PIL import Image, UnidentifiedImageError
 
 from registration.errors import InputError
 
-MAX_PIXELS = 2**28  # 16384 x 16384: beyond any camera, and what a hostile header must not make us allocate
+MAX_PIXELS = 2**28  # 16384 x 16384: beyond any camera, and a hostile header must not make us allocate more
 _PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 _PNG_END = b"\x00\x00\x00\x00IEND\xaeB`\x82"
 
@@ -25,9 +25,14 @@ class Header:
 
 
 def read_header(path: Path, role: str) -> Header:
-    """Size and depth that the file declares; `role` ("image", "mask" ...) is for the message.
+    """Read the size and depth that an image file declares.
 
-    Raises InputError if the file is missing, is no image, or declares more than `MAX_PIXELS`.
+    Args:
+        path: the file.
+        role: "image", "mask" ..., for the message.
+
+    Raises:
+        InputError: the file is missing, is not an image, or declares more than `MAX_PIXELS`.
     """
     if not path.is_file():
         raise InputError(
@@ -61,7 +66,7 @@ def read_header(path: Path, role: str) -> Header:
 
 
 def require_size(path: Path, role: str, width_px: int, height_px: int) -> Header:
-    """`read_header`, and an InputError if the size is not the camera's."""
+    """Read the header as `read_header`. Raises InputError also if the size (px) is not the camera's."""
     header = read_header(path, role)
     if (header.width_px, header.height_px) != (width_px, height_px):
         raise InputError(
@@ -75,9 +80,12 @@ def require_size(path: Path, role: str, width_px: int, height_px: int) -> Header
 
 
 def require_complete(path: Path, role: str) -> None:
-    """InputError if a PNG or JPEG file was cut off. Reads a few bytes at the end, or walks a PNG's chunk heads.
+    """Refuse a truncated PNG or JPEG file. Reads a few bytes at the end, or the heads of a PNG's chunks.
 
-    A hole in the middle of a file that still ends well is only found when its pixels are decoded.
+    Damage in the middle is detected when the pixels are decoded.
+
+    Raises:
+        InputError: the file is truncated.
     """
     with path.open("rb") as file:
         start = file.read(8)
@@ -101,7 +109,10 @@ def require_complete(path: Path, role: str) -> None:
 
 
 def _png_chunks_reach_end(path: Path, size: int) -> bool:
-    """Walk the chunk heads, so that bytes appended behind a whole PNG are forgiven as decoders forgive them."""
+    """Follow the chunk lengths to IEND, so that bytes after a whole PNG are accepted, as decoders do.
+
+    Pillow's `verify` also accepts files that end within IEND (docs/adr/0010-libraries-of-captures.md).
+    """
     with path.open("rb") as file:
         position = len(_PNG_SIGNATURE)
         while position + 12 <= size:
@@ -115,7 +126,7 @@ def _png_chunks_reach_end(path: Path, size: int) -> bool:
 
 def _too_large(path: Path, role: str, got: str) -> InputError:
     return InputError(
-        f"The {role} declares an absurd size",
+        f"The {role} declares too many pixels",
         where=path,
         expected=f"at most {MAX_PIXELS} pixels",
         got=got,

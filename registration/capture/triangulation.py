@@ -1,4 +1,4 @@
-"""3D landmarks from a capture's 2D ones, robust to broken views. Pure: nothing is read from disk."""
+"""Triangulate landmarks over the views of a capture, robust to outliers and to miscalibrated views."""
 
 from itertools import combinations
 
@@ -8,31 +8,36 @@ from jaxtyping import Bool, Float, Int
 from registration.capture.pixels import undistort_landmarks
 from registration.types import Camera, Capture, View
 
-MIN_CONFIDENCE = 0.5  # at or below it a 2D landmark is not used
-MAX_PAIRS = 400  # of views that start a hypothesis; 29 views have 406
-INLIER_SHARE = 0.01  # of the image's geometric mean side: a larger residual means that a view saw something else
+MIN_CONFIDENCE = 0.5  # a 2D landmark is used above it
+MAX_PAIRS = 400  # of views that propose a point; 29 views have 406
+MAX_RESIDUAL = 0.01  # of an inlier, as a fraction of the image's geometric mean side
 MIN_ANGLE = np.radians(0.5)  # between the widest two rays; below it depth is not determined
 
 
 def triangulate(
     capture: Capture, scheme: str
 ) -> tuple[Float[np.ndarray, "L 3"], Int[np.ndarray, "L"], Float[np.ndarray, "L"]]:
-    """Triangulate every landmark of a scheme in the capture's world.
+    """Triangulate every landmark of a scheme.
 
-    Each pair of views proposes a point (linear DLT in normalised coordinates, Hartley and Zisserman 2004, section
-    12.2); the proposal with the least truncated reprojection error over all views wins; its inliers are then solved
-    together, reweighted from algebraic to reprojection error. One broken view so costs nothing but itself.
+    Each pair of views proposes a point (linear DLT in normalized coordinates, Hartley and Zisserman 2004, section
+    12.2). The proposal with the smallest truncated reprojection error over all views is refined over its inliers,
+    reweighted from algebraic to reprojection error. An outlier in one view therefore costs that view only.
 
-    Returns points (m, world; NaN where fewer than two views agree), the number of views used, and the
-    root-mean-square reprojection error over those views (px of the full images; NaN as the points). L = 0 if no
-    view has the scheme.
+    Args:
+        capture: its landmarks are used where their confidence is above `MIN_CONFIDENCE`.
+        scheme: name of the landmark scheme.
+
+    Returns:
+        points: metres, world; NaN where fewer than two views agree. L = 0 if no view has the scheme.
+        used: number of inlier views of each point.
+        residuals: root-mean-square reprojection error over the inlier views, px of the full images; NaN as the points.
     """
     views = [view for view in capture.views if scheme in view.landmarks]
     if not views:
         return np.zeros((0, 3)), np.zeros(0, np.int64), np.zeros(0)
     pixels = np.stack([undistort_landmarks(view, scheme) for view in views])  # N L 3
-    seen = (pixels[..., 2] > MIN_CONFIDENCE) & np.isfinite(pixels).all(-1)
-    rays = np.stack([_normalised(view.camera.intrinsics, xy) for view, xy in zip(views, pixels[..., :2], strict=True)])
+    observed = (pixels[..., 2] > MIN_CONFIDENCE) & np.isfinite(pixels).all(-1)
+    rays = np.stack([_normalized(view.camera.intrinsics, xy) for view, xy in zip(views, pixels[..., :2], strict=True)])
     poses = np.stack([view.camera.T_cam_world[:3] for view in views])
     focals = np.array([[view.camera.intrinsics[0, 0], view.camera.intrinsics[1, 1]] for view in views])
     limits = np.array([inlier_limit_px(view.camera) for view in views])
@@ -40,18 +45,18 @@ def triangulate(
     count = pixels.shape[1]
     points, used, residuals = np.full((count, 3), np.nan), np.zeros(count, np.int64), np.full(count, np.nan)
     for landmark in range(count):
-        index = np.flatnonzero(seen[:, landmark])
+        index = np.flatnonzero(observed[:, landmark])
         if len(index) < 2:
             continue
-        solved = _solve(rays[index, landmark], poses[index], focals[index], limits[index])
-        if solved is not None:
-            points[landmark], inliers, residuals[landmark] = solved
+        solution = _solve(rays[index, landmark], poses[index], focals[index], limits[index])
+        if solution is not None:
+            points[landmark], inliers, residuals[landmark] = solution
             used[landmark] = inliers.sum()
     return points, used, residuals
 
 
-def _normalised(intrinsics: Float[np.ndarray, "3 3"], xy: Float[np.ndarray, "L 2"]) -> Float[np.ndarray, "L 2"]:
-    """Pixels to the plane z = 1 of the camera."""
+def _normalized(intrinsics: Float[np.ndarray, "3 3"], xy: Float[np.ndarray, "L 2"]) -> Float[np.ndarray, "L 2"]:
+    """Project pixels onto the plane z = 1 of the camera."""
     homogeneous = np.concatenate([xy, np.ones((len(xy), 1))], -1)
     return (homogeneous @ np.linalg.inv(intrinsics).T)[:, :2]
 
@@ -62,7 +67,10 @@ def _solve(
     focals: Float[np.ndarray, "N 2"],
     limits: Float[np.ndarray, "N"],
 ) -> tuple[Float[np.ndarray, "3"], Bool[np.ndarray, "N"], float] | None:
-    """One landmark: best pair, then its inliers together. None if no two views agree or their rays are parallel."""
+    """Solve one landmark: best pair, then its inliers together.
+
+    Returns the point, its inliers and its rms error (px); None if no two views agree or their rays are parallel.
+    """
     rows = rays[:, :, None] * poses[:, 2:3] - poses[:, :2]  # N 2 4: the two DLT equations of a view
     pairs = np.array(list(combinations(range(len(rays)), 2)))
     if len(pairs) > MAX_PAIRS:
@@ -87,7 +95,7 @@ def _solve(
 
 
 def _null_points(systems: Float[np.ndarray, "P R 4"]) -> Float[np.ndarray, "P 3"]:
-    """The point that each homogeneous system maps closest to zero; very far where it lies at infinity."""
+    """Return the point that each homogeneous system maps closest to zero; very far away for points at infinity."""
     solution = np.linalg.svd(systems, full_matrices=False)[2][:, -1]
     scale = np.where(np.abs(solution[:, 3:]) < 1e-12, 1e-12, solution[:, 3:])
     return solution[:, :3] / scale
@@ -99,7 +107,7 @@ def _errors(
     poses: Float[np.ndarray, "N 3 4"],
     focals: Float[np.ndarray, "N 2"],
 ) -> Float[np.ndarray, "P N"]:
-    """Reprojection errors in px; infinite behind a camera."""
+    """Return reprojection errors in px; infinite behind a camera."""
     local = np.einsum("nij,pj->pni", poses[:, :, :3], points) + poses[:, :, 3]
     depth = local[..., 2]
     front = depth > 1e-9
@@ -108,7 +116,7 @@ def _errors(
 
 
 def _widest_angle(point: Float[np.ndarray, "3"], poses: Float[np.ndarray, "N 3 4"]) -> float:
-    """The largest angle (rad) at which two cameras see the point."""
+    """Return the largest angle (rad) between the rays of two cameras to the point."""
     centres = -np.einsum("nji,nj->ni", poses[:, :, :3], poses[:, :, 3])
     rays = point - centres
     rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
@@ -116,7 +124,7 @@ def _widest_angle(point: Float[np.ndarray, "3"], poses: Float[np.ndarray, "N 3 4
 
 
 def residuals(view: View, scheme: str, points: Float[np.ndarray, "L 3"]) -> Float[np.ndarray, "L"]:
-    """Distances (px, full image) of a view's landmarks from the projected 3D ones (m); NaN where one is not used."""
+    """Return the distances (px, full image) of a view's landmarks from projected points (m, world); NaN if unused."""
     landmarks = undistort_landmarks(view, scheme)
     projected, depth = view.camera.project(points)
     distance = np.linalg.norm(projected - landmarks[:, :2], axis=-1)
@@ -124,16 +132,21 @@ def residuals(view: View, scheme: str, points: Float[np.ndarray, "L 3"]) -> Floa
 
 
 def inlier_limit_px(camera: Camera) -> float:
-    """The reprojection error above which a landmark is taken to show something else."""
-    return INLIER_SHARE * float(np.sqrt(camera.width_px * camera.height_px))
+    """Return the reprojection error (px) above which a landmark is an outlier."""
+    return MAX_RESIDUAL * float(np.sqrt(camera.width_px * camera.height_px))
 
 
 def reversed_jaw_points(points: Float[np.ndarray, "68 3"]) -> list[int]:
-    """Jaw points (0 to 16 of the 68 scheme) that do not follow their neighbours around the face.
+    """Find the jaw points (0 to 16 of the 68 scheme) whose order around the face is reversed.
 
-    Seen from the front, the jaw runs from the subject's right ear (0) over the chin (8) to the left ear (16): the
-    angle around the point between the brows only ever grows. Returns the indices of every run that goes backwards
-    by more than two degrees; NaN points are passed over, and empty comes back if the eyes or nose are missing.
+    From the front, the jaw runs from the subject's right ear (0) over the chin (8) to the left ear (16): the angle
+    around the point between the brows increases.
+
+    Args:
+        points: triangulated landmarks, metres; NaN points are skipped.
+
+    Returns:
+        Indices of the points at steps of less than -2 degrees; empty if eyes or nose are missing.
     """
     right, left, brow, nose = points[36], points[45], points[27], points[33]
     x = left - right
@@ -143,8 +156,8 @@ def reversed_jaw_points(points: Float[np.ndarray, "68 3"]) -> list[int]:
     down = down / np.linalg.norm(down)
     if not np.isfinite([x, down]).all():
         return []
-    known = np.flatnonzero(np.isfinite(points[:17]).all(-1))
-    local = points[known] - brow
+    valid = np.flatnonzero(np.isfinite(points[:17]).all(-1))
+    local = points[valid] - brow
     angles = np.unwrap(np.arctan2(local @ down, -(local @ x)))  # 0 at the subject's right, a quarter turn at the chin
     back = np.flatnonzero(np.diff(angles) < -np.radians(2.0))
-    return sorted({int(known[i]) for step in back for i in (step, step + 1)})
+    return sorted({int(valid[i]) for step in back for i in (step, step + 1)})

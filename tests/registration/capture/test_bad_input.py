@@ -164,7 +164,7 @@ def image_that_is_none(root: Path) -> None:
     (root / "images" / "cam1.png").write_text("hello")
 
 
-@bad("The image declares an absurd size", where="images/cam1.png", got="", fix="again")
+@bad("The image declares too many pixels", where="images/cam1.png", got="", fix="again")
 def image_bomb(root: Path) -> None:
     path = root / "images" / "cam1.png"
     content = bytearray(path.read_bytes())
