@@ -42,7 +42,7 @@ from registration.render.studio.shoot import Quality
 from workflows.engine.database import default_url
 from workflows.engine.process import migrate
 from workflows.farm.coregistration import coregister
-from workflows.farm.plan import make_plan
+from workflows.farm.plan import RoundSettings, make_plan
 from workflows.records.coregistration import FIRST_MODEL as FIRST
 from workflows.records.held_out import read_held_out
 from workflows.steps.hold_out import PEOPLE
@@ -135,9 +135,11 @@ def main() -> None:
             first,
             options.out / "rounds",
             RegisterOptions(recipe=options.recipe, seed=options.seed),
-            components=COMPONENTS,
-            samples=SAMPLES,
-            rule=StoppingRule(max_rounds=options.rounds, max_failure_rate=1.0, early_stopping=False),
+            RoundSettings(
+                components=COMPONENTS,
+                samples=SAMPLES,
+                rule=StoppingRule(max_rounds=options.rounds, max_failure_rate=1.0, early_stopping=False),
+            ),
         )
         farm = options.out / "farm"
         url = default_url(farm)

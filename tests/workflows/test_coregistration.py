@@ -4,12 +4,14 @@ import asyncio
 import json
 import shutil
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 import workflows.farm.coregistration
+import workflows.farm.plan
 import workflows.pages.coregistration
 import workflows.steps.build
 import workflows.steps.evaluate
@@ -31,7 +33,7 @@ from workflows.engine.serialization import JobFailed
 from workflows.farm.coregistration import start_coregistration
 from workflows.farm.flows import coregister
 from workflows.farm.local import LocalFarm, LocalRunResult
-from workflows.farm.plan import make_plan
+from workflows.farm.plan import RoundSettings, make_plan
 from workflows.pages import model
 from workflows.records.dataset import read_dataset, split
 from workflows.records.training_subjects import RegisteredSubjects
@@ -61,8 +63,9 @@ def dataset(capture: Path, tmp_path: Path) -> Path:
 
 
 def go(dataset: Path, out: Path, **options) -> dict:
-    settings = dict(model=MODEL, rule=TWICE, components=(2,), samples=2)
-    plan = start_coregistration(make_plan(dataset, out=out, **{**settings, **options}))
+    first, registration = options.pop("model", MODEL), options.pop("options", RegisterOptions())
+    rounds = RoundSettings(**{"rule": TWICE, "components": (2,), "samples": 2, **options})
+    plan = start_coregistration(make_plan(dataset, first, out, registration, rounds))
     scope = Inline("run", really((dataset, MODEL.parent, out)), [])
     asyncio.run(coregister(scope, plan=str(plan)))
     return told(out)
@@ -353,7 +356,7 @@ def test_who_is_held_out(dataset, tmp_path):
 
 def test_the_command(dataset, finds, tmp_path, capsys, monkeypatch):
     """Processes have stand-ins too, which do the queue's one flow here; `make demo-batch` starts them."""
-    monkeypatch.setitem(make_plan.__kwdefaults__, "samples", 2)
+    monkeypatch.setattr(workflows.farm.plan, "RoundSettings", partial(RoundSettings, samples=2))
     out, roots = tmp_path / "out", (dataset, MODEL.parent, tmp_path / "out")
     arguments = ["coregister", str(dataset), "--model", str(MODEL), "--out", str(out), "--components", "2"]
     assert main([*arguments, "--folder", str(tmp_path)]) == 2

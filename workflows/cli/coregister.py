@@ -65,19 +65,16 @@ def coregister(
     from workflows.engine.process import migrate
     from workflows.farm.coregistration import coregister, submit_coregistration
     from workflows.farm.local import local_gpus
-    from workflows.farm.plan import make_plan
+    from workflows.farm.plan import RoundSettings, make_plan
     from workflows.records.coregistration import PAGE
 
-    plan = make_plan(
-        dataset,
-        model,
-        out,
-        fit.register_options(),
+    settings = RoundSettings(
         model_recipe=rounds.model_recipe,
         held_out=_fraction_or_file(rounds.held_out),
         components=rounds.components or None,
         rule=StoppingRule(max_rounds=rounds.iterations, early_stopping=not rounds.all_iterations),
     )
+    plan = make_plan(dataset, model, out, fit.register_options(), settings)
     folder = farm.farm_folder(out)
     url = farm.url_for(folder)
     if not farm.local:

@@ -1,6 +1,7 @@
 """The plan of a coregistration, checked before anything is computed."""
 
 from collections.abc import Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 
 from coregister.evaluate.linear_fit import identity_part
@@ -18,17 +19,32 @@ from workflows.steps.job_options import to_job
 COMPONENTS = (5, 10, 20, 40)  # numbers of components that models are evaluated with by default
 
 
+@dataclass(frozen=True, kw_only=True)
+class RoundSettings:
+    """What is done in each round besides registration, and when to stop.
+
+    Attributes:
+        model_recipe: settings of model building, as for `load_model_recipe`.
+        held_out: as for `dataset.split`.
+        components: numbers of components that models are evaluated with; the stopping rule uses the largest. None:
+            COMPONENTS, as far as models have them.
+        samples: random heads of each model, for specificity; 0: none.
+        rule: when to stop.
+    """
+
+    model_recipe: str | ModelRecipe = DEFAULT_MODEL_RECIPE
+    held_out: float | Path | None = None
+    components: Sequence[int] | None = None
+    samples: int = 200
+    rule: StoppingRule = field(default_factory=StoppingRule)
+
+
 def make_plan(
     dataset: Path,
     model: Path,
     out: Path,
     options: RegisterOptions = RegisterOptions(),  # noqa: B008  frozen
-    *,
-    model_recipe: str | ModelRecipe = DEFAULT_MODEL_RECIPE,
-    held_out: float | Path | None = None,
-    components: Sequence[int] | None = None,
-    samples: int = 200,
-    rule: StoppingRule | None = None,
+    rounds: RoundSettings = RoundSettings(),  # noqa: B008  frozen
 ) -> CoregistrationPlan:
     """Plan rounds of registration and model building over a dataset (docs/coregistration.md).
 
@@ -37,12 +53,7 @@ def make_plan(
         model: file of the first model, with its landmark schemes next to it.
         out: folder of all results.
         options: of all registrations; the seed is that of everything random.
-        model_recipe: settings of model building, as for `load_model_recipe`.
-        held_out: as for `dataset.split`.
-        components: numbers of components that models are evaluated with; the stopping rule uses the largest. None:
-            COMPONENTS, as far as models have them.
-        samples: random heads of each model, for specificity; 0: none.
-        rule: when to stop.
+        rounds: model building, evaluation and the stopping rule.
 
     Raises:
         InputError: `read_dataset`, `split` or `check_out` refuses; there is no such recipe or model; more components
@@ -50,7 +61,7 @@ def make_plan(
     """
     options = to_job(options)
     source = read_dataset(dataset)
-    division = split(source, held_out, options.seed)
+    division = split(source, rounds.held_out, options.seed)
     data = gnm_npz.read(Path(model))
     names = (*division.training, *division.held_out)
     plan = CoregistrationPlan(
@@ -58,15 +69,15 @@ def make_plan(
         model=Path(model).resolve(),
         out=Path(out).resolve(),
         options=options,
-        model_recipe=load_model_recipe(model_recipe),
-        components=tuple(components or COMPONENTS),
-        samples=samples,
-        rule=rule or StoppingRule(),
+        model_recipe=load_model_recipe(rounds.model_recipe),
+        components=tuple(rounds.components or COMPONENTS),
+        samples=rounds.samples,
+        rule=rounds.rule,
         split=division,
         captures={name: tuple(capture.root.name for capture in source.subjects[name].captures) for name in names},
         without_truth=tuple(name for name in division.held_out if not has_truths(source.subjects[name], data)),
     )
-    _check(plan, data, requested=components is not None)
+    _check(plan, data, requested=rounds.components is not None)
     check_out(plan.out)
     return plan
 

@@ -14,14 +14,14 @@ from workflows.engine.process import migrate
 from workflows.engine.reader import QueueReader
 from workflows.farm.coregistration import submit_coregistration
 from workflows.farm.local import LocalFarm, run_until_done
-from workflows.farm.plan import make_plan
+from workflows.farm.plan import RoundSettings, make_plan
 from workflows.records.coregistration import PLAN
 
 
 def test_a_run_that_goes_on_stays_and_one_that_ended_is_forgotten(capture: Path, tmp_path: Path) -> None:
     dataset = write_people(capture, tmp_path / "dataset", 5)
     url, out = default_url(tmp_path), tmp_path / "june"
-    plan = make_plan(dataset, MODEL, out, components=(2,))
+    plan = make_plan(dataset, MODEL, out, rounds=RoundSettings(components=(2,)))
     with pytest.raises(InputError, match="There is no queue"):
         submit_coregistration(url, plan)
     assert not out.exists()
