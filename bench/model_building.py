@@ -68,7 +68,7 @@ def main() -> None:
     modes = smooth_modes(data.template_vertex_positions[rows].astype(np.float64), np.random.default_rng(1))
     samples = GeneratedSamples(args.samples, modes)
     start = time.perf_counter()
-    principal = principal_components(samples, centred=False, most=args.components, memory_gb=args.memory_gb)
+    principal = principal_components(samples, centred=False, max_components=args.components, memory_gb=args.memory_gb)
     seconds = time.perf_counter() - start
     truth = (modes**2).sum(1) + NOISE_M**2
     error = np.abs(principal.variance / truth[: len(principal.variance)] - 1)

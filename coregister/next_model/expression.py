@@ -89,9 +89,9 @@ def regional_bases(
         samples = _MaskedSamples(
             displacements, rows, mask[rows, None] * vertex_scales, data.mirror_indices if both else None
         )
-        most = None if settings.max_components is None else settings.max_components.get(name)
+        max_components = None if settings.max_components is None else settings.max_components.get(name)
         sample_weights = np.repeat(weights, 2) if both else weights
-        bases[name] = _region_basis(samples, sample_weights, vertex_scales, data, settings, most, memory_gb)
+        bases[name] = _region_basis(samples, sample_weights, vertex_scales, data, settings, max_components, memory_gb)
     lower = bases["lower_face_region"].basis
     parts = regions.jaw_parts(data)
     lower[:, parts] = jaw_motion(lower, data)[:, parts]
@@ -186,14 +186,18 @@ def _region_basis(
     previous = (data.expression_basis[:, rows].astype(np.float64) * samples.scale).reshape(-1, size)
     covariance = ShrunkCovariance(samples, weights, float(weights.sum()), previous, settings.shrinkage)
     principal = pca.principal_components(
-        covariance, centred=False, share=settings.variance_ratio, most=max_components, memory_gb=memory_gb
+        covariance,
+        centred=False,
+        variance_ratio=settings.variance_ratio,
+        max_components=max_components,
+        memory_gb=memory_gb,
     )
     basis = np.zeros((len(principal.variance), *data.template_vertex_positions.shape))
     basis[:, rows] = principal.components.reshape(len(basis), len(rows), 3) / vertex_scales
     return RegionBasis(
         basis=basis,
         energy=principal.variance,
-        variance_ratio=principal.share,
+        variance_ratio=principal.variance_ratio,
         shrinkage=covariance.shrinkage,
         method=principal.method,
     )

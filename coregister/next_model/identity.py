@@ -102,8 +102,8 @@ def build_identity_basis(
     principal = pca.principal_components(
         covariance,
         centred=False,
-        share=settings.variance_ratio,
-        most=settings.max_components,
+        variance_ratio=settings.variance_ratio,
+        max_components=settings.max_components,
         memory_gb=memory_gb,
     )
     basis = np.zeros((len(principal.variance), *data.template_vertex_positions.shape))
@@ -117,7 +117,7 @@ def build_identity_basis(
         template=template,
         basis=basis,
         variance=principal.variance,
-        variance_ratio=principal.share,
+        variance_ratio=principal.variance_ratio,
         shrinkage=covariance.shrinkage,
         shrinkage_scores=scores,
         head_count=len(heads),

@@ -1,6 +1,7 @@
 """The regional stage's view of a dataset: principal components per region, and how much each looks like motion of the
 whole head [GNM, Head Expression]; docs/algorithms.md, "Stabilization"."""
 
+import math
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -9,7 +10,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from registration.errors import InputError
-from registration.geometry.pca import uncentred_components
+from registration.geometry.pca import principal_components
 from registration.geometry.rigid import align, fit_twists, motion_fields
 from registration.geometry.topology import vertex_areas
 from registration.model import regions
@@ -174,7 +175,9 @@ def _components(
     area, points = head.area[rows], head.points[rows]
     root = np.sqrt(area)[:, None]
     parts = _Parts(displacements, rows, root)
-    flat, coefficients, energy = uncentred_components(parts, len(labels), settings.share)
+    principal = principal_components(parts, centred=False, variance_ratio=settings.share, memory_gb=math.inf)
+    flat, coefficients = principal.components, principal.coefficients(parts)
+    energy = principal.variance / (principal.total or 1)
     modes = flat.reshape(len(flat), len(rows), 3) / root
     twists = fit_twists(modes, points, area)
     # Coefficients of one component do not go with another's: their regressions are independent.

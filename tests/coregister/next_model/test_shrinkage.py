@@ -27,7 +27,7 @@ def test_products_give_the_residuals_of_explicit_models(shrinkage):
         mean = samples[~excluded].mean(0)
         kept = samples[~excluded] - mean
         stream = ShrunkCovariance(kept, np.ones(len(kept)), len(kept) - 1, previous, shrinkage)
-        basis = principal_components(stream, centred=False, most=6).components
+        basis = principal_components(stream, centred=False, max_components=6).components
         for test in samples[excluded] - mean:
             squares += ((test - np.linalg.lstsq(basis.T, test, rcond=None)[0] @ basis) ** 2).sum()
     assert rms[0] == pytest.approx(np.sqrt(squares / 13), rel=1e-5)
