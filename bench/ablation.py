@@ -23,7 +23,7 @@ from registration.evaluate.evaluation import evaluate
 from registration.fit.recipes import Recipe, Stage, draft
 from registration.options import RegisterOptions
 from registration.pipeline import register
-from registration.progress import shown
+from registration.progress import console_progress
 from registration.storage.registration_folder import load_registration
 from registration.types import Registration
 
@@ -86,11 +86,11 @@ def main() -> None:
     neutral_table = Table(*heads, title=f"{options.neutral.name}, draft")
     drifting = ("without", "mean", "median", "drift", "p95", "too deep", "s")
     expression_table = Table(*drifting, title=f"{options.expression.name}, draft, from the whole recipe's neutral")
-    with shown() as progress:
+    with console_progress() as progress:
         for name in dict.fromkeys(["everything", *options.only]):
             recipe, folder = VARIANTS[name](draft()), options.out / name.replace(" ", "_")
             recipe = replace(recipe, name=f"draft without {name}" if name != "everything" else "draft")
-            progress.note(f"without {name}" if name != "everything" else name)
+            progress.message(f"without {name}" if name != "everything" else name)
             chosen = RegisterOptions(recipe=recipe)
             made = register(options.neutral, options.model, folder / "neutral", chosen, progress=progress)
             neutral_table.add_row(name, *_row(made, None))

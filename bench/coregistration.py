@@ -37,7 +37,7 @@ from registration.geometry.topology import vertex_areas
 from registration.model import gnm_npz, regions
 from registration.model.gnm_npz import GNMData
 from registration.options import RegisterOptions
-from registration.progress import shown
+from registration.progress import console_progress
 from registration.render.studio.shoot import Quality
 from workflows.engine.database import default_url
 from workflows.engine.process import migrate
@@ -127,7 +127,7 @@ def main() -> None:
     first = bootstrap.bootstrap(options.out / "first" / "gnm_head_first.npz")
     population = Population(subjects=count, seed=options.seed, held_out=options.held_out, studio=STUDIO)
     start = time.perf_counter()
-    with shown() as progress:
+    with console_progress() as progress:
         synth_dataset(options.out / "dataset", population, jobs=options.jobs, progress=progress)
         captured = time.perf_counter()
         plan = make_plan(

@@ -42,7 +42,7 @@ from registration.model import gnm_npz, regions
 from registration.model.gnm import GNM
 from registration.model.gnm_npz import GNMData
 from registration.pipeline import register
-from registration.progress import shown
+from registration.progress import console_progress
 from registration.types import Capture, Registration
 
 _MIN_CONFIDENCE = 0.1  # of observed vertices
@@ -53,10 +53,10 @@ MEASURES = ("scan", "vertices")
 def register_all(captures: Sequence[Path], model: Path, out: Path) -> list[tuple[Capture, Registration]]:
     """Register each capture into a folder with the subject's name."""
     pairs = []
-    with shown() as progress:
+    with console_progress() as progress:
         for number, path in enumerate(captures):
             capture = read_capture(path)
-            progress.at(number, len(captures), capture.subject)
+            progress.update(number, len(captures), capture.subject)
             registration = register(path, model, out / "registrations" / capture.subject, progress=progress)
             pairs.append((capture, registration))
     return pairs
@@ -108,9 +108,9 @@ def leave_one_out(
     model = GNM(previous)
     subjects = [training_subject(capture, registration, model) for capture, registration in pairs]
     errors = []
-    with shown() as progress:
+    with console_progress() as progress:
         for number, (capture, registration) in enumerate(pairs):
-            progress.at(number, len(pairs), f"without {capture.subject}")
+            progress.update(number, len(pairs), f"without {capture.subject}")
             points = face_points(capture, registration)
             others = [
                 subject

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from registration.model.gnm_npz import read as load_model
     from registration.options import RegisterOptions
     from registration.pipeline import register
-    from registration.progress import shown as console_progress
+    from registration.progress import console_progress
     from registration.storage.registration_folder import load_registration, save_registration
     from registration.types import Camera, Capture, Parameters, Registration, View
 

@@ -28,7 +28,7 @@ from registration.model.atlas import texture_atlas
 from registration.model.gnm import GNM
 from registration.model.regions import exterior
 from registration.options import RegisterOptions
-from registration.progress import Progress, Silent
+from registration.progress import NullProgress, Progress
 from registration.render import backend
 from registration.report.inputs import ReportInputs, heat_map, report_views
 from registration.report.page import write_report
@@ -76,12 +76,12 @@ def register(
     Raises:
         InputError: something cannot be used; nothing is computed or written.
     """
-    progress = progress or Silent()
+    progress = progress or NullProgress()
     out = Path(out)
     check_output_folder(out)
     inputs = read_inputs(Path(capture), Path(model), options, None if neutral is None else Path(neutral))
     if not force and (same := find_existing(out, inputs.input_hash)) is not None:
-        progress.note(f"{out} already holds the registration of these inputs")
+        progress.message(f"{out} already holds the registration of these inputs")
         return same
     device = backend.activate(options.variant, deterministic=options.deterministic)
     torch.manual_seed(options.seed)
@@ -110,7 +110,7 @@ def _fit(
     targets_time = time.perf_counter()
     initial = _initial_guess(inputs, context, progress)
     for note in initial.notes:
-        progress.note(note)
+        progress.message(note)
     problem = FitProblem(context, initial)
     initial_time = time.perf_counter()
     seconds = {"targets": targets_time - start_time, "start": initial_time - targets_time}
@@ -136,7 +136,7 @@ def _context(inputs: RegistrationInputs, seed: int, device: torch.device, progre
         classes,
         finest_head_px=recipe.finest_head_px,
         levels=recipe.levels,
-        progress=lambda done: progress.at(done, count, "reading views"),
+        progress=lambda done: progress.update(done, count, "reading views"),
     )
     return FitContext(
         data=inputs.data,
@@ -159,7 +159,7 @@ class _StepProgress:
 
     def advance(self, stage: str) -> None:
         self._done += 1
-        self._progress.at(self._done, self._total, stage)
+        self._progress.update(self._done, self._total, stage)
 
 
 class _Snapshots:
@@ -188,7 +188,7 @@ def _initial_guess(inputs: RegistrationInputs, context: FitContext, progress: Pr
         neutral = initial_guess_from(parameters, inputs.neutral.offsets, context.model, inputs.data)
     unknown = {name for view in inputs.capture.views for name in view.landmarks} - set(inputs.schemes)
     if unknown:
-        progress.note(f"landmark schemes that the model does not have, ignored: {', '.join(sorted(unknown))}")
+        progress.message(f"landmark schemes that the model does not have, ignored: {', '.join(sorted(unknown))}")
     counts = {name: int(np.isfinite(points).all(1).sum()) for name, points in inputs.landmarks.items()}
     best = max(counts, key=lambda name: counts[name], default=None)
     if best is not None and counts[best] >= MIN_LANDMARKS:
@@ -196,7 +196,7 @@ def _initial_guess(inputs: RegistrationInputs, context: FitContext, progress: Pr
         return from_landmarks(inputs.data, scheme, points, free_scale=free_scale, neutral=neutral)
     if neutral is not None and assess(context, neutral).overlap >= MIN_OVERLAP:
         return replace(neutral, notes=("no landmarks: starting from the neutral's pose",))
-    progress.note("no landmarks of a scheme that the model has: estimating the head's pose from the masks")
+    progress.message("no landmarks of a scheme that the model has: estimating the head's pose from the masks")
     return from_masks(inputs.data, context.pyramid[-1], partial(assess, context), partial(refine, context))
 
 
@@ -282,14 +282,14 @@ def _evaluate(
     evaluation: Evaluation | None = None
     finite = np.isfinite(registration.vertices).all()
     if finite:
-        progress.note("auditing intersections between parts")
+        progress.message("auditing intersections between parts")
         intersections = audit(registration.vertices, inputs.data, scale=float(registration.scale)).figures
         registration = replace(registration, figures={**registration.figures, "intersections": intersections})
     if inputs.capture.scan is not None and finite:
-        progress.note("measuring against the scan")
+        progress.message("measuring against the scan")
         evaluation = evaluate(registration, inputs.capture)
         registration = replace(registration, figures={**registration.figures, **evaluation.figures})
-    progress.note("writing the report")
+    progress.message("writing the report")
     cameras = [view.camera for view in inputs.capture.views]
     batch, rendered = problem.render_views(select_spread_views(cameras, _REPORT_VIEWS))
     page = write_report(

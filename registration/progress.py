@@ -1,4 +1,4 @@
-"""Progress of long work: a bar in a terminal, plain lines in a log."""
+"""Progress of long computations: a bar in a terminal, plain lines in a log."""
 
 import sys
 import time
@@ -9,74 +9,46 @@ from typing import TYPE_CHECKING, Protocol, runtime_checkable
 if TYPE_CHECKING:
     from rich.progress import Progress as RichProgress
 
-_LINE_EVERY_S = 15.0
+_LINE_INTERVAL_S = 15.0
 
 
 @runtime_checkable
 class Progress(Protocol):
-    """What long work reports to."""
+    """Receives the progress of a long computation."""
 
-    def note(self, text: str) -> None:
-        """Something a person should know."""
+    def message(self, text: str) -> None:
+        """Show a message to the user."""
 
-    def at(self, done: int, total: int, what: str) -> None:
-        """`done` of `total` steps; `what` is going on."""
-
-
-class _Bar:
-    def __init__(self, bar: "RichProgress") -> None:
-        self._bar = bar
-        self._task = bar.add_task("", total=None)
-
-    def note(self, text: str) -> None:
-        self._bar.console.print(text, markup=False, highlight=False)
-
-    def at(self, done: int, total: int, what: str) -> None:
-        self._bar.update(self._task, completed=done, total=total, description=what)
+    def update(self, done: int, total: int, label: str) -> None:
+        """Report that `done` of `total` steps of `label` are complete."""
 
 
-class _Lines:
-    def __init__(self) -> None:
-        self._begun = self._last = time.monotonic()
-        self._what = ""
+class NullProgress:
+    """Discards everything."""
 
-    def note(self, text: str) -> None:
-        print(text, file=sys.stderr, flush=True)
-
-    def at(self, done: int, total: int, what: str) -> None:
-        now = time.monotonic()
-        if what == self._what and now - self._last < _LINE_EVERY_S:
-            return
-        self._what, self._last = what, now
-        self.note(f"[{now - self._begun:6.1f} s] {what}: {done}/{total}")
-
-
-class Silent:
-    """For callers that want none."""
-
-    def note(self, text: str) -> None:
+    def message(self, text: str) -> None:
         pass
 
-    def at(self, done: int, total: int, what: str) -> None:
+    def update(self, done: int, total: int, label: str) -> None:
         pass
 
 
-class Named:
-    """For one of several: says which one it is about."""
+class PrefixedProgress:
+    """Passes everything on with a prefix, which says to which of several items it belongs."""
 
-    def __init__(self, progress: Progress, name: str) -> None:
-        self._progress, self._name = progress, name
+    def __init__(self, progress: Progress, prefix: str) -> None:
+        self._progress, self._prefix = progress, prefix
 
-    def note(self, text: str) -> None:
-        self._progress.note(f"{self._name}: {text}")
+    def message(self, text: str) -> None:
+        self._progress.message(f"{self._prefix}: {text}")
 
-    def at(self, done: int, total: int, what: str) -> None:
-        self._progress.at(done, total, f"{self._name}: {what}")
+    def update(self, done: int, total: int, label: str) -> None:
+        self._progress.update(done, total, f"{self._prefix}: {label}")
 
 
 @contextmanager
-def shown() -> Iterator[Progress]:
-    """Return a context with a progress bar on stderr if that is a terminal, else lines."""
+def console_progress() -> Iterator[Progress]:
+    """Yield a progress bar on stderr if that is a terminal, else lines: one per new label, then one each 15 s."""
     if not sys.stderr.isatty():
         yield _Lines()
         return
@@ -87,3 +59,31 @@ def shown() -> Iterator[Progress]:
     columns = TextColumn("{task.description}", markup=False), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn()
     with RichProgress(*columns, console=Console(stderr=True)) as bar:
         yield _Bar(bar)
+
+
+class _Bar:
+    def __init__(self, bar: "RichProgress") -> None:
+        self._bar = bar
+        self._task = bar.add_task("", total=None)
+
+    def message(self, text: str) -> None:
+        self._bar.console.print(text, markup=False, highlight=False)
+
+    def update(self, done: int, total: int, label: str) -> None:
+        self._bar.update(self._task, completed=done, total=total, description=label)
+
+
+class _Lines:
+    def __init__(self) -> None:
+        self._start_s = self._last_s = time.monotonic()
+        self._label = ""
+
+    def message(self, text: str) -> None:
+        print(text, file=sys.stderr, flush=True)
+
+    def update(self, done: int, total: int, label: str) -> None:
+        now = time.monotonic()
+        if label == self._label and now - self._last_s < _LINE_INTERVAL_S:
+            return
+        self._label, self._last_s = label, now
+        self.message(f"[{now - self._start_s:6.1f} s] {label}: {done}/{total}")

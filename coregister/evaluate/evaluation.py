@@ -27,7 +27,7 @@ from coregister.tag_groups import tag_group
 from registration.errors import InputError
 from registration.model import gnm_npz, regions
 from registration.model.gnm_npz import GNMData
-from registration.progress import Progress, Silent
+from registration.progress import NullProgress, Progress
 
 NEUTRAL = "neutral"  # the neutral's category
 _CATEGORY = "category"  # a tag of a capture, not of a subject
@@ -162,7 +162,7 @@ def evaluate(
     Raises:
         InputError: as `check`, before anything is computed.
     """
-    settings, progress = settings or EvaluationSettings(), progress or Silent()
+    settings, progress = settings or EvaluationSettings(), progress or NullProgress()
     check(models, held_out, triangles, settings)
     metrics = {name: _model_metrics(name, data, held_out, settings, progress) for name, data in models.items()}
     (_, first), *others = metrics.items()
@@ -256,13 +256,13 @@ def _model_metrics(
 ) -> ModelMetrics:
     distances = _ModelDistances(data, settings)
     for index, subject in enumerate(held_out):
-        progress.at(index, len(held_out), f"{name}: {subject.subject}")
+        progress.update(index, len(held_out), f"{name}: {subject.subject}")
         distances.add(subject)
     part, counts = distances.identity, distances.counts
     parts = {"identity": part, **{region: expression.part for region, expression in distances.expressions.items()}}
     specificity = None
     if settings.samples:
-        progress.at(len(held_out), len(held_out), f"{name}: {settings.samples} random heads")
+        progress.update(len(held_out), len(held_out), f"{name}: {settings.samples} random heads")
         values = specificity_mm(
             part,
             np.stack([subject.neutral[part.rows] for subject in held_out]),

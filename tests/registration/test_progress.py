@@ -23,13 +23,13 @@ def clock(monkeypatch):
 
 def test_lines_in_a_log(clock, capsys):
     """A line when something new begins, then one each 15 s; notes at once."""
-    with progress.shown() as shown:
+    with progress.console_progress() as shown:
         for done in range(60):
-            shown.at(done, 60, "model")
+            shown.update(done, 60, "model")
             clock[0] += 1.0
-        shown.note("something [odd]")
-        shown.at(0, 30, "offsets")
-        shown.at(1, 30, "offsets")
+        shown.message("something [odd]")
+        shown.update(0, 30, "offsets")
+        shown.update(1, 30, "offsets")
     out, lines = capsys.readouterr()
     assert out == ""
     assert lines.splitlines() == [
@@ -46,20 +46,20 @@ def test_a_bar_in_a_terminal(monkeypatch):
     """Notes are printed as they are: a path may hold what rich would take for markup."""
     terminal = Terminal()
     monkeypatch.setattr(sys, "stderr", terminal)
-    with progress.shown() as shown:
-        shown.at(3, 10, "offsets [8 mm]")
-        shown.note("run[/red] [bold] is there")
-        shown.at(7, 10, "offsets [8 mm]")
+    with progress.console_progress() as shown:
+        shown.update(3, 10, "offsets [8 mm]")
+        shown.message("run[/red] [bold] is there")
+        shown.update(7, 10, "offsets [8 mm]")
     text = terminal.getvalue()
     assert "offsets [8 mm]" in text and "7/10" in text
     assert "run[/red] [bold] is there" in text
 
 
 def test_all_are_progress(capsys):
-    silent = progress.Silent()
+    silent = progress.NullProgress()
     assert isinstance(silent, progress.Progress)
-    silent.note("a")
-    silent.at(1, 2, "b")
-    with progress.shown() as shown:
+    silent.message("a")
+    silent.update(1, 2, "b")
+    with progress.console_progress() as shown:
         assert isinstance(shown, progress.Progress)
     assert capsys.readouterr() == ("", "")

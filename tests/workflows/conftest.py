@@ -71,7 +71,7 @@ class FakeRegister:
         self.calls.append((capture_path.name, out, neutral))
         self.settings.append(settings)
         self.seen.append(statuses(out.parent))
-        progress.at(1, 2, "fitting")
+        progress.update(1, 2, "fitting")
         outcome = self.outcomes.get(capture_path.name, "converged")
         if isinstance(outcome, BaseException):
             raise outcome
@@ -109,11 +109,11 @@ class Notes:
         self.notes: list[str] = []
         self.steps: list[str] = []
 
-    def note(self, text: str) -> None:
+    def message(self, text: str) -> None:
         self.notes.append(text)
 
-    def at(self, done: int, total: int, what: str) -> None:
-        self.steps.append(what)
+    def update(self, done: int, total: int, label: str) -> None:
+        self.steps.append(label)
 
 
 def manifest(out: Path) -> dict:

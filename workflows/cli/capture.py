@@ -110,12 +110,12 @@ def synth_dataset(
         jobs: Captures rendered in parallel.
         studio: The synthetic studio.
     """
-    from registration.progress import shown
+    from registration.progress import console_progress
     from workflows.steps.synthesize import Population, synth_dataset
 
     names = tuple(name.strip() for name in expressions.split(",") if name.strip())
     population = Population(subjects=subjects, expressions=names, seed=seed, held_out=held_out, studio=studio.studio())
-    with shown() as progress:
+    with console_progress() as progress:
         synth_dataset(out, population, jobs=jobs, progress=progress)
     print(out)
     return 0

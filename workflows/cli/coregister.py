@@ -61,7 +61,7 @@ def coregister(
         farm: Where the jobs are executed.
     """
     from coregister.stopping_rule import StoppingRule
-    from registration.progress import shown
+    from registration.progress import console_progress
     from workflows.engine.process import migrate
     from workflows.farm.coregistration import coregister, submit_coregistration
     from workflows.farm.local import local_gpus
@@ -82,7 +82,7 @@ def coregister(
         return 0
     migrate(url)
     gpus = local_gpus() if fit.variant == "cuda" else ()
-    with shown() as progress:
+    with console_progress() as progress:
         result = coregister(plan, url=url, folder=folder, workers=farm.workers, gpus=gpus, progress=progress)
     state = result.state
     for name, curve in state.generalization_mm.items():

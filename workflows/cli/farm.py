@@ -110,7 +110,7 @@ def batch(
         fit: How the captures are registered.
         farm: Where the jobs are executed.
     """
-    from registration.progress import shown
+    from registration.progress import console_progress
     from workflows.engine.process import migrate
     from workflows.farm.batch import batch_jobs, submit_batch
     from workflows.farm.local import LocalFarm, local_gpus, run_until_done
@@ -127,7 +127,7 @@ def batch(
     roots = (*jobs.roots, str(folder.resolve()))
     gpus = local_gpus() if fit.variant == "cuda" else ()
     machine = LocalFarm(url=url, folder=folder, roots=roots, workers=farm.workers, gpus=gpus)
-    with shown() as progress:
+    with console_progress() as progress:
         result = run_until_done(machine, jobs.run, progress)
     print("\n".join((*_status_lines(_figures(url, jobs.run)), *filter(None, [result.reason]))))
     return 0 if result.counts.get("done", 0) == sum(result.counts.values()) else 1
@@ -191,13 +191,13 @@ def debug(
         port: Port of that page on this machine's loopback interface; from elsewhere: ssh -L PORT:127.0.0.1:PORT HOST.
         farm: Which farm.
     """
-    from registration.progress import shown
+    from registration.progress import console_progress
     from workflows.farm.debug import debug
 
     row = _row(farm.url, job)
     if row.failure:
         print(f"in the farm: {row.failure['status']}: {row.failure['reason']}")
-    with shown() as progress:
+    with console_progress() as progress:
         result = debug(row, out, progress, port=port if view else None)
     print(f"{result.summary}\n{out}", flush=True)
     if result.page is not None:

@@ -45,11 +45,11 @@ def evaluate(
         force: Evaluate again although the folder holds the result of the same input.
     """
     from coregister.evaluate.evaluation import EvaluationSettings
-    from registration.progress import shown
+    from registration.progress import console_progress
     from workflows.steps.evaluate import PAGE, evaluate_models, lines
 
     settings = EvaluationSettings(components=components, samples=samples, seed=seed)
-    with shown() as progress:
+    with console_progress() as progress:
         manifest = evaluate_models(
             models, held_out=held_out, out=out, captures=captures, settings=settings, force=force, progress=progress
         )

@@ -31,9 +31,9 @@ def register(
         fit: How the capture is registered.
     """
     from registration.pipeline import register
-    from registration.progress import shown
+    from registration.progress import console_progress
 
-    with shown() as progress:
+    with console_progress() as progress:
         result = register(capture, model, out, fit, neutral=neutral, force=force, progress=progress)
     print(f"{result.status}: {result.reason}\n{out}")
     return 1 if result.status == "failed" else 0
@@ -62,10 +62,10 @@ def subject(
         force: Register again although the folder holds the results of the same input.
         fit: How the captures are registered.
     """
-    from registration.progress import shown
+    from registration.progress import console_progress
     from workflows.steps.subject import register_subject
 
-    with shown() as progress:
+    with console_progress() as progress:
         result = register_subject(subject, model, out, fit, neutral=neutral, force=force, progress=progress)
     for row in result.rows:
         print(f"{row.name}: {row.status}: {row.reason}")

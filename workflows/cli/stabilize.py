@@ -32,11 +32,11 @@ def stabilize(
         skip_failed: Exclude failed registrations.
         force: Stabilize again although the folder holds the result of the same input.
     """
-    from registration.progress import shown
+    from registration.progress import console_progress
     from workflows.records.run import known_model
     from workflows.steps.stabilize import stabilize_run
 
-    with shown() as progress:
+    with console_progress() as progress:
         outcome = stabilize_run(
             run,
             model_path=model or known_model(run),
@@ -77,11 +77,11 @@ def review(
         skip_failed: Exclude failed registrations.
         port: Port on this machine's loopback interface; from elsewhere: ssh -L PORT:127.0.0.1:PORT HOST.
     """
-    from registration.progress import shown
+    from registration.progress import console_progress
     from workflows.records.run import known_model
     from workflows.web.review import review
 
-    with shown() as progress:
+    with console_progress() as progress:
         page = review(
             run,
             model_path=model or known_model(run),

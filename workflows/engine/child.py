@@ -106,17 +106,17 @@ class JsonlProgress:
 
     def __init__(self, file: Path) -> None:
         self._file = file
-        self._what, self._last = "", 0.0
+        self._label, self._last = "", 0.0
 
-    def note(self, text: str) -> None:
+    def message(self, text: str) -> None:
         self._line({"note": text})
         print(text, flush=True)
 
-    def at(self, done: int, total: int, what: str) -> None:
+    def update(self, done: int, total: int, label: str) -> None:
         now = time.monotonic()
-        if what != self._what or now - self._last > 1.0:
-            self._what, self._last = what, now
-            self._line({"done": done, "total": total, "what": what})
+        if label != self._label or now - self._last > 1.0:
+            self._label, self._last = label, now
+            self._line({"done": done, "total": total, "what": label})
 
     def _line(self, value: Mapping[str, Any]) -> None:
         with self._file.open("a") as file:

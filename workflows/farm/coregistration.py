@@ -3,7 +3,7 @@
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from registration.progress import Progress, Silent
+from registration.progress import NullProgress, Progress
 from workflows.engine.client import QueueClient
 from workflows.engine.jobs import DRIVER, FlowJob
 from workflows.farm.local import LocalFarm, run_until_done
@@ -89,5 +89,5 @@ def coregister(
     name = submit_coregistration(url, plan)
     roots = tuple(str(path) for path in (plan.dataset, plan.model.parent, plan.out, folder.resolve()))
     farm = LocalFarm(url=url, folder=folder, roots=roots, workers=workers, gpus=gpus)
-    stopped = run_until_done(farm, name, progress or Silent()).reason
+    stopped = run_until_done(farm, name, progress or NullProgress()).reason
     return CoregistrationResult(state=CoregistrationState.read(plan.out / MANIFEST), stopped=stopped)

@@ -68,7 +68,7 @@ def _register(arguments: Mapping[str, Any], out: Path, progress: Progress, port:
     location = str(arguments["capture"])
     if is_remote(location):
         copy = out / INPUTS / local_path(location).name
-        progress.note(f"downloading {location}")
+        progress.message(f"downloading {location}")
         fetch_folder(location, copy)
         location = str(copy)
     neutral = arguments.get("neutral")
@@ -96,7 +96,7 @@ def _page(stages: Path, capture: Path, model: Path, port: int, progress: Progres
     from workflows.web.fit_page import FitPage
 
     page = FitPage(stages, read_capture(capture), regions.exterior(gnm_npz.read(model)), port)
-    progress.note(f"open {page.url} in a browser")
+    progress.message(f"open {page.url} in a browser")
     return page
 
 

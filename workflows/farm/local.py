@@ -60,7 +60,7 @@ def run_until_done(farm: LocalFarm, run: str, progress: Progress) -> LocalRunRes
             processes.restart()
             row = reader.rows([run]).get(run)
             counts = reader.counts(run, kind="job")
-            progress.at(ended(counts), max(sum(counts.values()), 1), _summary(counts))
+            progress.update(ended(counts), max(sum(counts.values()), 1), _summary(counts))
             if row is not None and row.state in (DONE, FAILED, CANCELLED):
                 reason = f"{row.failure['status']}: {row.failure['reason']}" if row.failure else ""
                 return LocalRunResult(counts=counts, reason=reason)

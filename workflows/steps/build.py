@@ -10,7 +10,7 @@ from coregister.next_model.build import build_model
 from coregister.next_model.recipes import ModelRecipe
 from registration.errors import InputError
 from registration.model import gnm_npz
-from registration.progress import Progress, Silent
+from registration.progress import NullProgress, Progress
 from registration.storage import hashing
 from registration.storage.files import atomic_directory
 from workflows.pages.model import write_model_page
@@ -62,7 +62,7 @@ def build_next_model(
     product = Product(folder, hashing.input_hash(inputs, config), BuildResult)
     if (existing := product.find()) is not None and _is_model(folder / MODEL, existing.content_id):
         return replace(existing, model=str(folder / MODEL)).to_json()
-    (progress or Silent()).note(f"building a model from {len(subjects.usable)} subjects")
+    (progress or NullProgress()).message(f"building a model from {len(subjects.usable)} subjects")
     built = build_model(subjects, data, settings, categories=source.categories)
     result = BuildResult(
         input_hash=product.input_hash,

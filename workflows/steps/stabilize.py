@@ -10,7 +10,7 @@ import numpy as np
 from registration.errors import InputError
 from registration.model import gnm_npz
 from registration.model.gnm_npz import GNMData
-from registration.progress import Progress, Silent
+from registration.progress import NullProgress, Progress
 from registration.stabilize import stabilized_folder as disk
 from registration.stabilize.components import LEAST_SAMPLES, Components, Head
 from registration.stabilize.decisions import Change, Decision, change
@@ -64,7 +64,7 @@ def stabilize_run(
     Raises:
         InputError: as `read_run`, `read_decisions`, `check_out`; fewer than two expressions. Nothing is written then.
     """
-    progress, settings = progress or Silent(), settings or Stabilization()
+    progress, settings = progress or NullProgress(), settings or Stabilization()
     out = Path(run) / STABILIZED if out is None else Path(out)
     data = gnm_npz.read(model_path)
     head = Head.of(data)
@@ -147,13 +147,13 @@ def _write_subjects(
     """Both stages; content ids by file, the components, and by how much the second stage moves the skin."""
     count = len(run.subjects)
     for number, meshes in enumerate(run.meshes()):
-        progress.at(number, count, f"the skull of {meshes.subject}")
+        progress.update(number, count, f"the skull of {meshes.subject}")
         disk.write_subject(automatic_stage(meshes, head, run.skin, settings), fresh, number)
 
     def steady() -> Iterator[StabilizedSubject]:
         return (disk.read_subject(fresh, k) for k in range(count))
 
-    progress.at(count, count, "components of all subjects")
+    progress.update(count, count, "components of all subjects")
     components, correction = regional_stage(steady, head, settings, decisions)
     names = [(s.subject, name, label) for s in steady() for name, label in zip(s.names, s.labels, strict=True)]
     subjects, files, labels = (tuple(row[k] for row in names) for k in range(3))

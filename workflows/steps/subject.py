@@ -17,7 +17,7 @@ from registration.inputs import input_hash, read_schemes
 from registration.model import gnm_npz
 from registration.options import RegisterOptions
 from registration.pipeline import register
-from registration.progress import Named, Progress, Silent
+from registration.progress import NullProgress, PrefixedProgress, Progress
 from registration.storage import hashing
 from registration.storage.registration_folder import read_manifest, update_figures
 from registration.types import Capture, Registration
@@ -72,7 +72,7 @@ def register_subject(
         InputError: `read_captures` or `check_subject_out` refuses a folder, there is no such recipe, or the model or
             a landmark file cannot be read; nothing is computed or written.
     """
-    progress = progress or Silent()
+    progress = progress or NullProgress()
     subject_dir, model, out = Path(subject_dir), Path(model), Path(out)
     captures, start = _begun(subject_dir, model, out, options, neutral)
     one = partial(register, model=model, options=options, force=force)
@@ -212,12 +212,12 @@ def _loop(
             reason = f"the neutral failed: {record.row(captures[0]).reason}"
             record.put(replace(row, status="skipped", reason=reason))
             continue
-        told = Named(progress, f"{row.name} ({number} of {len(captures)})")
-        told.note("registering")
+        told = PrefixedProgress(progress, f"{row.name} ({number} of {len(captures)})")
+        told.message("registering")
         row, result = _registered(row, capture, record.out / row.name, one, neutral, told)
         picture = None if result is None else _attempt(partial(thumbnail, result), told)[0]
         record.put(row, picture)
-        told.note(f"{row.status}: {row.reason}")
+        told.message(f"{row.status}: {row.reason}")
         if number == 1 and result is not None and row.usable:
             neutral = _Neutral(registration=result, capture=capture, folder=record.out / row.name)
     return record.subject
@@ -284,7 +284,7 @@ def _attempt(action: Callable[[], T], progress: Progress) -> tuple[T | None, str
     except InputError as error:
         return None, error.line
     except Exception as error:
-        progress.note(traceback.format_exc())
+        progress.message(traceback.format_exc())
         first, *_ = str(error).splitlines() or [""]  # the log has it all
         return None, f"{type(error).__name__}: {first}"
 

@@ -7,7 +7,7 @@ from typing import Any
 from coregister.synthetic import expressions, subject
 from coregister.synthetic.capture import Studio, check_studio
 from registration.errors import InputError
-from registration.progress import Progress, Silent
+from registration.progress import NullProgress, Progress
 from registration.storage.hashing import to_jsonable, versions
 from workflows.processes import run_parallel
 from workflows.records.dataset import HELD_OUT, MANIFEST, DatasetRecord
@@ -50,7 +50,7 @@ def synth_dataset(
         InputError: settings out of range, unknown expressions, a folder that holds anything but this dataset, before
             anything is drawn; captures that could not be made, after all others were tried.
     """
-    progress, out = progress or Silent(), Path(out)
+    progress, out = progress or NullProgress(), Path(out)
     _check(population)
     record = _make_record(population)
     _check_out(out, record)
@@ -68,7 +68,7 @@ def synth_dataset(
         _write(out, record)
     lost = {}
     for done, (name, trouble) in enumerate(run_parallel(photograph, calls, jobs), 1):
-        progress.at(done, len(calls), name)
+        progress.update(done, len(calls), name)
         if trouble:
             lost[name] = trouble
     if lost:

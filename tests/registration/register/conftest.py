@@ -24,13 +24,13 @@ class Notes:
         self.notes: list[str] = []
         self.stages: list[str] = []
 
-    def note(self, text: str) -> None:
+    def message(self, text: str) -> None:
         self.notes.append(text)
 
-    def at(self, done: int, total: int, what: str) -> None:
+    def update(self, done: int, total: int, label: str) -> None:
         assert 0 <= done <= total
-        if what not in self.stages:
-            self.stages.append(what)
+        if label not in self.stages:
+            self.stages.append(label)
 
 
 @dataclass(frozen=True, kw_only=True)

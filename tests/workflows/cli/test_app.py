@@ -178,7 +178,7 @@ def test_register_hands_over_every_argument(
     monkeypatch.setattr(pipeline, "register", record)
     flags = "--recipe studio --views 7 --seed 3 --neutral N --deterministic --force --variant cuda --landmarks 68=a 5=b"
     assert main(["register", "C", "--model", "M.npz", "--out", "O", *flags.split()]) == code
-    received.pop("progress").note("a message")
+    received.pop("progress").message("a message")
     assert received == {
         "capture": Path("C"),
         "model": Path("M.npz"),
@@ -225,7 +225,7 @@ def test_subject_hands_over_every_argument(
     monkeypatch.setattr(workflows.steps.subject, "register_subject", record)
     flags = "--recipe studio --views 7 --seed 3 --neutral N --deterministic --force --variant cuda --landmarks 68=a 5=b"
     assert main(["subject", "S", "--model", "M.npz", "--out", "O", *flags.split()]) == code
-    received.pop("progress").note("a message")
+    received.pop("progress").message("a message")
     assert received == {
         "subject": Path("S"),
         "model": Path("M.npz"),

@@ -28,8 +28,8 @@ def work(store: str, key: str, seconds: float = 0.0, trace: str | None = None) -
 
 
 def talk(text: str, progress: Progress) -> str:
-    progress.note(text)
-    progress.at(1, 2, "talking")
+    progress.message(text)
+    progress.update(1, 2, "talking")
     print("from Python", file=sys.stderr)
     ctypes.CDLL(None).puts(b"from C")
     return text

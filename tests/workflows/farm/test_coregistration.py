@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from registration.errors import InputError
-from registration.progress import Silent
+from registration.progress import NullProgress
 from tests.workflows.rounds import MODEL, write_people
 from workflows.engine.client import QueueClient
 from workflows.engine.database import default_url
@@ -42,4 +42,4 @@ def test_a_run_that_goes_on_stays_and_one_that_ended_is_forgotten(capture: Path,
 def test_without_a_worker_nothing_starts(tmp_path: Path) -> None:
     farm = LocalFarm(url=default_url(tmp_path), folder=tmp_path, roots=(), workers=0)
     with pytest.raises(InputError, match="no worker"):
-        run_until_done(farm, "june", Silent())
+        run_until_done(farm, "june", NullProgress())

@@ -9,7 +9,7 @@ import pytest
 from registration import pipeline
 from registration.errors import InputError
 from registration.options import RegisterOptions
-from registration.progress import Silent
+from registration.progress import NullProgress
 from tests.registration.capture import small
 from tests.registration.register import synthetic
 from tests.registration.report.test_page import a_registration
@@ -52,7 +52,7 @@ def test_a_registration_is_made_again_with_pictures_and_out_of_the_way(
         "register": {"out": "/results/e", "neutral": "/results/n"},
         "register stored": {"store": "/s", "key": "k"},
     }
-    result = debug(row(step, **arguments, **places[step]), tmp_path / "out", Silent())
+    result = debug(row(step, **arguments, **places[step]), tmp_path / "out", NullProgress())
     assert result.summary == "failed: so it is" and result.page is None
     (call,) = calls
     assert call["capture"] == Path("/c/e") and call["model"] == Path("/m.npz")
@@ -67,13 +67,13 @@ def test_a_capture_from_a_url_is_kept_for_looking(
     monkeypatch.setattr("workflows.farm.debug.fetch_folder", lambda place, folder: folder.mkdir(parents=True))
     monkeypatch.setattr("workflows.farm.debug.fetch_model", lambda place: Path("/cache/m.npz"))
     stored = row("register stored", capture="s3://b/c/e", model="s3://b/m.npz", store="s3://b/s", key="k")
-    debug(stored, tmp_path / "out", Silent())
+    debug(stored, tmp_path / "out", NullProgress())
     assert calls[0]["capture"] == tmp_path / "out" / "inputs" / "e" and calls[0]["capture"].is_dir()
 
 
 def test_a_registration_can_be_watched(calls: list[dict[str, Any]], tmp_path: Path) -> None:
     capture = small.make(tmp_path / "capture")
-    done = debug(row(capture=str(capture), model=str(synthetic.MODEL)), tmp_path / "out", Silent(), port=0)
+    done = debug(row(capture=str(capture), model=str(synthetic.MODEL)), tmp_path / "out", NullProgress(), port=0)
     assert done.page is not None
     with urllib.request.urlopen(f"http://127.0.0.1:{done.page.port}", timeout=10) as answer:
         assert answer.status == 200
@@ -86,10 +86,10 @@ def test_a_page_ends_with_the_registration_that_was_refused(monkeypatch: pytest.
 
     ports: list[int] = []
     monkeypatch.setattr(pipeline, "register", refuse)
-    monkeypatch.setattr(Silent, "note", lambda self, text: ports.append(int(text.split(":")[2].split(" ")[0])))
+    monkeypatch.setattr(NullProgress, "message", lambda self, text: ports.append(int(text.split(":")[2].split(" ")[0])))
     capture = small.make(tmp_path / "capture")
     with pytest.raises(InputError, match="no"):
-        debug(row(capture=str(capture), model=str(synthetic.MODEL)), tmp_path / "out", Silent(), port=0)
+        debug(row(capture=str(capture), model=str(synthetic.MODEL)), tmp_path / "out", NullProgress(), port=0)
     with pytest.raises(OSError):
         urllib.request.urlopen(f"http://127.0.0.1:{ports[0]}", timeout=10)
 
@@ -104,7 +104,7 @@ def test_jobs_that_cannot_be_debugged_are_refused(calls: list[dict[str, Any]], t
         (row(capture="http://x/y"), tmp_path / "out"),
     ):
         with pytest.raises(InputError):
-            debug(wrong, out, Silent())
+            debug(wrong, out, NullProgress())
     with pytest.raises(InputError, match="--view cannot show"):
-        debug(row(step="stabilize", run="/r", model="/m.npz", out="/o"), tmp_path / "out", Silent(), port=0)
+        debug(row(step="stabilize", run="/r", model="/m.npz", out="/o"), tmp_path / "out", NullProgress(), port=0)
     assert not calls and not (tmp_path / "out").exists()
