@@ -1,4 +1,4 @@
-"""Captures and models that lie in a folder or in object storage, brought to this machine."""
+"""Local copies of captures and models, which are in folders or in object storage."""
 
 import hashlib
 import json
@@ -15,83 +15,84 @@ from registration.errors import InputError
 from registration.storage.cache import cache_folder
 from workflows.ids import redact
 
-MAX_BYTES = 64 * 2**30  # of one capture: far beyond any, and what a hostile listing must not make us fetch
+MAX_BYTES = 64 * 2**30  # of one capture: more than any has; limits the download of a hostile listing
 
 
-def is_remote(place: str) -> bool:
-    return "://" in place and not place.startswith("file://")
+def is_remote(location: str) -> bool:
+    """Return whether a path or URL is outside the file system."""
+    return "://" in location and not location.startswith("file://")
 
 
-def local_path(place: str) -> Path:
-    """The path of a place that is not remote."""
-    return Path(place.removeprefix("file://"))
+def local_path(location: str) -> Path:
+    """Return the path of a location that is not remote."""
+    return Path(location.removeprefix("file://"))
 
 
 @contextmanager
-def fetch_capture(place: str) -> Iterator[Path]:
-    """A capture's folder as a local path; what was fetched for it is deleted in the end.
+def fetch_capture(location: str) -> Iterator[Path]:
+    """Yield a capture's folder as a local path; a downloaded copy is deleted at the end.
 
     Raises:
         InputError: the remote folder is missing, too large, or names files outside itself.
     """
-    if not is_remote(place):
-        yield local_path(place)
+    if not is_remote(location):
+        yield local_path(location)
         return
     with tempfile.TemporaryDirectory(prefix="gnmreg-capture-") as name:
-        folder = Path(name) / PurePosixPath(place).name
-        fetch_folder(place, folder)
+        folder = Path(name) / PurePosixPath(location).name
+        fetch_folder(location, folder)
         yield folder
 
 
-def fetch_folder(place: str, folder: Path) -> None:
-    """Copy all files below a URL into a folder. Raises InputError as `fetch_capture`."""
-    fs, root = fsspec.core.url_to_fs(place)
+def fetch_folder(location: str, folder: Path) -> None:
+    """Download all files below a URL into a folder. Raises InputError as `fetch_capture`."""
+    fs, root = fsspec.core.url_to_fs(location)
     files = fs.find(root, detail=True)
     if not files:
-        raise _unusable(place, expected="files below this URL", got="none")
+        raise _input_error(location, expected="files below this URL", got="none")
     if (total := sum(int(info["size"] or 0) for info in files.values())) > MAX_BYTES:
-        raise _unusable(place, expected=f"at most {MAX_BYTES} bytes", got=total)
+        raise _input_error(location, expected=f"at most {MAX_BYTES} bytes", got=total)
     for path in files:
         name = PurePosixPath(path.removeprefix(root).lstrip("/"))
         if name.is_absolute() or ".." in name.parts or "\0" in str(name):
-            raise _unusable(place, expected="names inside the folder", got=repr(str(name)))
+            raise _input_error(location, expected="names inside the folder", got=repr(str(name)))
         target = folder / name
         target.parent.mkdir(parents=True, exist_ok=True)
         fs.get_file(path, str(target))
 
 
-def fetch_model(place: str) -> Path:
-    """A model's file as a local path, with its landmark schemes beside it; fetched once and then found in the cache.
+def fetch_model(location: str) -> Path:
+    """Return a model's file as a local path, with its landmark schemes next to it; downloads are cached.
 
     Raises:
         InputError: there is no such file.
     """
-    if not is_remote(place):
-        return local_path(place)
-    fs, path = fsspec.core.url_to_fs(place)
+    if not is_remote(location):
+        return local_path(location)
+    fs, path = fsspec.core.url_to_fs(location)
     folder, _, name = path.rpartition("/")
     try:
         infos = {p: i for p, i in fs.find(folder, maxdepth=1, detail=True).items() if p == path or _is_scheme(p)}
     except FileNotFoundError:
         infos = {}
     if path not in infos:
-        raise _unusable(place, expected="a model's NPZ file", got="no such file")
-    told = {p: [str(i.get(k)) for k in ("size", "ETag", "etag", "LastModified", "mtime")] for p, i in infos.items()}
+        raise _input_error(location, expected="a model's NPZ file", got="no such file")
+    versions = {p: [str(i.get(k)) for k in ("size", "ETag", "etag", "LastModified", "mtime")] for p, i in infos.items()}
     cache = cache_folder() / "fetched"
-    cached = cache / hashlib.sha256(json.dumps([place, told], sort_keys=True).encode()).hexdigest()[:32]
+    cached = cache / hashlib.sha256(json.dumps([location, versions], sort_keys=True).encode()).hexdigest()[:32]
     if not cached.is_dir():
         cache.mkdir(parents=True, exist_ok=True)
-        fresh = Path(tempfile.mkdtemp(prefix=".fetch-", dir=cache))
+        temporary = Path(tempfile.mkdtemp(prefix=".fetch-", dir=cache))
         try:
-            for one in infos:
-                fs.get_file(one, str(fresh / PurePosixPath(one).name))
+            for remote in infos:
+                fs.get_file(remote, str(temporary / PurePosixPath(remote).name))
             if not cached.is_dir():
-                fresh.rename(cached)
+                temporary.rename(cached)
         except OSError:
-            if not cached.is_dir():  # unless another worker was faster
+            if not cached.is_dir():  # another worker was not faster
                 raise
         finally:
-            shutil.rmtree(fresh, ignore_errors=True)
+            shutil.rmtree(temporary, ignore_errors=True)
     return cached / name
 
 
@@ -100,7 +101,7 @@ def _is_scheme(path: str) -> bool:
     return name.startswith("head_sparse_") and name.endswith(".txt")
 
 
-def _unusable(place: str, *, expected: Any, got: Any) -> InputError:
+def _input_error(location: str, *, expected: Any, got: Any) -> InputError:
     return InputError(
-        "The input cannot be fetched", where=redact(place), expected=expected, got=got, fix="check the URL's files"
+        "The input cannot be fetched", where=redact(location), expected=expected, got=got, fix="check the URL's files"
     )

@@ -1,10 +1,10 @@
-"""Where artifacts live: below a folder or an object storage's URL, each under a key, told by its manifest.
+"""Storage of artifacts below a folder or a URL of object storage, each under a key.
 
-    <store>/<key>/artifact.json          what was made, from what, and the digest of every file
-    <store>/<key>/attempt-<uuid>/...     the files of the attempt that the manifest names
+    <store>/<key>/artifact.json          the record: input hash and the digest of every file
+    <store>/<key>/attempt-<uuid>/...     the files of the attempt that the record names
 
-An attempt writes only below its own folder and is published by writing the manifest, which is atomic: two workers that
-make the same thing at the same time disturb nobody, and one that dies leaves an orphan that `verify` names.
+An attempt writes only below its own folder and is published by writing the record, which is atomic: two workers that
+compute the same artifact do not interfere, and one that dies leaves files that `verify` lists as orphaned.
 """
 
 import hashlib
@@ -64,16 +64,17 @@ class Artifact(
 
 @dataclass(frozen=True, kw_only=True)
 class VerificationReport:
-    """What re-hashing a whole store found; names are relative to the store."""
+    """The result of `Store.verify`; names are relative to the store."""
 
     artifacts: int
     missing: tuple[str, ...] = ()
     altered: tuple[str, ...] = ()
-    orphaned: tuple[str, ...] = ()  # files that no manifest names; a running attempt's are among them
-    unreadable: Mapping[str, str] = field(default_factory=dict)  # manifest -> why
+    orphaned: tuple[str, ...] = ()  # files that no record names, including those of running attempts
+    unreadable: Mapping[str, str] = field(default_factory=dict)  # record -> reason
 
     @property
     def is_sound(self) -> bool:
+        """Whether all records are readable and all their files unchanged."""
         return not (self.missing or self.altered or self.unreadable)
 
 
@@ -81,7 +82,7 @@ class Store:
     """Artifacts below one folder or URL (`s3://bucket/prefix`)."""
 
     def __init__(self, url: str | Path) -> None:
-        """Nothing is read or created yet. Raises InputError for a scheme that fsspec or this installation lacks."""
+        """Nothing is read or created yet. Raises InputError for a scheme that is not installed."""
         self.url = str(url)
         try:
             self._fs, root = fsspec.core.url_to_fs(self.url, **_options(self.url))
@@ -97,10 +98,10 @@ class Store:
         self.local = Path(root) if "file" in _protocols(self._fs) else None
 
     def find(self, key: str) -> Artifact | None:
-        """The published artifact of a key, or None.
+        """Return the published artifact of a key, or None.
 
         Raises:
-            InputError: the manifest is not ours, cannot be read, or names a file outside its attempt.
+            InputError: the record is malformed, or names a file outside its attempt.
         """
         path = self._path(key, MANIFEST)
         try:
@@ -109,14 +110,20 @@ class Store:
             return None
         return _checked(content, where=f"{redact(self.url)}/{key}/{MANIFEST}", key=key)
 
-    def produce(self, key: str, *, wanted: str, make: Callable[[Path], Mapping[str, Any]]) -> Artifact:
-        """The artifact of `key` made from the input that hashes to `wanted`: the published one, or a fresh one.
+    def produce(self, key: str, *, input_hash: str, make: Callable[[Path], Mapping[str, Any]]) -> Artifact:
+        """Return the artifact of a key: the published one if it has this input hash, else a new one.
 
-        `make` fills the empty folder that it is handed and returns what the manifest shall say about it.
+        Args:
+            key: of the artifact.
+            input_hash: of everything that determines the artifact.
+            make: writes the files into the empty folder that it is given, and returns the record's `about`.
+
+        Raises:
+            InputError: the key is invalid, or the published record malformed.
         """
-        found = self.find(check_id(key))
-        if found is not None and found.input_hash == wanted and self._complete(found):
-            return found
+        published = self.find(check_id(key))
+        if published is not None and published.input_hash == input_hash and self._is_complete(published):
+            return published
         attempt = f"{ATTEMPT}{uuid.uuid4().hex}"
         if self.local is not None:
             folder = self.local / key / attempt
@@ -126,21 +133,21 @@ class Store:
             except BaseException:
                 shutil.rmtree(folder, ignore_errors=True)
                 raise
-            return self._published(key, attempt, wanted, folder, about)
+            return self._publish(key, attempt, input_hash, folder, about)
         with tempfile.TemporaryDirectory(prefix="gnmreg-") as name:
             about = make(Path(name))
             for file in _files(Path(name)):
                 self._fs.put_file(str(file), self._path(key, attempt, file.relative_to(name).as_posix()))
-            return self._published(key, attempt, wanted, Path(name), about)
+            return self._publish(key, attempt, input_hash, Path(name), about)
 
     def keys(self, below: str = "") -> Iterator[str]:
-        """Keys of the published artifacts at and below a key, sorted."""
+        """Yield the keys of the published artifacts at and below a key, sorted."""
         for name in sorted(self._names(below)):
             if posixpath.basename(name) == MANIFEST and not _in_attempt(name):
                 yield posixpath.dirname(name)
 
     def verify(self) -> VerificationReport:
-        """Read every file of the store and compare it with the manifests."""
+        """Read every file of the store and compare it with the records."""
         names, missing, altered, unreadable = set(self._names()), [], [], {}
         manifests = {name for name in names if posixpath.basename(name) == MANIFEST and not _in_attempt(name)}
         known = set(manifests)
@@ -152,12 +159,12 @@ class Store:
                 unreadable[manifest] = f"expected {error.expected}, got {error.got}"
                 continue
             for name, stored in artifact.files.items() if artifact else ():
-                place = posixpath.join(key, artifact.attempt, name) if artifact else ""
-                known.add(place)
-                if place not in names:
-                    missing.append(place)
-                elif _digest(self._fs.open(self._path(place), "rb")) != stored.sha256:
-                    altered.append(place)
+                path = posixpath.join(key, artifact.attempt, name) if artifact else ""
+                known.add(path)
+                if path not in names:
+                    missing.append(path)
+                elif _digest(self._fs.open(self._path(path), "rb")) != stored.sha256:
+                    altered.append(path)
         return VerificationReport(
             artifacts=len(manifests),
             missing=tuple(missing),
@@ -167,21 +174,21 @@ class Store:
         )
 
     def tidy(self, older_than_s: float = 24 * 3600.0) -> int:
-        """Delete the files of attempts that were never published or are superseded; returns how many.
+        """Delete the files of attempts that were not published or are superseded, and return their number.
 
-        Younger ones may belong to a running job and stay.
+        Younger files are kept: they may belong to a running job.
         """
-        gone = 0
+        deleted = 0
         for name in self.verify().orphaned:
             if _in_attempt(name) and time.time() - self._written(name) > older_than_s:
                 self._fs.rm_file(self._path(name))
-                gone += 1
+                deleted += 1
         if self.local is not None:
             _remove_empty(self.local)
-        return gone
+        return deleted
 
     def delete(self, below: str) -> int:
-        """Delete all artifacts at and below a key, manifests first; returns how many there were."""
+        """Delete all artifacts at and below a key, records first, and return their number."""
         keys = list(self.keys(check_id(below)))
         for key in keys:
             self._fs.rm_file(self._path(key, MANIFEST))
@@ -190,21 +197,21 @@ class Store:
         return len(keys)
 
     def retire(self, run: str, keep: int) -> list[str]:
-        """Delete the artifacts of a run's iterations (`it00`, `it01` ...) but the last `keep`; returns their keys."""
+        """Delete the artifacts of a run's iterations (`it00`, `it01` ...) except the last `keep`; return their keys."""
         parts = {key.split("/")[1] for key in self.keys(run) if key.startswith(f"{run}/it")}
         old = sorted(parts)[: len(parts) - keep] if keep > 0 else []
         for part in old:
             self.delete(f"{run}/{part}")
         return [f"{run}/{part}" for part in old]
 
-    def _published(self, key: str, attempt: str, wanted: str, folder: Path, about: Mapping[str, Any]) -> Artifact:
+    def _publish(self, key: str, attempt: str, input_hash: str, folder: Path, about: Mapping[str, Any]) -> Artifact:
         files = {
             file.relative_to(folder).as_posix(): StoredFile(sha256=_digest(file.open("rb")), bytes=file.stat().st_size)
             for file in _files(folder)
         }
         artifact = Artifact(
             key=key,
-            input_hash=wanted,
+            input_hash=input_hash,
             content_id=_content_id(files),
             attempt=attempt,
             files=files,
@@ -214,14 +221,14 @@ class Store:
         return artifact
 
     def _write(self, path: str, text: str) -> None:
-        """One file, atomically: object storage shows whole objects only, a folder needs a rename."""
+        """Write a file atomically: object storage shows whole objects only, a folder needs a rename."""
         if self.local is None:
             self._fs.pipe_file(path, text.encode())
             return
         atomic_write_text(Path(path), text)
 
-    def _complete(self, artifact: Artifact) -> bool:
-        """Whether all files are there in their length; `verify` is for more."""
+    def _is_complete(self, artifact: Artifact) -> bool:
+        """Whether all files exist with their length; `verify` checks digests too."""
         try:
             return all(
                 self._fs.size(self._path(artifact.key, artifact.attempt, name)) == stored.bytes
@@ -244,7 +251,7 @@ class Store:
 
 
 def _options(url: str) -> dict[str, Any]:
-    # A listing must show what other machines wrote since.
+    # A listing must show what other machines wrote meanwhile.
     return {"use_listings_cache": False} if url.startswith("s3://") else {}
 
 
@@ -257,7 +264,7 @@ def _files(folder: Path) -> list[Path]:
 
 
 def _digest(stream: Any) -> str:
-    """sha256 of all that a stream of bytes holds; closes it."""
+    """sha256 of a stream of bytes, which is closed."""
     digest = hashlib.sha256()
     with stream:
         while block := stream.read(_BLOCK):

@@ -1,4 +1,4 @@
-"""What a model is built from and measured on, off the disk: registrations of a run, true meshes of captures."""
+"""Subjects that a model is built from or evaluated on: registrations of a run, true meshes of captures."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float
 
 from coregister.evaluate.evaluation import HeldOutSubject
-from coregister.next_model.training_data import NEUTRAL, TrainingMesh, TrainingSubject, transfer_to_unposed, unpose
+from coregister.next_model.training_data import TrainingMesh, TrainingSubject, transfer_to_unposed, unpose
 from registration.capture.scan import read_truth
 from registration.model.gnm import GNM
 from registration.model.gnm_npz import GNMData
@@ -20,14 +20,15 @@ from registration.stabilize.subject_meshes import SkullSkin, SubjectMeshes, subj
 from registration.storage.files import atomic_file
 from registration.storage.registration_folder import load_registration, read_manifest
 from workflows.records.held_out import TAG
-from workflows.records.subject import SubjectCaptures, UsableRegistrations, read_usable
+from workflows.records.subject import NEUTRAL, SubjectCaptures, UsableRegistrations, read_usable
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class RegisteredSubjects:
-    """Subjects of a run whose neutral is usable, with expressions where a stabilized set has them; read anew each time.
+    """The training subjects of a run: those with a usable neutral, with the expressions of a stabilized set.
 
-    Neutrals are unposed, and expressions laid onto them; the confidence is each registration's own.
+    An iterable; every iteration reads the meshes from disk. Neutrals are in the bind pose, and expressions aligned with
+    them; the confidence is that of each registration.
     """
 
     run: Path
@@ -38,35 +39,36 @@ class RegisteredSubjects:
 
     @cached_property
     def usable(self) -> dict[str, UsableRegistrations]:
-        found = {name: read_usable(self.run / name) for name in self.names}
-        return {name: one for name, one in found.items() if one is not None}
+        """Folder name -> usable registrations, of the subjects that have any. Raises InputError for broken records."""
+        usable = {name: read_usable(self.run / name) for name in self.names}
+        return {name: registrations for name, registrations in usable.items() if registrations is not None}
 
     @cached_property
     def inputs(self) -> dict[str, str]:
-        """Content ids of everything that is read."""
+        """Content ids of everything that an iteration reads."""
         ids = {
             f"{name}/{folder}": read_manifest(self.run / name / folder).content_id
-            for name, one in self.usable.items()
-            for folder in (one.neutral, *(one.expressions if self.steady else ()))
+            for name, usable in self.usable.items()
+            for folder in (usable.neutral, *(usable.expressions if self.steady else ()))
         }
         return ids | ({"stabilized": stabilized.read_manifest(self.steady)["content_id"]} if self.steady else {})
 
     def __iter__(self) -> Iterator[TrainingSubject]:
         model, weights = GNM(self.model), SkullSkin.of(self.model).area
-        places = _places(self.steady)
-        for name, one in self.usable.items():
-            neutral = load_registration(self.run / name / one.neutral)
-            bare = unpose(neutral, model)
+        numbers = _subject_numbers(self.steady)
+        for name, usable in self.usable.items():
+            neutral = load_registration(self.run / name / usable.neutral)
+            unposed = unpose(neutral, model)
             expressions = []
-            if self.steady is not None and one.subject in places:
-                found = stabilized.read_subject(self.steady, places[one.subject])
-                sure = weights * neutral.confidence
-                for folder, label, vertices in zip(found.names, found.labels, found.vertices, strict=True):
+            if self.steady is not None and usable.subject in numbers:
+                meshes = stabilized.read_subject(self.steady, numbers[usable.subject])
+                confidence = weights * neutral.confidence
+                for folder, label, vertices in zip(meshes.names, meshes.labels, meshes.vertices, strict=True):
                     expressions.append(
                         TrainingMesh(
                             name=folder,
                             label=label,
-                            vertices=transfer_to_unposed(vertices, neutral.vertices, bare, sure),
+                            vertices=transfer_to_unposed(vertices, neutral.vertices, unposed, confidence),
                             confidence=load_registration(self.run / name / folder).confidence,
                             triangles=neutral.triangles,
                             digest=self.inputs[f"{name}/{folder}"],
@@ -75,32 +77,36 @@ class RegisteredSubjects:
             yield TrainingSubject(
                 name=name,
                 neutral=TrainingMesh(
-                    name=one.neutral,
+                    name=usable.neutral,
                     label=NEUTRAL,
-                    vertices=bare,
+                    vertices=unposed,
                     confidence=neutral.confidence,
                     triangles=neutral.triangles,
-                    digest=self.inputs[f"{name}/{one.neutral}"],
+                    digest=self.inputs[f"{name}/{usable.neutral}"],
                 ),
                 expressions=tuple(expressions),
                 tags=self.tags.get(name, {}),
             )
 
 
-def _places(steady: Path | None) -> dict[str, int]:
-    """Subject -> its number in the stabilized set."""
+def _subject_numbers(steady: Path | None) -> dict[str, int]:
+    """Subject -> number in the stabilized set."""
     return {} if steady is None else {name: k for k, name in enumerate(stabilized.read_manifest(steady)["subjects"])}
 
 
 def has_truths(captures: SubjectCaptures, model: GNMData) -> bool:
-    """Whether every capture of a subject has true vertices of the model's number. Raises InputError for broken ones."""
+    """Return whether all captures of a subject have ground truths with the model's number of vertices.
+
+    Raises:
+        InputError: a ground truth cannot be read.
+    """
     truths = [capture.ground_truth for capture in captures.captures]
     count = len(model.template_vertex_positions)
     return not captures.broken and all(truth is not None and len(read_truth(truth)) == count for truth in truths)
 
 
 def true_meshes(captures: SubjectCaptures, model: GNMData) -> SubjectMeshes:
-    """A subject's true vertices, seen everywhere."""
+    """Return a subject's true vertices, with full confidence. All captures must have a ground truth."""
     truths = [read_truth(c.ground_truth).astype(np.float32) for c in captures.captures if c.ground_truth is not None]
     others = captures.captures[1:]
     return SubjectMeshes(
@@ -115,16 +121,20 @@ def true_meshes(captures: SubjectCaptures, model: GNMData) -> SubjectMeshes:
 
 
 def registered_meshes(folder: Path, model: GNMData) -> SubjectMeshes | None:
-    """The usable registrations in a subject's folder; None without a neutral. Raises InputError for broken ones."""
-    one = read_usable(folder)
-    if one is None:
+    """Return the usable registrations in a subject's folder; None without a usable neutral.
+
+    Raises:
+        InputError: the record or a registration cannot be read.
+    """
+    usable = read_usable(folder)
+    if usable is None:
         return None
-    neutral = load_registration(folder / one.neutral)
-    if one.expressions:
-        rows = ((name, label, load_registration(folder / name)) for name, label in one.expressions.items())
-        return subject_meshes(one.subject, neutral, rows, SkullSkin.of(model))
+    neutral = load_registration(folder / usable.neutral)
+    if usable.expressions:
+        rows = ((name, label, load_registration(folder / name)) for name, label in usable.expressions.items())
+        return subject_meshes(usable.subject, neutral, rows, SkullSkin.of(model))
     return SubjectMeshes(
-        subject=one.subject,
+        subject=usable.subject,
         neutral=neutral.vertices,
         neutral_confidence=neutral.confidence,
         names=(),
@@ -137,7 +147,15 @@ def registered_meshes(folder: Path, model: GNMData) -> SubjectMeshes | None:
 def held_out(
     name: str, meshes: SubjectMeshes, skin: SkullSkin, categories: Mapping[str, str], tags: Mapping[str, Any]
 ) -> HeldOutSubject:
-    """One subject to measure models on: expressions lie in the neutral's world, the skull where the neutral has it."""
+    """Return a held-out subject whose expressions are stabilized: their skull is aligned with the neutral's.
+
+    Args:
+        name: of the subject's folder.
+        meshes: of the subject.
+        skin: of the model, for stabilization.
+        categories: expression label -> category; other labels are their own category.
+        tags: of the subject.
+    """
     vertices: Float[np.ndarray, "S V 3"] = meshes.vertices
     if meshes.names:
         vertices = stabilize_subject(meshes, skin).vertices
@@ -150,12 +168,18 @@ def held_out(
     )
 
 
-def write_held_out(people: Sequence[HeldOutSubject], triangles: np.ndarray, file: Path) -> None:
-    """The NPZ file of `gnmreg model evaluate --held-out` (docs/formats.md), in one rename; tags that all have."""
-    rows = [(one, NEUTRAL, NEUTRAL, one.neutral) for one in people]
-    rows += [(o, c, c, v) for o in people for c, v in zip(o.categories, o.expressions, strict=True)]
-    shared = [tag for tag in (people[0].tags if people else ()) if all(tag in one.tags for one in people)]
-    arrays = {TAG + tag: np.array([one.tags[tag] for one, *_ in rows]) for tag in shared}
+def write_held_out(subjects: Sequence[HeldOutSubject], triangles: np.ndarray, file: Path) -> None:
+    """Write the NPZ file of `gnmreg model evaluate --held-out` (docs/formats.md), in one rename.
+
+    Args:
+        subjects: to be written; of their tags, those that all of them have.
+        triangles: (F, 3), of all meshes.
+        file: to write.
+    """
+    rows = [(subject, NEUTRAL, NEUTRAL, subject.neutral) for subject in subjects]
+    rows += [(s, c, c, v) for s in subjects for c, v in zip(s.categories, s.expressions, strict=True)]
+    shared = [tag for tag in (subjects[0].tags if subjects else ()) if all(tag in s.tags for s in subjects)]
+    arrays = {TAG + tag: np.array([subject.tags[tag] for subject, *_ in rows]) for tag in shared}
     file.parent.mkdir(parents=True, exist_ok=True)
     with atomic_file(file) as temporary:
         np.savez(
@@ -163,7 +187,7 @@ def write_held_out(people: Sequence[HeldOutSubject], triangles: np.ndarray, file
             allow_pickle=False,
             vertices=np.array([vertices for *_, vertices in rows], np.float32),
             triangles=triangles,
-            subjects=np.array([one.subject for one, *_ in rows]),
+            subjects=np.array([subject.subject for subject, *_ in rows]),
             labels=np.array([label for _, label, _, _ in rows]),
             categories=np.array([category for _, _, category, _ in rows]),
             **{name: array for name, array in arrays.items() if array.dtype.kind != "O"},

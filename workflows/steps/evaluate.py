@@ -1,7 +1,7 @@
-"""`gnmreg model evaluate`, also as a step: models and held-out subjects in, a folder with figures and a page out."""
+"""`gnmreg model evaluate`, also as a step: writes a folder with metrics and a page."""
 
-import json
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -13,16 +13,31 @@ from registration.errors import InputError
 from registration.model import gnm_npz
 from registration.model.gnm_npz import GNMData
 from registration.progress import Progress
-from registration.storage.files import atomic_directory, read_json_of_kind, refuse_foreign
+from registration.storage.files import atomic_directory, refuse_foreign
 from registration.storage.hashing import input_hash, to_jsonable, versions
+from registration.storage.records import Record
 from workflows.pages.evaluation import write_evaluate_page
 from workflows.records.held_out import read_held_out
 from workflows.records.step_results import EvaluateResult
 
-SCHEMA = 1
-KIND = "gnm-evaluation"
 MANIFEST, PAGE, VERTICES = "manifest.json", "index.html", "vertices.npz"
 _FILES = (MANIFEST, PAGE, VERTICES)
+
+
+@dataclass(frozen=True, kw_only=True)
+class EvaluationManifest(
+    Record,
+    kind="gnm-evaluation",
+    title="evaluation's manifest",
+    fix="evaluate again with --force, or delete the folder",
+):
+    """The record of an evaluation of models: `manifest.json`."""
+
+    input_hash: str  # of everything that determines the evaluation
+    figures: Mapping[str, Any]
+    config: Mapping[str, Any]  # the settings
+    inputs: Mapping[str, str]  # input -> sha256
+    versions: Mapping[str, str]
 
 
 def evaluate_models(
@@ -34,11 +49,17 @@ def evaluate_models(
     settings: EvaluationSettings | None = None,
     force: bool = False,
     progress: Progress | None = None,
-) -> dict[str, Any]:
-    """Evaluate model files on held-out subjects and write the folder `out` (docs/formats.md); returns its manifest.
+) -> EvaluationManifest:
+    """Evaluate model files on held-out subjects, write the folder `out` (docs/formats.md) and return its manifest.
 
-    A folder made from the same inputs is left as it is, unless `force`. Others are compared with the first model.
-    Models are named as in the mapping, or after their files.
+    Args:
+        model_paths: name -> file, or files, which are named by their stems. All are compared with the first.
+        held_out: as for `read_held_out`.
+        out: folder of the evaluation. An evaluation of the same inputs is kept.
+        captures: as for `read_held_out`.
+        settings: of the evaluation.
+        force: compute again even if there is an evaluation of the same inputs.
+        progress: where to report to.
 
     Raises:
         InputError: as `read_held_out`, `evaluation.check` and `check_out`, before anything is computed.
@@ -47,24 +68,20 @@ def evaluate_models(
     check_out(out)
     named = model_paths if isinstance(model_paths, Mapping) else _named(model_paths)
     models = {name: gnm_npz.read(path) for name, path in named.items()}
-    found = read_held_out(held_out, captures)
-    check(models, found.subjects, found.triangles, settings)
-    inputs = {**{f"model {name}": gnm_npz.content_hash(data) for name, data in models.items()}, **found.inputs}
-    wanted = input_hash(inputs, to_jsonable(settings))
-    known = None if force else read_json_of_kind(Path(out) / MANIFEST, KIND)
-    if known is not None and known.get("input_hash") == wanted and known.get("schema") == SCHEMA:
-        return known
-    evaluation = evaluate(models, found.subjects, found.triangles, settings, progress)
-    manifest: dict[str, Any] = to_jsonable(
-        {
-            "kind": KIND,
-            "schema": SCHEMA,
-            "input_hash": wanted,
-            "figures": evaluation.metrics,
-            "config": settings,
-            "inputs": inputs,
-            "versions": versions(),
-        }
+    people = read_held_out(held_out, captures)
+    check(models, people.subjects, people.triangles, settings)
+    inputs = {**{f"model {name}": gnm_npz.content_hash(data) for name, data in models.items()}, **people.inputs}
+    digest, file = input_hash(inputs, to_jsonable(settings)), Path(out) / MANIFEST
+    existing = EvaluationManifest.read(file) if file.is_file() and not force else None
+    if existing is not None and existing.input_hash == digest:
+        return existing
+    evaluation = evaluate(models, people.subjects, people.triangles, settings, progress)
+    manifest = EvaluationManifest(
+        input_hash=digest,
+        figures=to_jsonable(evaluation.metrics),
+        config=to_jsonable(settings),
+        inputs=inputs,
+        versions=versions(),
     )
     _write(manifest, evaluation, models, Path(out))
     return manifest
@@ -102,9 +119,9 @@ def evaluate_round(
     paths = {name: Path(path) for name, path in models.items()}
     settings = EvaluationSettings(components=counts, samples=samples, seed=seed)
     manifest = evaluate_models(paths, held_out=Path(people), out=Path(out), settings=settings, progress=progress)
-    figures = manifest["figures"]["models"]
+    figures = manifest.figures["models"]
     return EvaluateResult(
-        input_hash=manifest["input_hash"],
+        input_hash=manifest.input_hash,
         out=out,
         components=counts,
         at=counts[-1],
@@ -122,52 +139,52 @@ def _means(figures: Mapping[str, Any], curve: str) -> dict[str, dict[str, float 
     }
 
 
-def lines(manifest: Mapping[str, Any]) -> list[str]:
-    """The figures for a terminal: a line each model and number of components, then what models gain on the first."""
-    figures, found = manifest["figures"], []
-    for name, one in figures["models"].items():
-        rows = zip(one["identity"]["components"], one["identity"]["intervals"], strict=True)
+def lines(manifest: EvaluationManifest) -> list[str]:
+    """Return lines for a terminal: one per model and number of components, then the gains over the first model."""
+    figures, text = manifest.figures, []
+    for name, model in figures["models"].items():
+        rows = zip(model["identity"]["components"], model["identity"]["intervals"], strict=True)
         for number, (count, distance) in enumerate(rows):
-            random = one["specificity"] and one["specificity"]["intervals"][number]["mean"]
-            told = f", specificity {random:.3f} mm" if random is not None else ""
+            random = model["specificity"] and model["specificity"]["intervals"][number]["mean"]
+            suffix = f", specificity {random:.3f} mm" if random is not None else ""
             span = f"{distance['low']:.3f} to {distance['high']:.3f}"
-            found.append(f"{name}, {count} components: generalization {distance['mean']:.3f} mm ({span}){told}")
+            text.append(f"{name}, {count} components: generalization {distance['mean']:.3f} mm ({span}){suffix}")
     for gain in figures["gains"]:
-        share = gain["gain"]
-        span = f"{100 * share['low']:.1f} to {100 * share['high']:.1f}"
-        found.append(f"{gain['model']}, {gain['components']} components: gain {100 * share['mean']:.1f} % ({span})")
-    return found
+        interval = gain["gain"]
+        span = f"{100 * interval['low']:.1f} to {100 * interval['high']:.1f}"
+        text.append(f"{gain['model']}, {gain['components']} components: gain {100 * interval['mean']:.1f} % ({span})")
+    return text
 
 
 def check_out(out: Path) -> None:
-    """Refuse, before any work, a folder that is not ours to replace. Raises InputError."""
-    refuse_foreign(Path(out), kind=KIND, command="model evaluate", files=_FILES)
+    """Refuse, before any work, an output folder that is not an evaluation's. Raises InputError."""
+    refuse_foreign(Path(out), kind=EvaluationManifest.KIND, command="model evaluate", files=_FILES)
 
 
 def _named(paths: Sequence[Path]) -> dict[str, Path]:
-    """By the files' names without suffix, or by their paths where these are equal."""
+    """Files by their stems, or by their paths where stems are equal."""
     stems = [Path(path).stem for path in paths]
     named = {stem if stems.count(stem) == 1 else str(path): Path(path) for stem, path in zip(stems, paths, strict=True)}
     if len(named) < len(paths):
         raise InputError(
-            "A model comes twice",
+            "A model is given twice",
             where="models",
             expected="different files",
             got=", ".join(str(path) for path in paths),
-            fix="give each once",
+            fix="give each file once",
         )
     return named
 
 
-def _write(manifest: Mapping[str, Any], evaluation: ModelEvaluation, models: Mapping[str, GNMData], out: Path) -> None:
-    """The folder appears, or is replaced, in one rename."""
-    with atomic_directory(out) as fresh:
-        (fresh / MANIFEST).write_text(json.dumps(manifest, indent=1, allow_nan=False) + "\n", encoding="utf-8")
+def _write(manifest: EvaluationManifest, evaluation: ModelEvaluation, models: Mapping[str, GNMData], out: Path) -> None:
+    """Write or replace the folder in one rename."""
+    with atomic_directory(out) as temporary:
+        manifest.write(temporary / MANIFEST)
         distances = {name: one.vertex_mm.astype(np.float32) for name, one in evaluation.models.items()}
         np.savez(
-            fresh / VERTICES,
+            temporary / VERTICES,
             allow_pickle=False,
             models=np.array(list(distances)),
             distance_mm=np.stack(list(distances.values())),
         )
-        (fresh / PAGE).write_text(write_evaluate_page(evaluation, models, manifest), encoding="utf-8")
+        (temporary / PAGE).write_text(write_evaluate_page(evaluation, models, manifest.to_json()), encoding="utf-8")

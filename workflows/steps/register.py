@@ -15,7 +15,7 @@ from workflows.engine.jobs import PermanentStepError
 from workflows.records.remote import fetch_capture, fetch_model
 from workflows.records.store import Store
 from workflows.steps.job_options import from_job
-from workflows.steps.subject import begin_subject
+from workflows.steps.subject import start_subject
 
 REGISTRATION = "registration"  # the folder within an attempt
 
@@ -58,7 +58,7 @@ def register_stored(
             scan = result.figures.get("scan_to_mesh", {}).get("face")
             return hashing.to_jsonable({"status": result.status, "reason": result.reason, "scan_to_mesh_face": scan})
 
-        artifact = Store(store).produce(key, wanted=digest, make=make)
+        artifact = Store(store).produce(key, input_hash=digest, make=make)
     if artifact.about.get("status") == "failed":
         raise PermanentStepError(f"registration failed: {artifact.about.get('reason')}")
     return {**artifact.brief(), "attempt": artifact.attempt}
@@ -94,7 +94,7 @@ def register_capture(
     """
     chosen = from_job(options)
     if subject_dir is not None:
-        begin_subject(Path(subject_dir), Path(model), Path(out).parent, chosen)
+        start_subject(Path(subject_dir), Path(model), Path(out).parent, chosen)
     start = None if neutral is None else Path(neutral)
     result = register(Path(capture), Path(model), Path(out), chosen, neutral=start, progress=progress)
     if result.status == "failed":

@@ -1,4 +1,4 @@
-"""`gnmreg stabilize`, also as a step: both stages over a run's registrations, one subject at a time on disk."""
+"""`gnmreg stabilize`, also as a step: both stages over a run's registrations, with one subject in memory at a time."""
 
 from collections.abc import Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass
@@ -35,10 +35,10 @@ LOG = "decisions.jsonl"  # within the run
 
 @dataclass(frozen=True, kw_only=True)
 class StabilizationResult:
-    """What a run of the command made, or found."""
+    """The stabilized set of a run."""
 
     out: Path
-    dataset: str  # id of registrations, model and settings: decisions are about it
+    dataset: str  # id of registrations, model and settings, which decisions refer to
     figures: dict[str, Any]
 
 
@@ -55,11 +55,19 @@ def stabilize_run(
     whatever_decided: bool = False,
     progress: Progress | None = None,
 ) -> StabilizationResult:
-    """Stabilize all registrations of a run and write the folder `out` (docs/formats.md), by default RUN/stabilized.
+    """Stabilize all registrations of a run and write the stabilized set (docs/formats.md).
 
-    The same as `stabilize` of the registrations, or of `only` the subjects in folders of these names. A folder made
-    from the same inputs is left as it is, unless `force`; with `whatever_decided` also one that other decisions made:
-    its components are the same.
+    Args:
+        run: a folder of subject folders, or one subject folder.
+        model_path: the model that the captures were registered with.
+        out: folder of the stabilized set; None: RUN/stabilized. A set of the same inputs is kept.
+        decisions: log of decisions about components; None: none.
+        settings: of both stages.
+        skip_failed: exclude failed registrations instead of refusing the run.
+        only: names of the subject folders to use; None: all.
+        force: compute the set again even if there is one of the same inputs.
+        whatever_decided: also keep a set of other decisions: its components are the same.
+        progress: where to report to.
 
     Raises:
         InputError: as `read_run`, `read_decisions`, `check_out`; fewer than two expressions. Nothing is written then.
@@ -68,35 +76,35 @@ def stabilize_run(
     out = Path(run) / STABILIZED if out is None else Path(out)
     data = gnm_npz.read(model_path)
     head = Head.of(data)
-    found = read_run(run, data, skip_failed=skip_failed, only=only)
+    inputs = read_run(run, data, skip_failed=skip_failed, only=only)
     disk.check_out(out)
-    _check_count(found, run)
-    dataset = input_hash(found.inputs, to_jsonable(settings))
+    _check_count(inputs, run)
+    dataset = input_hash(inputs.inputs, to_jsonable(settings))
     decided = [] if decisions is None else read_decisions(decisions, dataset)
-    wanted = input_hash(found.inputs, {"settings": to_jsonable(settings), "decisions": to_jsonable(decided)})
+    digest = input_hash(inputs.inputs, {"settings": to_jsonable(settings), "decisions": to_jsonable(decided)})
     if not force and disk.is_stabilized(out):
         manifest = disk.read_manifest(out)
-        if manifest["input_hash"] == wanted or (whatever_decided and manifest["dataset"] == dataset):
+        if manifest["input_hash"] == digest or (whatever_decided and manifest["dataset"] == dataset):
             return StabilizationResult(out=out, dataset=dataset, figures=manifest["figures"])
-    with disk.fresh_set(out) as fresh:
-        ids, components, moved = _write_subjects(fresh, found, data, head, settings, decided, progress)
-        figures = _figures(components, moved, fresh, len(found.subjects))
+    with disk.fresh_set(out) as temporary:
+        ids, components, effect = _write_subjects(temporary, inputs, data, head, settings, decided, progress)
+        figures = _figures(components, effect, temporary, len(inputs.subjects))
         manifest = {
             "content_id": input_hash(ids, {}),
-            "input_hash": wanted,
+            "input_hash": digest,
             "dataset": dataset,
-            "subjects": [one.subject for one in found.subjects],
-            "left_out": {one.subject: one.excluded for one in found.subjects if one.excluded},
+            "subjects": [subject.subject for subject in inputs.subjects],
+            "left_out": {subject.subject: subject.excluded for subject in inputs.subjects if subject.excluded},
             "decisions": decided,
             "figures": figures,
             "config": settings,
-            "inputs": found.inputs,
+            "inputs": inputs.inputs,
             "versions": versions(),
         }
-        disk.write_manifest(manifest, fresh)
-        subjects = (disk.read_subject(fresh, k) for k in range(len(found.subjects)))
-        page = write_stabilize_page(manifest, components, subjects, head)
-        (fresh / disk.PAGE).write_text(page, encoding="utf-8")
+        disk.write_manifest(manifest, temporary)
+        stabilized = (disk.read_subject(temporary, k) for k in range(len(inputs.subjects)))
+        page = write_stabilize_page(manifest, components, stabilized, head)
+        (temporary / disk.PAGE).write_text(page, encoding="utf-8")
     return StabilizationResult(out=out, dataset=dataset, figures=figures)
 
 
@@ -136,7 +144,7 @@ def stabilize_subjects(
 
 
 def _write_subjects(
-    fresh: Path,
+    folder: Path,
     run: StabilizationInputs,
     data: GNMData,
     head: Head,
@@ -144,32 +152,39 @@ def _write_subjects(
     decisions: Sequence[Decision],
     progress: Progress,
 ) -> tuple[dict[str, str], list[Components], Change]:
-    """Both stages; content ids by file, the components, and by how much the second stage moves the skin."""
+    """Compute both stages; return content ids by file, the components, and the effect of the second stage."""
     count = len(run.subjects)
     for number, meshes in enumerate(run.meshes()):
         progress.update(number, count, f"the skull of {meshes.subject}")
-        disk.write_subject(automatic_stage(meshes, head, run.skin, settings), fresh, number)
+        disk.write_subject(automatic_stage(meshes, head, run.skin, settings), folder, number)
 
-    def steady() -> Iterator[StabilizedSubject]:
-        return (disk.read_subject(fresh, k) for k in range(count))
+    def stabilized() -> Iterator[StabilizedSubject]:
+        return (disk.read_subject(folder, k) for k in range(count))
 
     progress.update(count, count, "components of all subjects")
-    components, correction = regional_stage(steady, head, settings, decisions)
-    names = [(s.subject, name, label) for s in steady() for name, label in zip(s.names, s.labels, strict=True)]
+    components, correction = regional_stage(stabilized, head, settings, decisions)
+    names = [(s.subject, name, label) for s in stabilized() for name, label in zip(s.names, s.labels, strict=True)]
     subjects, files, labels = (tuple(row[k] for row in names) for k in range(3))
-    moves = along(Displacements(steady), components)
-    stored = StoredComponents(components=tuple(components), subjects=subjects, names=files, labels=labels, along=moves)
-    ids = {disk.COMPONENTS: disk.write_components(stored, fresh)}
+    mean_displacements = along(Displacements(stabilized), components)
+    stored = StoredComponents(
+        components=tuple(components), subjects=subjects, names=files, labels=labels, along=mean_displacements
+    )
+    ids = {disk.COMPONENTS: disk.write_components(stored, folder)}
     first = 0
     for number in range(count):
-        subject = disk.read_subject(fresh, number)
-        ids[f"{number:04d}"] = disk.write_subject(corrected(subject, correction, first), fresh, number)
+        subject = disk.read_subject(folder, number)
+        ids[f"{number:04d}"] = disk.write_subject(corrected(subject, correction, first), folder, number)
         first += len(subject.names)
     return ids, components, change(correction, head)
 
 
 def along(displacements: Iterable[np.ndarray], components: Sequence[Components]) -> dict[str, np.ndarray]:
-    """What the whole head does, on average, along with a coefficient of one: coefficients have a mean square of one."""
+    """Return the head's mean displacement per unit coefficient, by region; coefficients have a mean square of one.
+
+    Args:
+        displacements: (V, 3) of each sample.
+        components: of all regions, with coefficients of the same samples.
+    """
     sums: dict[str, np.ndarray] = {}
     count = 0
     for count, displacement in enumerate(displacements, 1):
@@ -179,8 +194,8 @@ def along(displacements: Iterable[np.ndarray], components: Sequence[Components])
     return {region: total / count for region, total in sums.items()}
 
 
-def _figures(components: Sequence[Components], moved: Change, fresh: Path, count: int) -> dict[str, Any]:
-    residual = np.concatenate([disk.read_subject(fresh, k).residual_mm for k in range(count)])
+def _figures(components: Sequence[Components], effect: Change, folder: Path, count: int) -> dict[str, Any]:
+    residual = np.concatenate([disk.read_subject(folder, k).residual_mm for k in range(count)])
     return {
         "samples": len(residual),
         "residual_first_median_mm": float(np.median(residual[:, 0])),
@@ -188,14 +203,14 @@ def _figures(components: Sequence[Components], moved: Change, fresh: Path, count
         "residual_p95_mm": float(np.percentile(residual[:, -1], 95)),
         "components": {part.region: len(part.energy) for part in components},
         "flagged": {part.region: np.flatnonzero(part.flagged).tolist() for part in components},
-        "regional_rms_mm": moved.rms_mm,
-        "regional_most_mm": moved.most_mm,
-        "regional_turn_deg": moved.turn_deg,
+        "regional_rms_mm": effect.rms_mm,
+        "regional_most_mm": effect.most_mm,
+        "regional_turn_deg": effect.turn_deg,
     }
 
 
 def _check_count(run: StabilizationInputs, where: Path) -> None:
-    count = sum(len(one.expressions) for one in run.subjects)
+    count = sum(len(subject.expressions) for subject in run.subjects)
     if count < LEAST_SAMPLES:
         raise InputError(
             "There is only one expression to stabilize",

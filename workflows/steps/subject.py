@@ -24,18 +24,18 @@ from registration.types import Capture, Registration
 from workflows.pages.subject import thumbnail, write_subject_page
 from workflows.records.step_results import CaptureResult, CollectResult
 from workflows.records.subject import (
-    MANIFEST,
     CaptureRow,
     SubjectCaptures,
     SubjectRecord,
     check_subject_out,
+    is_subject_folder,
     read_captures,
     write_subject,
 )
 from workflows.steps.job_options import from_job
 from workflows.steps.products import Product
 
-HEADLINE = ("scan_to_mesh", "drift")  # of a manifest's figures, those of the face
+HEADLINE = ("scan_to_mesh", "drift")  # metrics of the face that are copied from the manifest
 
 
 def register_subject(
@@ -51,9 +51,9 @@ def register_subject(
 ) -> SubjectRecord:
     """Register all captures of a subject: the neutral, then every expression from it, each by `register`.
 
-    Every registration goes into the folder of `out` that is named as its capture's; what is there already is kept, as
-    `register` does. `out/subject.json` and `out/index.html` are replaced after every capture. A capture that fails
-    does not stop the others, but without a neutral no expression is tried.
+    Every registration goes into the folder of `out` that has its capture's name; a registration of the same inputs is
+    kept. `out/subject.json` and `out/index.html` are replaced after every capture. A capture that fails does not stop
+    the others, but without a neutral no expression is tried.
 
     Args:
         subject_dir: its sub-folders that hold a capture.toml are the captures.
@@ -61,12 +61,12 @@ def register_subject(
         out: the folder of the subject's registrations.
         options: of each registration.
         neutral: the name of the neutral's sub-folder; None: the one whose expression is "neutral".
-        force: register again what is there already.
-        leave: captures that are not to be tried, and why: their rows are errors.
+        force: register again even if there is a registration of the same inputs.
+        leave: captures that are not to be tried -> the reason; their rows are errors.
         progress: where to report to.
 
     Returns:
-        What became of each capture.
+        The record with the status of each capture.
 
     Raises:
         InputError: `read_captures` or `check_subject_out` refuses a folder, there is no such recipe, or the model or
@@ -74,9 +74,9 @@ def register_subject(
     """
     progress = progress or NullProgress()
     subject_dir, model, out = Path(subject_dir), Path(model), Path(out)
-    captures, start = _begun(subject_dir, model, out, options, neutral)
-    one = partial(register, model=model, options=options, force=force)
-    return _loop(captures.captures, one, _Record(start, out), leave or {}, progress)
+    captures, initial = _prepare(subject_dir, model, out, options, neutral)
+    register_one = partial(register, model=model, options=options, force=force)
+    return _register_captures(captures.captures, register_one, _SubjectWriter(initial, out), leave or {}, progress)
 
 
 def collect_subject(
@@ -136,49 +136,50 @@ def _contents(folder: Path, names: Iterable[str]) -> dict[str, str]:
     }
 
 
-def begin_subject(subject_dir: Path, model: Path, out: Path, options: RegisterOptions) -> None:
-    """Write the record of a subject of which nothing is registered yet, so that registrations may be put beside it.
+def start_subject(subject_dir: Path, model: Path, out: Path, options: RegisterOptions) -> None:
+    """Write the record of a subject without registrations, unless there is one: it marks `out` as a subject's folder.
 
-    One that is there stays. Raises InputError as `register_subject`.
+    Raises:
+        InputError: as `register_subject`.
     """
-    _, start = _begun(subject_dir, model, out, options, None)
-    if not (out / MANIFEST).exists():
-        _Record(start, out)
+    _, initial = _prepare(subject_dir, model, out, options, None)
+    if not is_subject_folder(out):
+        _SubjectWriter(initial, out)
 
 
-def _begun(
+def _prepare(
     subject_dir: Path, model: Path, out: Path, options: RegisterOptions, neutral: str | None
 ) -> tuple[SubjectCaptures, SubjectRecord]:
-    """A subject's captures, and what is known before the first is registered. Everything is checked."""
+    """Check everything; return the captures and the record before the first is registered."""
     load_recipe(options.recipe)
     captures = read_captures(subject_dir, neutral)
     check_subject_out(out, captures)
     data = gnm_npz.read(model)
     read_schemes(model, data, options.landmark_files)
-    start = SubjectRecord(
+    initial = SubjectRecord(
         subject=captures.subject,
         model=gnm_npz.content_hash(data),
         recipe=options.recipe_name,
         neutral=captures.captures[0].root.name,
-        rows=_waiting(captures),
+        rows=_initial_rows(captures),
     )
-    return captures, start
+    return captures, initial
 
 
-class _Record:
-    """What is known so far; every change lies on disk at once."""
+class _SubjectWriter:
+    """A subject's record, which is written after every change, with the page."""
 
     def __init__(self, subject: SubjectRecord, out: Path):
         self.subject, self.out = subject, out
-        self._thumbnails: dict[str, str] = {}  # row -> picture as a data URI
+        self._thumbnails: dict[str, str] = {}  # row -> image as a data URI
         self._save()
 
     def row(self, capture: Capture) -> CaptureRow:
         return next(row for row in self.subject.rows if row.name == capture.root.name)
 
-    def put(self, row: CaptureRow, picture: str | None = None) -> None:
-        if picture is not None:
-            self._thumbnails[row.name] = picture
+    def put(self, row: CaptureRow, thumbnail: str | None = None) -> None:
+        if thumbnail is not None:
+            self._thumbnails[row.name] = thumbnail
         rows = tuple(row if old.name == row.name else old for old in self.subject.rows)
         self.subject = replace(self.subject, rows=rows)
         self._save()
@@ -194,53 +195,54 @@ class _Neutral:
     folder: Path
 
 
-def _loop(
+def _register_captures(
     captures: tuple[Capture, ...],
-    one: Callable[..., Registration],
-    record: _Record,
+    register_one: Callable[..., Registration],
+    writer: _SubjectWriter,
     leave: Mapping[str, str],
     progress: Progress,
 ) -> SubjectRecord:
-    """Register the first capture, the neutral, and each other one from it. `one` is `register` with its settings."""
+    """Register the first capture, the neutral, then every other one from it; `register_one` has model and options."""
     neutral: _Neutral | None = None
     for number, capture in enumerate(captures, 1):
-        row = record.row(capture)
+        row = writer.row(capture)
         if row.name in leave:
-            record.put(replace(row, status="error", reason=leave[row.name]))
+            writer.put(replace(row, status="error", reason=leave[row.name]))
             continue
         if number > 1 and neutral is None:
-            reason = f"the neutral failed: {record.row(captures[0]).reason}"
-            record.put(replace(row, status="skipped", reason=reason))
+            reason = f"the neutral failed: {writer.row(captures[0]).reason}"
+            writer.put(replace(row, status="skipped", reason=reason))
             continue
-        told = PrefixedProgress(progress, f"{row.name} ({number} of {len(captures)})")
-        told.message("registering")
-        row, result = _registered(row, capture, record.out / row.name, one, neutral, told)
-        picture = None if result is None else _attempt(partial(thumbnail, result), told)[0]
-        record.put(row, picture)
-        told.message(f"{row.status}: {row.reason}")
+        named = PrefixedProgress(progress, f"{row.name} ({number} of {len(captures)})")
+        named.message("registering")
+        row, result = _register_row(row, capture, writer.out / row.name, register_one, neutral, named)
+        image = None if result is None else _attempt(partial(thumbnail, result), named)[0]
+        writer.put(row, image)
+        named.message(f"{row.status}: {row.reason}")
         if number == 1 and result is not None and row.usable:
-            neutral = _Neutral(registration=result, capture=capture, folder=record.out / row.name)
-    return record.subject
+            neutral = _Neutral(registration=result, capture=capture, folder=writer.out / row.name)
+    return writer.subject
 
 
-def _registered(
+def _register_row(
     row: CaptureRow,
     capture: Capture,
     folder: Path,
-    one: Callable[..., Registration],
+    register_one: Callable[..., Registration],
     neutral: _Neutral | None,
     progress: Progress,
 ) -> tuple[CaptureRow, Registration | None]:
-    """One capture's row, filled in, and its registration if there is one."""
-    start = neutral.folder if neutral else None
-    result, reason = _attempt(partial(one, capture.root, out=folder, neutral=start, progress=progress), progress)
+    """Register a capture; return its row and its registration if there is one."""
+    initial = neutral.folder if neutral else None
+    action = partial(register_one, capture.root, out=folder, neutral=initial, progress=progress)
+    result, reason = _attempt(action, progress)
     if result is None:
         return replace(row, status="error", reason=reason), None
     reason = result.reason
     if neutral is not None:
-        measured, trouble = _attempt(partial(_with_drift, result, capture, folder, neutral), progress)
-        result = measured or result
-        reason += f"; the drift could not be measured: {trouble}" if trouble else ""
+        evaluated, failure = _attempt(partial(_with_drift, result, capture, folder, neutral), progress)
+        result = evaluated or result
+        reason += f"; the drift could not be measured: {failure}" if failure else ""
     row = replace(
         row,
         status=result.status,
@@ -253,9 +255,9 @@ def _registered(
 
 
 def _with_drift(result: Registration, capture: Capture, folder: Path, neutral: _Neutral) -> Registration:
-    """The registration with the figures of `evaluate`, which join its manifest: where the two truths can be compared.
+    """Add the metrics of `evaluate` to the registration and its manifest, if the two ground truths can be compared.
 
-    Figures that are there already stay if they are newer than the neutral.
+    Existing metrics are kept if they are newer than the neutral.
     """
     if not _comparable(capture, neutral.capture) or not np.isfinite(result.vertices).all():
         return result
@@ -268,8 +270,8 @@ def _with_drift(result: Registration, capture: Capture, folder: Path, neutral: _
 
 
 def _comparable(capture: Capture, neutral: Capture) -> bool:
-    """Whether both have a scan, and truths of one topology."""
-    truths = [moment.ground_truth for moment in (capture, neutral) if moment.scan is not None]
+    """Whether both have a scan and ground truths of one topology."""
+    truths = [c.ground_truth for c in (capture, neutral) if c.scan is not None]
     shapes = [read_truth(truth).shape for truth in truths if truth is not None]
     return len(shapes) == 2 and shapes[0] == shapes[1]
 
@@ -278,19 +280,19 @@ T = TypeVar("T")
 
 
 def _attempt(action: Callable[[], T], progress: Progress) -> tuple[T | None, str]:
-    """What the action returns, or None and why: whatever happens to one capture, the others are to be tried."""
+    """The action's result, or None and the reason of its failure, which must not stop the other captures."""
     try:
         return action(), ""
     except InputError as error:
         return None, error.line
     except Exception as error:
         progress.message(traceback.format_exc())
-        first, *_ = str(error).splitlines() or [""]  # the log has it all
+        first, *_ = str(error).splitlines() or [""]  # the log has the traceback
         return None, f"{type(error).__name__}: {first}"
 
 
-def _waiting(captures: SubjectCaptures) -> tuple[CaptureRow, ...]:
-    """A row for each capture, the neutral's first; those that cannot be read are told as errors."""
+def _initial_rows(captures: SubjectCaptures) -> tuple[CaptureRow, ...]:
+    """A row for each capture, the neutral's first; unreadable ones are errors."""
     rows = [CaptureRow(name=capture.root.name, expression=capture.expression) for capture in captures.captures]
     broken = [
         CaptureRow(name=name, expression="", status="error", reason=error.line)

@@ -1,4 +1,4 @@
-"""`gnmreg dataset synth`: a population of synthetic subjects as a dataset; one seed is one population."""
+"""`gnmreg dataset synth`: a dataset of synthetic subjects; a seed determines the subjects."""
 
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -13,26 +13,30 @@ from workflows.processes import run_parallel
 from workflows.records.dataset import HELD_OUT, MANIFEST, DatasetRecord
 from workflows.records.subject import NEUTRAL
 
-MOST = 1000  # subjects of one seed, so that populations of two seeds share nobody
+MAX_SUBJECTS = 1000  # of one seed, so that populations of two seeds have no subject in common
 
 
 @dataclass(frozen=True, kw_only=True)
 class Population:
-    """What a dataset is made from, resolved."""
+    """The settings of a synthetic dataset."""
 
     subjects: int
-    expressions: tuple[str, ...] = ()  # beside the neutral
+    expressions: tuple[str, ...] = ()  # besides the neutral
     seed: int = 0
     held_out: int = 0  # of the subjects, the last ones
-    studio: Studio = Studio()  # its seed is each subject's own
+    studio: Studio = Studio()  # its seed is replaced by each subject's
 
     @property
     def seeds(self) -> dict[str, int]:
-        """Folder name -> the seed that draws this subject."""
-        return {f"synth_{seed:04d}": seed for seed in range(MOST * self.seed, MOST * self.seed + self.subjects)}
+        """Folder name -> seed of the subject."""
+        return {
+            f"synth_{seed:04d}": seed
+            for seed in range(MAX_SUBJECTS * self.seed, MAX_SUBJECTS * self.seed + self.subjects)
+        }
 
     @property
-    def held(self) -> tuple[str, ...]:
+    def held_out_names(self) -> tuple[str, ...]:
+        """Folder names of the held-out subjects."""
         names = tuple(self.seeds)
         return names[len(names) - self.held_out :]
 
@@ -40,15 +44,22 @@ class Population:
 def synth_dataset(
     out: Path, population: Population, *, jobs: int = 1, progress: Progress | None = None
 ) -> DatasetRecord:
-    """Render a population into `out`: people of any adult age and build, by `subject.synthesize_capture`.
+    """Render captures of synthetic subjects into the folder `out`: `out/SUBJECT/EXPRESSION`, and `out/dataset.json`.
 
-    `out/SUBJECT/EXPRESSION` are captures, each whole or not there; called again it goes on where it was interrupted.
-    `out/dataset.json` tells the seeds, who is held out, and whether all is there. Held-out subjects' captures have the
-    tag `held_out`. Returns what `dataset.json` holds.
+    Every capture is written atomically; a repeated call resumes. Captures of held-out subjects have the tag `held_out`.
+
+    Args:
+        out: folder of the dataset.
+        population: its settings.
+        jobs: number of captures that are rendered in parallel.
+        progress: where to report to.
+
+    Returns:
+        The content of `dataset.json`.
 
     Raises:
-        InputError: settings out of range, unknown expressions, a folder that holds anything but this dataset, before
-            anything is drawn; captures that could not be made, after all others were tried.
+        InputError: settings are out of range, an expression is unknown, or the folder holds anything but this dataset,
+            before anything is rendered; or captures failed, after all others were tried.
     """
     progress, out = progress or NullProgress(), Path(out)
     _check(population)
@@ -56,35 +67,35 @@ def synth_dataset(
     _check_out(out, record)
     calls: dict[str, dict[str, Any]] = {}
     for name, seed in population.seeds.items():
-        for act in (NEUTRAL, *population.expressions):
-            root = out / name / act
+        for expression in (NEUTRAL, *population.expressions):
+            root = out / name / expression
             if not root.exists():
-                tags = {HELD_OUT: True} if name in population.held else {}
+                tags = {HELD_OUT: True} if name in population.held_out_names else {}
                 studio = replace(population.studio, seed=seed)
-                settings = {"seed": seed, "expression": act, "tags": tags, "studio": studio}
-                calls[f"{name}, {act}"] = {"root": root, **settings}
+                settings = {"seed": seed, "expression": expression, "tags": tags, "studio": studio}
+                calls[f"{name}, {expression}"] = {"root": root, **settings}
     out.mkdir(parents=True, exist_ok=True)
     if calls:
         _write(out, record)
-    lost = {}
-    for done, (name, trouble) in enumerate(run_parallel(photograph, calls, jobs), 1):
+    failures = {}
+    for done, (name, failure) in enumerate(run_parallel(render_subject, calls, jobs), 1):
         progress.update(done, len(calls), name)
-        if trouble:
-            lost[name] = trouble
-    if lost:
-        first, reason = next(iter(lost.items()))
+        if failure:
+            failures[name] = failure
+    if failures:
+        first, reason = next(iter(failures.items()))
         raise InputError(
-            f"{len(lost)} of {len(calls)} captures could not be made",
+            f"{len(failures)} of {len(calls)} captures could not be rendered",
             where=first,
             expected="a capture",
             got=reason,
-            fix="run the same command again: it makes what is missing",
+            fix="run the same command again: it renders missing captures",
         )
     return _write(out, replace(record, complete=True))
 
 
-def photograph(**settings: Any) -> str:
-    """One capture. Returns its trouble, "" if there was none."""
+def render_subject(**settings: Any) -> str:
+    """Render one capture of a subject. Returns the reason of its failure, "" for none."""
     try:
         subject.synthesize_capture(**settings)
     except InputError as error:
@@ -100,7 +111,7 @@ def _make_record(population: Population) -> DatasetRecord:
         complete=False,
         categories={name: expressions.expression_by_name(name).category for name in population.expressions},
         seeds=population.seeds,
-        held_out=population.held,
+        held_out=population.held_out_names,
         expressions=population.expressions,
         studio=to_jsonable(population.studio),
         versions=versions(),
@@ -119,18 +130,20 @@ def _check(population: Population) -> None:
     check_studio(Path("/nowhere/at/all"), population.studio)
     for name in population.expressions:
         expressions.expression_by_name(name)
-    acts = population.expressions
-    if NEUTRAL in acts or len(set(acts)) < len(acts):
+    names = population.expressions
+    if NEUTRAL in names or len(set(names)) < len(names):
         raise _input_error(
-            "The expressions are not each once", "expressions", "names beside the neutral", ", ".join(acts)
+            "The expressions are not each once", "expressions", "different names, without the neutral", ", ".join(names)
         )
-    if not 1 <= population.subjects <= MOST:
-        raise _input_error("The number of subjects is out of range", "subjects", f"1 to {MOST}", population.subjects)
+    if not 1 <= population.subjects <= MAX_SUBJECTS:
+        raise _input_error(
+            "The number of subjects is out of range", "subjects", f"1 to {MAX_SUBJECTS}", population.subjects
+        )
     if population.seed < 0:
         raise _input_error("The seed is out of range", "seed", "a whole number from 0", population.seed)
     if not 0 <= population.held_out <= population.subjects:
         expected = f"0 to {population.subjects}"
-        raise _input_error("More are held out than there are", "held-out", expected, population.held_out)
+        raise _input_error("More subjects are held out than there are", "held-out", expected, population.held_out)
 
 
 def _check_out(out: Path, record: DatasetRecord) -> None:

@@ -90,7 +90,7 @@ def test_a_password_is_never_printed(tmp_path: Path, monkeypatch: pytest.MonkeyP
 
 def test_store_verify_fails_on_altered_files(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     store = Store(tmp_path)
-    artifact = store.produce("a", wanted="w", make=lambda folder: {"n": (folder / "f").write_text("x")})
+    artifact = store.produce("a", input_hash="w", make=lambda folder: {"n": (folder / "f").write_text("x")})
     assert main(["store", "verify", str(tmp_path)]) == 0
     assert "1 artifacts; 0 files missing, 0 altered, 0 orphaned; 0 manifests unreadable" in capsys.readouterr().out
     (tmp_path / "a" / artifact.attempt / "f").write_text("y")

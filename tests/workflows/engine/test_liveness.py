@@ -35,7 +35,7 @@ def test_a_lock_is_held_while_its_process_lives_even_frozen(tmp_path: Path) -> N
     try:
         process.send_signal(signal.SIGSTOP)
         assert not locks.free(["w"])
-        with pytest.raises(InputError, match="Another process has this place"):
+        with pytest.raises(InputError, match="Another process has this executor id"):
             Liveness(url).join(["w"])
         assert Liveness(url).join(["w", "v"]) == "v"
     finally:

@@ -24,7 +24,7 @@ def work(store: str, key: str, seconds: float = 0.0, trace: str | None = None) -
         _trace(trace, f"end {key} {os.getpid()}")
         return {"seconds": seconds}
 
-    return Store(store).produce(key, wanted=key, make=make).brief()
+    return Store(store).produce(key, input_hash=key, make=make).brief()
 
 
 def talk(text: str, progress: Progress) -> str:

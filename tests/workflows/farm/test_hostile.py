@@ -153,8 +153,8 @@ SPOILS: dict[str, tuple[Callable[[Path], None], str]] = {
     "an image bomb": (bomb_image, "too many pixels"),
     "a truth that is a pickle": (pickle_truth, "ground truth cannot be used"),
     "a truth that is a bomb": (bomb_truth, "ground truth cannot be used"),
-    "a model with a pickle": (pickle_model, "model file"),
-    "a model that is a pickle": (raw_pickle, "model file"),
+    "a model with a pickle": (pickle_model, "head model"),
+    "a model that is a pickle": (raw_pickle, "head model"),
     "landmarks without a bottom": (deep_landmarks, "landmark file is malformed"),
 }
 
@@ -203,14 +203,14 @@ def test_a_step_that_is_not_in_the_table_never_reaches_the_child(root: Path) -> 
 def test_a_key_that_leads_out_of_the_store_is_refused(tmp_path: Path) -> None:
     for key in ("../x", "/etc/x", "a/../../x", ".hidden", ""):
         with pytest.raises(InputError):
-            Store(tmp_path / "store").produce(key, wanted="w", make=lambda folder: {})
+            Store(tmp_path / "store").produce(key, input_hash="w", make=lambda folder: {})
     assert not (tmp_path / "store").exists()
 
 
 def test_a_store_whose_manifest_lies_about_sizes_is_found_out(tmp_path: Path) -> None:
     store = Store(tmp_path)
-    made = store.produce("k", wanted="w", make=lambda folder: (folder / "f").write_text("abc") and {})
+    made = store.produce("k", input_hash="w", make=lambda folder: (folder / "f").write_text("abc") and {})
     value = json.loads((tmp_path / "k" / MANIFEST).read_text())
     value["files"]["f"]["sha256"] = "0" * 64
     (tmp_path / "k" / MANIFEST).write_text(json.dumps(value))
-    assert store.verify().unreadable and made.files["f"]["bytes"] == 3
+    assert store.verify().unreadable and made.files["f"].bytes == 3

@@ -195,7 +195,7 @@ def test_a_malformed_decision_is_named_by_its_line(
 )
 def test_a_malformed_artifact_is_refused(tmp_path: Path, spoil: Callable[[dict[str, Any]], str], field: str) -> None:
     store = Store(tmp_path)
-    store.produce("a", wanted="h", make=lambda folder: {})
+    store.produce("a", input_hash="h", make=lambda folder: {})
     file = tmp_path / "a" / MANIFEST
     file.write_text(spoil(json.loads(file.read_text())))
     refused(lambda: store.find("a"), file, field)

@@ -64,25 +64,25 @@ def spoil(store: Store, name: str, content: bytes | None) -> None:
 
 def test_a_published_artifact_is_found(store: Store) -> None:
     assert store.find("run/a") is None
-    made = store.produce("run/a", wanted="hash", make=write)
+    made = store.produce("run/a", input_hash="hash", make=write)
     assert store.find("run/a") == made
     assert made.about == {"mm": 0.5} and set(made.files) == {"mesh.ply", "sub/page.html"}
     assert list(store.keys()) == ["run/a"]
 
 
 def test_the_same_input_returns_at_once_and_another_is_made(store: Store) -> None:
-    first = store.produce("a", wanted="one", make=write)
-    assert store.produce("a", wanted="one", make=never) == first
-    second = store.produce("a", wanted="two", make=write)
+    first = store.produce("a", input_hash="one", make=write)
+    assert store.produce("a", input_hash="one", make=never) == first
+    second = store.produce("a", input_hash="two", make=write)
     assert second.input_hash == "two" and second.attempt != first.attempt
     assert second.content_id == first.content_id
     assert len(store.verify().orphaned) == 2
 
 
 def test_a_file_that_vanished_makes_it_again(store: Store) -> None:
-    first = store.produce("a", wanted="one", make=write)
+    first = store.produce("a", input_hash="one", make=write)
     spoil(store, f"a/{first.attempt}/mesh.ply", None)
-    assert store.produce("a", wanted="one", make=write).attempt != first.attempt
+    assert store.produce("a", input_hash="one", make=write).attempt != first.attempt
 
 
 def test_a_maker_that_fails_publishes_nothing(store: Store) -> None:
@@ -91,7 +91,7 @@ def test_a_maker_that_fails_publishes_nothing(store: Store) -> None:
         raise ValueError("broken")
 
     with pytest.raises(ValueError, match="broken"):
-        store.produce("a", wanted="one", make=half)
+        store.produce("a", input_hash="one", make=half)
     assert store.find("a") is None
     assert store.verify().artifacts == 0 and not store.verify().orphaned
 
@@ -100,18 +100,18 @@ def test_two_attempts_at_a_time_disturb_nobody(store: Store) -> None:
     """A thawed zombie publishes after its successor: one whole artifact is left, whichever."""
 
     def meanwhile(folder: Path) -> dict[str, object]:
-        store.produce("a", wanted="one", make=write)
+        store.produce("a", input_hash="one", make=write)
         return write(folder)
 
-    last = store.produce("a", wanted="one", make=meanwhile)
+    last = store.produce("a", input_hash="one", make=meanwhile)
     assert store.find("a") == last
     found = store.verify()
     assert found.is_sound and found.artifacts == 1 and len(found.orphaned) == 2
 
 
 def test_verify_names_what_is_missing_altered_and_orphaned(store: Store) -> None:
-    a = store.produce("run/a", wanted="one", make=write)
-    b = store.produce("run/b", wanted="one", make=write)
+    a = store.produce("run/a", input_hash="one", make=write)
+    b = store.produce("run/b", input_hash="one", make=write)
     assert store.verify().is_sound and store.verify().artifacts == 2
     spoil(store, f"run/a/{a.attempt}/mesh.ply", b"mush")
     spoil(store, f"run/b/{b.attempt}/sub/page.html", None)
@@ -127,7 +127,7 @@ def test_verify_names_what_is_missing_altered_and_orphaned(store: Store) -> None
 
 @pytest.mark.parametrize("name", ["../../outside", "/etc/passwd", "sub/../../x"])
 def test_a_manifest_that_points_outside_is_refused(store: Store, name: str) -> None:
-    store.produce("a", wanted="one", make=write)
+    store.produce("a", input_hash="one", make=write)
     value = json.loads(store._fs.cat_file(store._path("a", MANIFEST)))
     value["files"] = {name: {"sha256": "0", "bytes": 1}}
     spoil(store, f"a/{MANIFEST}", json.dumps(value).encode())
@@ -147,7 +147,7 @@ def test_a_manifest_that_is_none_is_refused(store: Store, content: bytes) -> Non
 
 def test_old_iterations_are_retired(store: Store) -> None:
     for key in ("run/it00/a", "run/it01/a", "run/it01/s/b", "run/it02/a", "run/final", "other/it00/a"):
-        store.produce(key, wanted="one", make=write)
+        store.produce(key, input_hash="one", make=write)
     assert store.retire("run", keep=2) == ["run/it00"]
     assert list(store.keys()) == ["other/it00/a", "run/final", "run/it01/a", "run/it01/s/b", "run/it02/a"]
     assert not store.verify().orphaned
@@ -155,8 +155,8 @@ def test_old_iterations_are_retired(store: Store) -> None:
 
 
 def test_tidying_removes_what_nobody_published_and_spares_the_young(store: Store) -> None:
-    store.produce("a", wanted="one", make=write)
-    store.produce("a", wanted="two", make=write)
+    store.produce("a", input_hash="one", make=write)
+    store.produce("a", input_hash="two", make=write)
     assert store.tidy(older_than_s=3600) == 0
     time.sleep(1.1)  # object storage tells whole seconds
     assert store.tidy(older_than_s=0.01) == 2
@@ -165,7 +165,7 @@ def test_tidying_removes_what_nobody_published_and_spares_the_young(store: Store
 
 
 def test_no_password_reaches_a_manifest(store: Store) -> None:
-    store.produce("a", wanted="one", make=lambda folder: {"from": "postgresql://me:secret@host/db"})
+    store.produce("a", input_hash="one", make=lambda folder: {"from": "postgresql://me:secret@host/db"})
     assert b"secret" not in store._fs.cat_file(store._path("a", MANIFEST))
 
 

@@ -16,7 +16,7 @@ from registration.storage.hashing import hash_file
 from workflows.cli.app import main
 from workflows.processes import run_parallel
 from workflows.records.dataset import read_dataset, split
-from workflows.steps.synthesize import Population, photograph, synth_dataset
+from workflows.steps.synthesize import Population, render_subject, synth_dataset
 
 ACTS = ("smile", "jaw_open")
 
@@ -83,7 +83,7 @@ def test_one_seed_is_one_population_resumed_or_not(photographs, tmp_path):
 
 def test_the_loop_takes_what_it_makes(photographs, tmp_path, monkeypatch):
     synth_dataset(tmp_path / "a", Population(subjects=4, expressions=("smile",), held_out=2))
-    monkeypatch.setattr("workflows.records.subject.read", lambda root: read_toml(root))
+    monkeypatch.setattr("workflows.records.subject.read_capture", lambda root: read_toml(root))
     found = read_dataset(tmp_path / "a")
     assert found.categories == {"smile": "flexing"} and found.closed
     assert split(found).held_out == ("synth_0002", "synth_0003")
@@ -102,7 +102,7 @@ def read_toml(root: Path):
 
 def test_a_capture_that_fails_is_told_after_all_others_were_tried(photographs, tmp_path):
     photographs.trouble = InputError("The lamp is out", where="lamp", expected="light", got="none", fix="change it")
-    with pytest.raises(InputError, match="of 6 captures could not be made"):
+    with pytest.raises(InputError, match="of 6 captures could not be rendered"):
         synth_dataset(tmp_path / "a", Population(subjects=6))
     assert json.loads((tmp_path / "a/dataset.json").read_text())["complete"] is False
     photographs.trouble = None
@@ -113,7 +113,7 @@ def test_a_capture_that_fails_is_told_after_all_others_were_tried(photographs, t
     ("options", "what"),
     [
         ("--subjects 0", "number of subjects"),
-        ("--subjects 2 --held-out 3", "More are held out"),
+        ("--subjects 2 --held-out 3", "More subjects are held out"),
         ("--subjects 2 --expressions smile,grin", "no such expression"),
         ("--subjects 2 --expressions neutral", "each once"),
         ("--subjects 2 --views 0", "number of cameras"),
@@ -141,7 +141,7 @@ def test_one_trouble_in_another_process_does_not_stop_the_others(tmp_path):
         "ann": {"root": tmp_path / "ann", "seed": 0, "expression": "neutral", "tags": {}, "studio": bad},
         "bob": {"place": tmp_path / "bob"},
     }
-    found = dict(run_parallel(photograph, calls, jobs=2))
+    found = dict(run_parallel(render_subject, calls, jobs=2))
     assert "number of cameras" in found["ann"] and found["bob"].startswith("TypeError")
 
 
