@@ -66,7 +66,7 @@ class Case:
         shares = label_weights(data)[:, :CLASSES]
         self.corner_uvs = texture_atlas(data)
         self.renderer = Renderer(triangles, self.corner_uvs, shares.astype(np.float32))
-        self.all = Pixels.all_of(cameras, device)
+        self.all = Pixels.full(cameras, device)
         self.rest = torch.as_tensor(head, dtype=torch.float32, device=device)
         generator = torch.Generator().manual_seed(0)
         self.texture = torch.rand(TEXTURE_PX, TEXTURE_PX, 3, generator=generator).to(device).requires_grad_()
@@ -74,7 +74,7 @@ class Case:
             mask = self.all.image(self.renderer(self.rest, None, self.all).mask[:, None])[..., 0] > 0
         self.hits = float(mask.float().mean())
         near = np.stack([_near(m) for m in mask.cpu().numpy()])
-        self.pixels = Pixels.of(cameras, torch.as_tensor(near, device=device))
+        self.pixels = Pixels.from_mask(cameras, torch.as_tensor(near, device=device))
         count = len(self.pixels.view)
         shapes = ((count, 3), (count, 3), (count,), (count, CLASSES))
         self.adjoint = [torch.rand(shape, generator=generator).to(device) for shape in shapes]

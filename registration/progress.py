@@ -48,7 +48,7 @@ class PrefixedProgress:
 
 @contextmanager
 def console_progress() -> Iterator[Progress]:
-    """Yield a progress bar on stderr if that is a terminal, else lines: one per new label, then one each 15 s."""
+    """Return a context: a progress bar on stderr if that is a terminal, else a line per new label and each 15 s."""
     if not sys.stderr.isatty():
         yield _Lines()
         return

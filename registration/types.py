@@ -1,4 +1,4 @@
-"""Every type that crosses a room. Axis letters: N views, H W pixels, V vertices, F triangles, I identity,
+"""The types that several rooms share. Axis letters: N views, H W pixels, V vertices, F triangles, I identity,
 E expression, J joints, L landmarks, K classes. Units: metres, radians, pixels (`_px`), millimetres (`_mm`)."""
 
 from collections.abc import Mapping, Sequence
@@ -62,7 +62,7 @@ class View:
 
 @dataclass(frozen=True, kw_only=True)
 class Capture:
-    """One moment of one subject seen by many cameras."""
+    """One moment of one subject, recorded by several cameras."""
 
     root: Path
     subject: str
@@ -82,61 +82,61 @@ class ViewPixels:
     rgb: Float[np.ndarray, "H W 3"]  # linear
     mask: Float[np.ndarray, "H W"] | None  # coverage of the subject in [0, 1]
     normals: Float[np.ndarray, "H W 3"] | None  # unit, camera frame; 0 where there is none
-    label_shares: Float[np.ndarray, "H W K"] | None  # share of each of Capture.classes; sums to 1 where valid
-    valid: Float[np.ndarray, "H W"]  # share of the pixel for which undistortion found a source
+    label_coverage: Float[np.ndarray, "H W K"] | None  # coverage by each of Capture.classes; sums to 1 where valid
+    valid: Float[np.ndarray, "H W"]  # fraction of the pixel that undistortion has a source for
 
 
-_BLOCK = 4  # pixels, either way, of a list's order
+_BLOCK = 4  # pixels, width and height of the blocks that order a list
 
 
 @dataclass(frozen=True, kw_only=True)
 class Pixels:
-    """The P pixels of some views that take part in a step: a list, and the way back from an image to it.
+    """The P pixels of some views that take part in a step, as a list with an index from the images into it.
 
     All cameras have one image size and no distortion. Arrays of pixels are ordered by view, within a view by blocks of
-    4 x 4 pixels: rays are cast sixteen at a time, and those of a block meet the same few faces.
+    4 x 4 pixels: rays are cast sixteen at a time, and those of a block hit the same few faces.
     """
 
     cameras: tuple[Camera, ...]
     view: Int[Tensor, "P"]  # int32, as the next two
     x: Int[Tensor, "P"]
     y: Int[Tensor, "P"]
-    index: Int[Tensor, "N H W"]  # place in the list, or -1
+    index: Int[Tensor, "N H W"]  # position in the list, or -1
 
     @classmethod
-    def of(cls, cameras: Sequence[Camera], chosen: Bool[Tensor, "N H W"]) -> "Pixels":
-        """The list of the chosen pixels."""
-        views, height, width = chosen.shape
-        padded = torch.nn.functional.pad(chosen, (0, -width % _BLOCK, 0, -height % _BLOCK))
+    def from_mask(cls, cameras: Sequence[Camera], mask: Bool[Tensor, "N H W"]) -> "Pixels":
+        """Return the list of the pixels where the mask is true."""
+        views, height, width = mask.shape
+        padded = torch.nn.functional.pad(mask, (0, -width % _BLOCK, 0, -height % _BLOCK))
         blocks = padded.view(views, -(-height // _BLOCK), _BLOCK, -(-width // _BLOCK), _BLOCK).transpose(2, 3)
         view, row, column, y, x = blocks.nonzero(as_tuple=True)
         view, y, x = view, _BLOCK * row + y, _BLOCK * column + x
-        index = torch.full(chosen.shape, -1, dtype=torch.int32, device=chosen.device)
-        index[view, y, x] = torch.arange(len(view), dtype=torch.int32, device=chosen.device)
+        index = torch.full(mask.shape, -1, dtype=torch.int32, device=mask.device)
+        index[view, y, x] = torch.arange(len(view), dtype=torch.int32, device=mask.device)
         view, y, x = (axis.to(torch.int32) for axis in (view, y, x))
         return cls(cameras=tuple(cameras), view=view, x=x, y=y, index=index)
 
     @classmethod
-    def all_of(cls, cameras: Sequence[Camera], device: torch.device | str = "cpu") -> "Pixels":
-        """Every pixel of every view."""
+    def full(cls, cameras: Sequence[Camera], device: torch.device | str = "cpu") -> "Pixels":
+        """Return the list of all pixels of all views."""
         shape = (len(cameras), cameras[0].height_px, cameras[0].width_px)
-        return cls.of(cameras, torch.ones(shape, dtype=torch.bool, device=device))
+        return cls.from_mask(cameras, torch.ones(shape, dtype=torch.bool, device=device))
 
     def image(self, values: Float[Tensor, "P D"], background: float = 0.0) -> Float[Tensor, "N H W D"]:
-        """Values of listed pixels laid out as images; differentiable."""
+        """Return images with these values at the listed pixels and `background` elsewhere; differentiable."""
         image = values.new_full((*self.index.shape, values.shape[-1]), background)
         return image.index_put((self.view.long(), self.y.long(), self.x.long()), values)
 
     def of_image(self, image: Shaped[Tensor, "N H W *D"]) -> Shaped[Tensor, "P *D"]:
-        """What an image holds at the listed pixels."""
+        """Return an image's values at the listed pixels."""
         return image[self.view.long(), self.y.long(), self.x.long()]
 
 
 @dataclass(frozen=True, kw_only=True)
 class Targets:
-    """What the losses compare with, at one pyramid level: the pixels in and around the head.
+    """Target values of the losses at one pyramid level: the pixels in and around the head.
 
-    Levels are kept in float16; `select` gives the float32 batch of a step. A weight of 0 means: not compared.
+    Levels are stored in float16; `select` returns the float32 batch of a step. Pixels of weight 0 are not compared.
     """
 
     names: tuple[str, ...]  # of the views
@@ -182,28 +182,28 @@ class Targets:
 
 @dataclass(frozen=True, kw_only=True)
 class Rendered:
-    """What the renderer draws at some pixels; nothing is shaded."""
+    """The rendering of the model at some pixels, without shading."""
 
     rgb: Float[Tensor, "P 3"]  # the texture's colour, linear
-    normals: Float[Tensor, "P 3"]  # world frame, unit, of the side that is seen; 0 on a miss
-    classes: Float[Tensor, "P K"]  # soft share of each class; 0 on a miss
+    normals: Float[Tensor, "P 3"]  # world frame, unit, of the visible side; 0 on a miss
+    classes: Float[Tensor, "P K"]  # soft membership of each class; 0 on a miss
     mask: Float[Tensor, "P"]  # 1 on a hit
 
 
 @dataclass(frozen=True, kw_only=True)
 class Parameters:
-    """What drives the GNM function. Tensors may carry the same leading batch axes."""
+    """Parameters of the GNM function. Tensors may have the same leading batch axes."""
 
     identity: Float[Tensor, "*B I"]
     expression: Float[Tensor, "*B E"]
-    rotations: Float[Tensor, "*B J 3"]  # axis-angle, each joint relative to its parent; the root turns everything
+    rotations: Float[Tensor, "*B J 3"]  # axis-angle, each joint relative to its parent; the root rotates everything
     translation: Float[Tensor, "*B 3"]
     scale: Float[Tensor, "*B"]  # applied to the posed mesh before the translation; 1 unless a recipe frees it
 
 
 @dataclass(frozen=True, kw_only=True)
 class Registration:
-    """The GNM mesh of one moment and how it was found. Arrays are float32 NumPy, in the model's vertex order."""
+    """The registered mesh of one capture and how it was computed. Arrays are float32, in the model's vertex order."""
 
     status: Status
     reason: str

@@ -124,7 +124,7 @@ def photograph(
 ) -> Targets:
     """All pixels of all views; those that show nothing but compared vertices have a weight."""
     renderer = Renderer(triangles, corner_uvs, compared[:, None].astype(np.float32), pixel_samples=16)
-    pixels = Pixels.all_of(cameras)
+    pixels = Pixels.full(cameras)
     drawn = renderer(torch.tensor(vertices, dtype=torch.float32), texture, pixels)
     count = len(pixels.view)
     grain = pixel_noise * torch.randn(count, 3, generator=torch.Generator().manual_seed(0))

@@ -54,7 +54,7 @@ def read_view(view: View, capture: Capture, *, downsample: int = 1) -> ViewPixel
         else _label_shares(read_labels(view.segmentation, camera, capture.classes), strips, valid, len(capture.classes))
     )
     return ViewPixels(
-        camera=reduced(camera, downsample), rgb=rgb, mask=mask, normals=normals, label_shares=labels, valid=valid
+        camera=reduced(camera, downsample), rgb=rgb, mask=mask, normals=normals, label_coverage=labels, valid=valid
     )
 
 

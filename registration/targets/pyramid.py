@@ -103,9 +103,9 @@ def _view_crop(view: View, capture: Capture, mapping: ClassMap, downsample: int)
     zeros = np.zeros(shape, np.float32)
     classes = np.zeros((*shape, len(mapping.names)), np.float32)
     neck = excluded = zeros
-    if pixels.label_shares is not None:
-        classes = pixels.label_shares @ mapping.from_capture
-        neck, excluded = pixels.label_shares @ mapping.neck, pixels.label_shares @ mapping.excluded
+    if pixels.label_coverage is not None:
+        classes = pixels.label_coverage @ mapping.from_capture
+        neck, excluded = pixels.label_coverage @ mapping.neck, pixels.label_coverage @ mapping.excluded
     mask = _coverage(pixels, capture)
     normals = np.zeros((*shape, 3), np.float32)
     if pixels.normals is not None:
@@ -127,7 +127,7 @@ def _view_crop(view: View, capture: Capture, mapping: ClassMap, downsample: int)
         valid=pixels.valid,
         landmarks=landmarks,
         has_mask=mask is not None,
-        has_classes=pixels.label_shares is not None,
+        has_classes=pixels.label_coverage is not None,
         has_normals=pixels.normals is not None,
         head_px=float(shape[0]),
     )
@@ -137,8 +137,8 @@ def _view_crop(view: View, capture: Capture, mapping: ClassMap, downsample: int)
 def _coverage(pixels: ViewPixels, capture: Capture) -> Float[np.ndarray, "H W"] | None:
     if pixels.mask is not None:
         return pixels.mask
-    if pixels.label_shares is not None and BACKGROUND in capture.classes:
-        return 1 - pixels.label_shares[..., capture.classes.index(BACKGROUND)]
+    if pixels.label_coverage is not None and BACKGROUND in capture.classes:
+        return 1 - pixels.label_coverage[..., capture.classes.index(BACKGROUND)]
     return None
 
 
@@ -196,7 +196,7 @@ def _halved(crop: _ViewCrop) -> _ViewCrop:
 def _targets(crops: list[_ViewCrop], mapping: ClassMap) -> Targets:
     weighted = [_apply_weights(crop) for crop in crops]
     compared = np.stack([np.any([w[name] > 0 for name in w if name.endswith("weight")], axis=0) for w in weighted])
-    pixels = Pixels.of([crop.camera for crop in crops], torch.as_tensor(compared))
+    pixels = Pixels.from_mask([crop.camera for crop in crops], torch.as_tensor(compared))
     indices = tuple(axis.numpy() for axis in (pixels.view, pixels.y, pixels.x))
 
     def listed(values: list[np.ndarray]) -> torch.Tensor:

@@ -43,13 +43,13 @@ def test_everything_is_undistorted_alike(tmp_path: Path, model: str, downsample:
     ideal = read_view(straight.views[0], straight, downsample=downsample)
     assert found.camera.distortion == () and found.mask is not None and ideal.mask is not None
     np.testing.assert_array_equal(found.camera.intrinsics, ideal.camera.intrinsics)
-    assert found.label_shares is not None and ideal.label_shares is not None
+    assert found.label_coverage is not None and ideal.label_coverage is not None
     assert (found.valid[ideal.mask > 0] > 0.999).all()
     tolerance_px = 0.1 / downsample
     np.testing.assert_allclose(place(found.mask), place(ideal.mask), atol=tolerance_px)
     for index in (1, 2):
         np.testing.assert_allclose(
-            place(found.label_shares[..., index]), place(ideal.label_shares[..., index]), atol=tolerance_px
+            place(found.label_coverage[..., index]), place(ideal.label_coverage[..., index]), atol=tolerance_px
         )
     inside = cv2.erode(np.minimum(found.mask, ideal.mask), np.ones((3, 3))) == 1
     assert inside.sum() > 15_000 / downsample**2
@@ -95,7 +95,7 @@ def test_reduction_keeps_the_mean_of_light_not_of_srgb(tmp_path: Path, dtype: ty
     capture = one_view(tmp_path / "capture", ViewArrays(name="a", camera=camera(), rgb=rgb))
     full = read_view(capture.views[0], capture)
     np.testing.assert_allclose(full.rgb, srgb_to_linear(rgb / top), atol=1e-6)
-    assert full.mask is None and full.normals is None and full.label_shares is None
+    assert full.mask is None and full.normals is None and full.label_coverage is None
     for downsample in (2, 4, 8):
         view = read_view(capture.views[0], capture, downsample=downsample)
         np.testing.assert_allclose(view.rgb.mean((0, 1), np.float64), full.rgb.mean((0, 1), np.float64), rtol=1e-6)
@@ -108,14 +108,14 @@ def test_masks_labels_and_normals_reduce_by_share(tmp_path: Path) -> None:
     plain = picture("a", camera(0.3))
     capture = one_view(tmp_path / "capture", plain)
     view = read_view(capture.views[0], capture, downsample=8)
-    assert view.mask is not None and view.label_shares is not None and view.normals is not None
+    assert view.mask is not None and view.label_coverage is not None and view.normals is not None
     assert plain.mask is not None and plain.labels is not None and plain.normals is not None
     blocks = plain.mask.reshape(20, 8, 15, 8).mean((1, 3))
     np.testing.assert_allclose(view.mask, blocks, atol=1e-6)
     for index in range(len(CLASSES)):
         counted = (plain.labels == index).reshape(20, 8, 15, 8).mean((1, 3))
-        np.testing.assert_allclose(view.label_shares[..., index], counted, atol=1e-6)
-    np.testing.assert_allclose(view.label_shares.sum(-1), 1, atol=1e-6)
+        np.testing.assert_allclose(view.label_coverage[..., index], counted, atol=1e-6)
+    np.testing.assert_allclose(view.label_coverage.sum(-1), 1, atol=1e-6)
     length = np.linalg.norm(view.normals, axis=-1)
     np.testing.assert_allclose(length[blocks > 0], 1, atol=1e-5)
     assert (length[blocks == 0] == 0).all()
@@ -137,13 +137,13 @@ def test_pixels_without_a_source_are_told_and_weigh_nothing(tmp_path: Path) -> N
     )
     capture = one_view(tmp_path / "capture", view)
     found = read_view(capture.views[0], capture, downsample=4)
-    assert found.mask is not None and found.label_shares is not None
+    assert found.mask is not None and found.label_coverage is not None
     assert found.valid[0, 0] == 0 and found.valid[20, 15] == 1 and 0.5 < found.valid.mean() < 0.98
     partly = found.valid > 0.05
     assert ((found.valid > 0.05) & (found.valid < 0.95)).sum() > 10
     np.testing.assert_allclose(found.rgb[partly], srgb_to_linear(np.array(200 / 255)), rtol=1e-3)
     np.testing.assert_allclose(found.mask[partly], 1, rtol=1e-3)
-    np.testing.assert_allclose(found.label_shares[partly] @ [0, 0, 1], 1, rtol=1e-3)
+    np.testing.assert_allclose(found.label_coverage[partly] @ [0, 0, 1], 1, rtol=1e-3)
     assert (found.rgb[found.valid == 0] == 0).all() and (found.mask[found.valid == 0] == 0).all()
 
 
@@ -266,7 +266,7 @@ def test_a_shared_view_at_half_size() -> None:
     capture = native.read_capture(SHARED / "data" / "captures" / "ict_dev" / "neutral")
     view = read_view(capture.views[2], capture, downsample=2)
     assert view.rgb.shape == (360, 240, 3) and view.rgb.min() >= 0 and view.rgb.max() <= 1
-    assert view.mask is not None and view.normals is not None and view.label_shares is not None
-    np.testing.assert_allclose(view.mask, 1 - view.label_shares[..., 0], atol=1e-5)
+    assert view.mask is not None and view.normals is not None and view.label_coverage is not None
+    np.testing.assert_allclose(view.mask, 1 - view.label_coverage[..., 0], atol=1e-5)
     facing = view.normals[view.mask == 1]
     assert np.median(facing[:, 2]) < -0.5  # the camera looks along +z, at surfaces that look back

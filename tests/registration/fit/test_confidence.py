@@ -26,7 +26,7 @@ def camera() -> Camera:
 
 def drawn(views: int, angle: float = 0.0, colour: float = 0.0) -> tuple[Targets, Rendered]:
     """Targets that face the camera, and a rendering rotated and brightened relative to them."""
-    pixels = Pixels.all_of([camera()] * views)
+    pixels = Pixels.full([camera()] * views)
     count = len(pixels.view)
     normals = torch.tensor([[0.0, 0, -1]]).expand(count, 3)
     ones = torch.ones(count)

@@ -118,7 +118,7 @@ def camera_at(yaw: float, roll: float = 0.0) -> Camera:
 
 def masks(cameras: list[Camera]) -> Targets:
     """A head in the centre of every image."""
-    pixels = Pixels.all_of(cameras)
+    pixels = Pixels.full(cameras)
     inside = ((pixels.x - 15.5).abs() < 6) & ((pixels.y - 15.5).abs() < 8)
     ones = torch.ones(len(inside))
     return Targets(

@@ -71,7 +71,7 @@ def targets(shift_px: int = 0) -> Targets:
         Camera(width_px=64, height_px=64, intrinsics=np.diag([64.0, 64.0, 1.0]), T_cam_world=np.eye(4))
         for _ in range(2)
     )
-    pixels = Pixels.all_of(cameras)
+    pixels = Pixels.full(cameras)
     mask = torch.zeros(2, 64, 64)
     mask[0, 16:48, 16:48] = 1
     mask[1, 16:48, 16 + shift_px : 48 + shift_px] = 1

@@ -19,7 +19,7 @@ def camera() -> Camera:
 
 def targets(pixels: Pixels | None = None, seed: int = 0) -> Targets:
     """Random values in every pixel, the subject everywhere, all weights 1."""
-    pixels = pixels or Pixels.all_of([camera()])
+    pixels = pixels or Pixels.full([camera()])
     rng, count = torch.Generator().manual_seed(seed), len(pixels.view)
 
     def random(*shape: int) -> torch.Tensor:
@@ -180,7 +180,7 @@ def test_classes_by_hand():
 
 def test_surfaces_of_their_own_must_agree():
     """An eye on skin, or a miss, is not compared; half a lip or a soft border is."""
-    pixels = Pixels.of([camera()], torch.arange(HEIGHT * WIDTH).reshape(1, HEIGHT, WIDTH) < 5)
+    pixels = Pixels.from_mask([camera()], torch.arange(HEIGHT * WIDTH).reshape(1, HEIGHT, WIDTH) < 5)
     target = targets(pixels)
     shares = [[1.0, 0, 0], [1, 0, 0], [0, 1, 0], [0.4, 0.6, 0], [0, 0, 1]]
     rendered = [[1.0, 0, 0], [0, 1, 0], [0, 1, 0], [0.6, 0.4, 0], [0, 1, 0]]
@@ -226,7 +226,7 @@ def test_a_few_pixels_or_all_of_them():
     index = whole.pixels.of_image(chosen)
     only = {name: values * index for name, values in vars(whole).items() if name.endswith("weight")}
     whole = replace(whole, mask=whole.mask * index, **only)
-    shown = Pixels.of([camera()], chosen)
+    shown = Pixels.from_mask([camera()], chosen)
     index = shown.of_image(whole.pixels.index)
     listed = {name: value[index] for name, value in vars(whole).items() if isinstance(value, torch.Tensor)}
     part = replace(whole, pixels=shown, **listed)

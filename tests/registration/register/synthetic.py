@@ -136,7 +136,7 @@ def _images(data: GNMData, vertices: np.ndarray, cameras: list[Camera]) -> np.nd
     classes = np.concatenate([vertex_classes(data)[1], neck_other(data)[:, None].astype(np.float32)], 1)
     classes[:, 0] *= 1 - classes[:, -1]
     renderer = Renderer(data.triangles, texture_atlas(data), classes, pixel_samples=16)
-    pixels = Pixels.all_of(cameras)
+    pixels = Pixels.full(cameras)
     image = renderer(torch.tensor(vertices), _texture(), pixels)
     flat = torch.cat([image.rgb, image.normals, image.mask[:, None], image.classes], -1)
     return pixels.image(flat).numpy()

@@ -60,10 +60,10 @@ class Scene:
     @cached_property
     def pixels(self) -> Pixels:
         """All pixels that a small motion can change."""
-        everywhere = Pixels.all_of(self.cameras)
+        everywhere = Pixels.full(self.cameras)
         mask = self.renderer(4)(torch.tensor(self.vertices), None, everywhere).mask
         near = torch.nn.functional.max_pool2d(everywhere.image(mask[:, None]).permute(0, 3, 1, 2), 9, 1, 4)[:, 0]
-        return Pixels.of(self.cameras, near > 0)
+        return Pixels.from_mask(self.cameras, near > 0)
 
     @property
     def centre(self) -> np.ndarray:

@@ -48,7 +48,7 @@ class Scene:
         pose[:3, 3] = -pose[:3, :3] @ ((low + high) / 2 + [0, 0, distance])
         intrinsics = np.array([[focal_px, 0, 0.51 * side_px], [0, focal_px, 0.48 * side_px], [0, 0, 1]])
         self.camera = Camera(width_px=side_px, height_px=side_px, intrinsics=intrinsics, T_cam_world=pose)
-        self.pixels = Pixels.all_of([self.camera])
+        self.pixels = Pixels.full([self.camera])
         self.pixel_m = distance / focal_px
 
     def renderer(self, samples: int) -> Renderer:

@@ -31,7 +31,7 @@ def pixels() -> Pixels:
     intrinsics = np.array([[FOCAL_PX, 0, SIDE_PX / 2 + 0.3], [0, FOCAL_PX, SIDE_PX / 2 - 0.2], [0, 0, 1]])
     pose = np.diag([1.0, -1, -1, 1])
     pose[2, 3] = DISTANCE_M
-    return Pixels.all_of([Camera(width_px=SIDE_PX, height_px=SIDE_PX, intrinsics=intrinsics, T_cam_world=pose)])
+    return Pixels.full([Camera(width_px=SIDE_PX, height_px=SIDE_PX, intrinsics=intrinsics, T_cam_world=pose)])
 
 
 def shown_area(centre_m: float, **settings) -> tuple[float, torch.Tensor]:

@@ -51,7 +51,7 @@ class Scene:
     def pixels(self) -> Pixels:
         """A tenth is left out: no gradient comes from there."""
         shape = (len(self.cameras), self.cameras[0].height_px, self.cameras[0].width_px)
-        return Pixels.of(self.cameras, torch.rand(shape, generator=torch.Generator().manual_seed(2)) < 0.9)
+        return Pixels.from_mask(self.cameras, torch.rand(shape, generator=torch.Generator().manual_seed(2)) < 0.9)
 
 
 def small_camera(position) -> Camera:
@@ -172,10 +172,10 @@ def test_inside_a_ball(group, pixel_samples):
     half = slice(len(scene.triangles) // 2, None)
     scene = replace(scene, triangles=scene.triangles[half], corner_uvs=scene.corner_uvs[half])
     renderer, reference = Renderer(*scene.mesh, pixel_samples=pixel_samples), Reference(*scene.mesh)
-    everywhere = Pixels.all_of(scene.cameras)
+    everywhere = Pixels.full(scene.cameras)
     mask = everywhere.image(reference(scene.positions, None, everywhere).mask[:, None])[..., 0]
     # What is convex and covers the centres around a pixel covers it all.
-    pixels = Pixels.of(scene.cameras, torch.nn.functional.avg_pool2d(mask, 3, 1, 1) > 0.99)
+    pixels = Pixels.from_mask(scene.cameras, torch.nn.functional.avg_pool2d(mask, 3, 1, 1) > 0.99)
     assert len(pixels.view) > 300
     inputs = [scene.positions.requires_grad_(), random_texture().requires_grad_()]
     image, twin = renderer(*inputs, pixels), mean_of_offsets(renderer, reference, *inputs, pixels)
@@ -208,7 +208,7 @@ def test_the_twins_silhouettes_by_hand():
     """A square's share of the image is the area of its projection (the shoelace formula)."""
     scene = squares()
     scene = replace(scene, triangles=scene.triangles[:2], corner_uvs=scene.corner_uvs[:2], cameras=scene.cameras[:1])
-    reference, view, pixels = Reference(*scene.mesh), scene.cameras[0], Pixels.all_of(scene.cameras[:1])
+    reference, view, pixels = Reference(*scene.mesh), scene.cameras[0], Pixels.full(scene.cameras[:1])
     vertices = torch.tensor(scene.vertices, requires_grad=True)
     projected = torch.cat([vertices[:4], torch.ones(4, 1)], 1) @ torch.tensor(
         (view.intrinsics @ view.T_cam_world[:3]).T

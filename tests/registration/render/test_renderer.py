@@ -71,7 +71,7 @@ def tiny(**settings) -> tuple[Renderer, torch.Tensor, Pixels]:
     renderer = Renderer(TINY.triangles, texture_atlas(TINY), vertex_classes(TINY)[1], **settings)
     centre = TINY.template_vertex_positions.mean(0)
     cameras = [camera(centre + 0.6 * np.array([np.sin(a), 0.1, np.cos(a)]), centre) for a in (0.3, -2.0)]
-    return renderer, torch.tensor(TINY.template_vertex_positions), Pixels.all_of(cameras)
+    return renderer, torch.tensor(TINY.template_vertex_positions), Pixels.full(cameras)
 
 
 def test_a_square_by_hand():
@@ -80,7 +80,7 @@ def test_a_square_by_hand():
     # Linear in u and v, so that bilinear look-ups are exact between the outermost texels' centres.
     centre = (np.arange(size) + 0.5) / size
     texture = np.stack(np.broadcast_arrays(centre[None, :], 1 - centre[:, None], 0.25), -1)
-    pixels = Pixels.all_of([view])
+    pixels = Pixels.full([view])
     image = square()(torch.tensor(SQUARE), torch.tensor(texture, dtype=torch.float32), pixels)
     rays = centre_rays(view, pixels.x.numpy(), pixels.y.numpy())
     point = view.centre - view.centre[2] / rays[:, 2:] * rays
@@ -100,7 +100,7 @@ def test_a_square_by_hand():
 
 def test_the_inner_side_shows_its_own_normal():
     view = camera((0.05, 0.05, -0.3), (0.05, 0.05, 0))
-    image = square()(torch.tensor(SQUARE), None, Pixels.all_of([view]))
+    image = square()(torch.tensor(SQUARE), None, Pixels.full([view]))
     assert image.mask.sum() > 400
     np.testing.assert_allclose(image.normals[image.mask == 1][:, 2], -1, atol=1e-6)
     assert image.rgb.abs().max() == 0  # no texture, no colour
@@ -113,7 +113,7 @@ def test_normals_of_a_sphere():
     uvs = np.zeros((len(triangles), 3, 2), np.float32)
     renderer = Renderer(triangles, uvs, np.ones((len(vertices), 1), np.float32))
     view = camera((0.4, 0.2, 0.5), centre)
-    pixels = Pixels.all_of([view])
+    pixels = Pixels.full([view])
     image = renderer(torch.tensor(vertices, dtype=torch.float32), None, pixels)
     rays = centre_rays(view, pixels.x.numpy(), pixels.y.numpy())
     rays /= np.linalg.norm(rays, axis=1, keepdims=True)
@@ -187,7 +187,7 @@ def test_some_pixels_are_those_of_all():
 
     parts = []
     for mask in (chosen, ~chosen):
-        pixels = Pixels.of(everywhere.cameras, mask)
+        pixels = Pixels.from_mask(everywhere.cameras, mask)
         image = renderer(vertices, texture, pixels)
         for name, values in vars(image).items():
             torch.testing.assert_close(values, getattr(whole, name)[everywhere.of_image(mask)])
@@ -200,7 +200,7 @@ def test_a_loss_of_one_pixel_moves_the_mesh():
     """Sums are in fixed point, their unit taken from a sample of the adjoint: a sparse one must not be lost."""
     size = 200
     view = camera((0.05, 0.05, 0.3), (0.05, 0.05, 0), focal_px=600.0, width_px=size, height_px=size)
-    pixels, attached = Pixels.all_of([view]), torch.tensor(SQUARE, requires_grad=True)
+    pixels, attached = Pixels.full([view]), torch.tensor(SQUARE, requires_grad=True)
     classes = square()(attached, None, pixels).classes[:, 1]
     one = int(pixels.index[0, 101, 93])
     assert 0.1 < classes[one] < 0.9
@@ -212,7 +212,7 @@ def test_a_loss_of_one_pixel_moves_the_mesh():
 def test_no_pixel_shows_the_mesh():
     away = camera((0, 0, 1), (0, 0, 2))
     vertices = torch.tensor(SQUARE, requires_grad=True)
-    image = square()(vertices, random_texture(8), Pixels.all_of([away]))
+    image = square()(vertices, random_texture(8), Pixels.full([away]))
     assert all(values.abs().max() == 0 for values in vars(image).values())
     (image.rgb.sum() + image.normals.sum() + image.mask.sum()).backward()
     assert vertices.grad.abs().max() == 0
@@ -241,7 +241,7 @@ def test_unwrap_is_the_transpose_of_the_look_up():
 def test_unwrap_reuses_what_was_just_drawn_and_nothing_else():
     """The same result whether faces are remembered or met again; other vertices or pixels are never taken for them."""
     renderer, vertices, pixels = tiny()
-    fewer = Pixels.all_of(pixels.cameras[:1])
+    fewer = Pixels.full(pixels.cameras[:1])
     generator = torch.Generator().manual_seed(3)
     values = torch.rand(len(pixels.view), 3, generator=generator)
     weights = torch.rand(len(pixels.view), generator=generator)
@@ -276,7 +276,7 @@ def test_another_forward_between_forward_and_backward():
         attached, colours = vertices.clone().requires_grad_(), texture.clone().requires_grad_()
         image = renderer(attached, colours, pixels)
         if disturb:
-            other = Pixels.all_of(pixels.cameras[:1])
+            other = Pixels.full(pixels.cameras[:1])
             renderer(vertices * 1.3 + 0.02, None, other)
             renderer.unwrap(vertices * 0.9, torch.ones(len(other.view), 3), torch.ones(len(other.view)), other, 32)
         (image.rgb.sum() + image.normals[:, 0].sum() + image.mask.sum()).backward()
@@ -303,7 +303,7 @@ def test_moving_geometry_compiles_nothing_new():
     def step(k: int) -> None:
         noise = 0.001 * torch.randn(vertices.shape, generator=rng)
         chosen = torch.rand(pixels.index.shape, generator=rng) < 0.4 + 0.1 * k
-        here = Pixels.of(pixels.cameras, chosen)
+        here = Pixels.from_mask(pixels.cameras, chosen)
         fit_step(renderer, vertices * (1 + 0.02 * k) + noise, texture, here)
         renderer.unwrap(vertices + noise, torch.ones(len(here.view), 3), torch.ones(len(here.view)), here, 64)
 
@@ -352,17 +352,17 @@ def test_many_rays_per_pixel_measure_an_area():
     polygon = 0.5 * corners * np.sin(2 * np.pi / corners) * 0.06**2
     area = polygon * view.intrinsics[0, 0] * view.intrinsics[1, 1] / 0.5**2
     renderer = Renderer(triangles, uvs, classes, pixel_samples=16)
-    mask = renderer(vertices, None, Pixels.all_of([view])).mask.double()
+    mask = renderer(vertices, None, Pixels.full([view])).mask.double()
     assert mask.sum().item() == pytest.approx(area, rel=2e-3)
     grey = (mask > 0.01) & (mask < 0.99)
     assert 80 < grey.sum() < 250
-    sharp = Renderer(triangles, uvs, classes)(vertices, None, Pixels.all_of([view])).mask
+    sharp = Renderer(triangles, uvs, classes)(vertices, None, Pixels.full([view])).mask
     assert set(sharp.unique().tolist()) == {0.0, 1.0}
 
 
 def test_cameras_of_two_sizes_or_with_distortion_are_refused():
     one, vertices = camera((0, 0, 0.5)), torch.tensor(SQUARE)
-    pixels = Pixels.all_of([one, one])
+    pixels = Pixels.full([one, one])
     for other in (replace(one, width_px=30), replace(one, distortion=(0.1, 0.0, 0.0, 0.0))):
         with pytest.raises(ValueError, match="one size without distortion"):
             square()(vertices, None, replace(pixels, cameras=(one, other)))
@@ -388,7 +388,7 @@ def test_the_gpu_draws_and_differentiates_as_the_cpu_does():
     def drawn(variant: backend.Variant) -> tuple[Rendered, torch.Tensor]:
         device = backend.activate(variant)
         renderer, vertices, pixels = tiny(edge_samples=64.0)
-        pixels = Pixels.all_of(pixels.cameras, device)
+        pixels = Pixels.full(pixels.cameras, device)
         attached = vertices.to(device).requires_grad_()
         image = renderer(attached, texture.to(device), pixels)
         (image.rgb.sum() + image.normals[:, 0].sum() + image.mask.sum() + image.classes[:, 0].sum()).backward()

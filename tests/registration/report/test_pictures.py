@@ -176,7 +176,7 @@ def test_report_views_of_targets_and_a_rendering():
     mask = torch.zeros(2, 8, 6)
     mask[:, 2:6, 1:5] = 1
     camera = Camera(width_px=6, height_px=8, intrinsics=np.eye(3), T_cam_world=np.eye(4))
-    pixels = Pixels.of((camera, camera), torch.nn.functional.max_pool2d(mask, 3, 1, 1) > 0)
+    pixels = Pixels.from_mask((camera, camera), torch.nn.functional.max_pool2d(mask, 3, 1, 1) > 0)
     listed = mask[pixels.view.long(), pixels.y.long(), pixels.x.long()]
     classes = torch.nn.functional.one_hot((listed * 2).long(), 3).float()
     nothing = torch.zeros(len(listed), 3)
