@@ -99,13 +99,13 @@ def check_page(page: str) -> None:
 def test_a_full_page():
     page = write_report(some_inputs())
     check_page(page)
-    for text in ("anna", "smile", "converged", "0.123", "1.46", "cam00", "cam01", "2.0 % dropped for normals"):
+    for text in ("anna", "smile", "converged", "0.123", "1.46", "cam00", "cam01", "2.0 % excluded by normals"):
         assert text in page, text
-    for text in ("subject&#x27;s left", "left_eye", "3 min 21 s", "mitsuba", "ab" * 32, "&quot;recipe&quot;"):
+    for text in ("subject&#39;s left", "left_eye", "3 min 21 s", "mitsuba", "ab" * 32, "&#34;recipe&#34;"):
         assert text in page, text
     assert page.count("data:image/jpeg") == 3 + 2 * 9
-    places = [page.index(f'id="{name}"') for name in ("distances", "views", "optimisation", "provenance")]
-    assert places == sorted(places)
+    positions = [page.index(f'id="{name}"') for name in ("distances", "views", "optimization", "provenance")]
+    assert positions == sorted(positions)
 
 
 def test_an_empty_page_has_no_empty_sections():
@@ -161,7 +161,7 @@ def test_number_curves_have_a_panel_a_title_and_a_band_where_one_is_known():
     assert number_curves({"none": []}, "components") == ""
 
 
-def test_remarks_name_what_was_left_out_and_what_lies_too_deep():
+def test_remarks_name_low_weights_exclusions_and_intersections():
     row = {"template_vertices": 3, "template_max_mm": 1.0, "vertices_beyond_0.3mm": 2, "max_excess_mm": 0.83}
     figures = {
         "notes": ["landmarks 2-6 of scheme 68 do not fit the model's: excluded"],
@@ -169,7 +169,7 @@ def test_remarks_name_what_was_left_out_and_what_lies_too_deep():
         "intersections": {"pairs": {"tongue in gums": row, "ears in skin": {**row, "vertices_beyond_0.3mm": 0}}},
     }
     page = write_report(some_inputs(registration=a_registration(figures=figures)))
-    assert "<li>View cam03 hardly counts: silhouette 35 px off the other views.</li>" in page
+    assert "<li>View cam03 has a low weight: silhouette 35 px off the other views.</li>" in page
     assert "<li>Landmarks 2-6 of scheme 68 do not fit" in page
     assert "<li>Tongue in gums: 2 vertices deeper than in the template, by up to 0.830 mm.</li>" in page
     assert "Ears in skin" not in page
