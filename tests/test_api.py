@@ -56,7 +56,7 @@ def test_every_name_resolves_and_is_documented(package, name: str) -> None:
     returned = get_type_hints(item)["return"]
     if returned is not type(None):
         summary = document.split()[0]
-        assert "Returns:" in document or summary in ("Return", "Read"), f"{name} does not say what it returns"
+        assert "Returns:" in document or summary in ("Return", "Read", "Yield"), f"{name} does not say what it returns"
 
 
 def test_unknown_names_are_attribute_errors() -> None:
