@@ -45,24 +45,28 @@ def measure_population(subjects: int) -> None:
     """Print all metrics for synthetic subjects, the headline ones last."""
     data = gnm_npz.read(build.bootstrap())
     anatomy = anatomy_of.build_assembly(makehuman.read(makehuman.fetch()), population.mean_person())
-    truths = [performances.perform(anatomy, 1000 + number) for number in range(subjects)]
-    injected = [stabilization_measures.injected(truths, data, seed) for seed in range(DRAWS)]
-    print(f"spurious_energy_reduced {min(result.reduced for result in injected):.3f}")
-    print(f"spurious_expression_lost {max(result.lost for result in injected):.4f}")
+    truths = [performances.true_subject(anatomy, 1000 + number) for number in range(subjects)]
+    results = [stabilization_measures.remove_injected_motion(truths, data, seed) for seed in range(DRAWS)]
+    print(f"spurious_energy_reduced {min(result.reduced for result in results):.3f}")
+    print(f"spurious_expression_lost {max(result.lost for result in results):.4f}")
     skin, head, settings = SkullSkin.of(data), Head.of(data), Stabilization()
     stabilized: list[StabilizedSubject] = []
     remaining, procrustes_mm, neck_mm, seconds = [], [], [], 0.0
     for number, truth in enumerate(truths):
-        seen = performances.seen(truth, number)
-        meshes = performances.meshes(truth, seen)
+        observed = performances.observe(truth, number)
+        meshes = performances.observed_meshes(truth, observed)
         start = time.perf_counter()
         stabilized.append(automatic_stage(meshes, head, skin, settings))
         seconds += time.perf_counter() - start
-        remaining.append(stabilization_measures.left(stabilized[-1].T_neutral_expression, seen, truth, data))
-        on_necks = stabilize_subject(performances.meshes(truth, performances.body_stays(seen, data)), skin)
-        neck_mm.append(stabilization_measures.left(on_necks.T_neutral_expression, seen, truth, data)[1])
-        procrustes = align(seen.vertices, seen.neutral, np.ones(seen.confidence.shape))
-        procrustes_mm.append(stabilization_measures.left(procrustes, seen, truth, data)[1])
+        remaining.append(
+            stabilization_measures.remaining_motion(stabilized[-1].T_neutral_expression, observed, truth, data)
+        )
+        on_necks = stabilize_subject(
+            performances.observed_meshes(truth, performances.with_still_body(observed, data)), skin
+        )
+        neck_mm.append(stabilization_measures.remaining_motion(on_necks.T_neutral_expression, observed, truth, data)[1])
+        procrustes = align(observed.vertices, observed.neutral, np.ones(observed.confidence.shape))
+        procrustes_mm.append(stabilization_measures.remaining_motion(procrustes, observed, truth, data)[1])
     samples = sum(len(subject.names) for subject in stabilized)
     print(f"automatic_seconds {seconds:.1f}  # {samples} samples of {len(head.points):,} vertices")
     start = time.perf_counter()
@@ -77,7 +81,7 @@ def measure_population(subjects: int) -> None:
     print(f"median_mm {np.median(mm):.3f}")
     print(f"p95_mm {np.percentile(mm, 95):.3f}")
     print(f"procrustes_mm {np.median(np.concatenate(procrustes_mm)):.3f}")
-    print(f"energy_lost {max(stabilization_measures.lost_by_label(final, truths, head).values()):.4f}")
+    print(f"energy_lost {max(stabilization_measures.energy_lost(final, truths, head).values()):.4f}")
 
 
 def measure_run(run: Path, data: GNMData) -> None:
@@ -85,17 +89,17 @@ def measure_run(run: Path, data: GNMData) -> None:
     skin, rng = SkullSkin.of(data), np.random.default_rng(0)
     remaining = []
     for meshes in read_run(run, data).meshes():
-        face = meshes.neutral[stabilization_measures.face(data)].astype(np.float64)
+        face = meshes.neutral[stabilization_measures.face_mask(data)].astype(np.float64)
         for motions in _random_motions(meshes, rng):
-            result = stabilize_subject(performances.moved(meshes, motions), skin)
-            remaining.append(stabilization_measures.residual(result.T_neutral_expression @ motions, face))
+            result = stabilize_subject(performances.transformed(meshes, motions), skin)
+            remaining.append(stabilization_measures.motion_size(result.T_neutral_expression @ motions, face))
     deg, mm = np.concatenate(remaining, 1)[:, :MOTIONS]
     print(f"run_median_deg {np.median(deg):.3f}\nrun_median_mm {np.median(mm):.3f}\nrun_worst_mm {mm.max():.3f}")
 
 
 def _random_motions(meshes: SubjectMeshes, rng: np.random.Generator) -> Iterator[np.ndarray]:
     for _ in range(-(-MOTIONS // len(meshes.names))):
-        yield np.stack([performances.motion(rng, 5.0, 10.0, meshes.neutral.mean(0)) for _ in meshes.names])
+        yield np.stack([performances.random_motion(rng, 5.0, 10.0, meshes.neutral.mean(0)) for _ in meshes.names])
 
 
 def main() -> None:

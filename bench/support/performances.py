@@ -1,5 +1,5 @@
-"""Subjects of the population whose expressions are known, and what a registration of them would look like: turned and
-shifted heads with smooth and white noise, and patches that no camera sees."""
+"""Synthetic subjects with known expressions, and what a registration of them would give: rotated and translated heads
+with smooth and white noise, and unobserved patches."""
 
 from dataclasses import dataclass, replace
 
@@ -23,13 +23,13 @@ NAMES = (
 )
 COUNT = len(NAMES)
 JAW, BROWS = ("jaw_open", "jaw_left", "jaw_right"), ("brows_up", "brows_down")
-_STRENGTH = (0.7, 1.0)  # no two people do the same: each unit of an expression has a strength of its own
+_STRENGTH = (0.7, 1.0)  # of each unit of an expression: subjects differ
 _WAVES = 200  # of a random smooth field
 
 
 @dataclass(frozen=True, kw_only=True)
-class Performed:
-    """One subject's truth, the skull where the neutral has it: metres, the model's frame."""
+class TrueSubject:
+    """A subject's true meshes, the skull where the neutral has it: metres, the model's frame."""
 
     name: str
     neutral: np.ndarray  # V 3
@@ -38,75 +38,77 @@ class Performed:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Seen:
-    """The same as a registration would give it."""
+class ObservedSubject:
+    """The meshes of a subject as a registration would give them."""
 
     neutral: np.ndarray  # V 3
     neutral_confidence: np.ndarray  # V
     vertices: np.ndarray  # S V 3
     confidence: np.ndarray  # S V
-    T_expression_neutral: np.ndarray  # S 4 4: the motion that was added
+    T_expression_neutral: np.ndarray  # S 4 4: the added motions
 
 
-def perform(anatomy: HeadAssembly, seed: int, names: tuple[str, ...] = NAMES) -> Performed:
-    """A person that the first model does not span, and expressions of varying strength."""
+def true_subject(anatomy: HeadAssembly, seed: int, names: tuple[str, ...] = NAMES) -> TrueSubject:
+    """Return a random subject outside the first model's span with expressions of random strength."""
     rng = np.random.default_rng(seed)
     person = population.sample_unspanned_person(anatomy.source, rng)
     moves = {name: anatomy.source.target(name) for name in person.weights}
     neutral, joints = anatomy.assemble(person, moves)
     heads = []
     for name in names:
-        act = EXPRESSIONS[name]
-        units = {unit: weight * rng.uniform(*_STRENGTH) for unit, weight in act.units.items()}
-        varied = Expression(category=act.category, units=units, gaze_deg=act.gaze_deg, tongue=act.tongue)
+        expression = EXPRESSIONS[name]
+        units = {unit: weight * rng.uniform(*_STRENGTH) for unit, weight in expression.units.items()}
+        varied = Expression(
+            category=expression.category, units=units, gaze_deg=expression.gaze_deg, tongue=expression.tongue
+        )
         heads.append(expressions.apply_expression(anatomy, varied, neutral, joints))
-    return Performed(name=f"synth_{seed:04d}", neutral=neutral, labels=names, vertices=np.stack(heads))
+    return TrueSubject(name=f"synth_{seed:04d}", neutral=neutral, labels=names, vertices=np.stack(heads))
 
 
 def smooth_noise(points: np.ndarray, length: float, rng: np.random.Generator) -> np.ndarray:
-    """A random field of unit variance in each coordinate, correlated as exp(-d^2 / 2 length^2) (Rahimi and Recht)."""
+    """Return a random field of unit variance, correlated as exp(-d^2 / 2 length^2) (random Fourier features)."""
     waves = rng.normal(0, 1 / length, (_WAVES, 3))
     phases = points @ waves.T + rng.uniform(0, 2 * np.pi, _WAVES)
     return np.sqrt(2 / _WAVES) * np.cos(phases) @ rng.normal(size=(_WAVES, 3))
 
 
-def motion(rng: np.random.Generator, most_deg: float, most_mm: float, centre: np.ndarray) -> np.ndarray:
-    """A turn about a random axis through `centre` and a shift, each evenly up to its most."""
+def random_motion(rng: np.random.Generator, max_deg: float, max_mm: float, centre: np.ndarray) -> np.ndarray:
+    """Return a rotation about a random axis through `centre` and a translation, each uniform up to its maximum."""
     transform = np.eye(4)
     axis = rng.normal(size=3)
-    turn = Rotation.from_rotvec(np.radians(rng.uniform(0, most_deg)) * axis / np.linalg.norm(axis)).as_matrix()
-    way = rng.normal(size=3)
-    shift = 1e-3 * rng.uniform(0, most_mm) * way / np.linalg.norm(way)
-    transform[:3, :3], transform[:3, 3] = turn, centre - turn @ centre + shift
+    rotation = Rotation.from_rotvec(np.radians(rng.uniform(0, max_deg)) * axis / np.linalg.norm(axis)).as_matrix()
+    direction = rng.normal(size=3)
+    translation = 1e-3 * rng.uniform(0, max_mm) * direction / np.linalg.norm(direction)
+    transform[:3, :3], transform[:3, 3] = rotation, centre - rotation @ centre + translation
     return transform
 
 
-def seen(
-    truth: Performed,
+def observe(
+    truth: TrueSubject,
     seed: int,
     *,
-    most_deg: float = 5.0,
-    most_mm: float = 10.0,
+    max_deg: float = 5.0,
+    max_mm: float = 10.0,
     smooth_mm: float = 0.3,
     white_mm: float = 0.1,
-    unseen: float = 0.1,
-) -> Seen:
-    """Motions, noise (standard deviations of each coordinate; smooth over 15 mm) and unseen patches added.
+    unobserved: float = 0.1,
+) -> ObservedSubject:
+    """Add motions, noise (standard deviations of each coordinate; smooth over 15 mm) and unobserved patches.
 
-    An unseen patch is wrong, smoothly, by 3 mm, and has no confidence.
+    An unobserved patch has a smooth error of 3 mm and no confidence.
     """
     rng = np.random.default_rng([seed, 1])
 
     def noisy(head: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         noise = 1e-3 * (smooth_mm * smooth_noise(head, 15e-3, rng) + white_mm * rng.normal(size=head.shape))
-        hidden = _patches(head, unseen, rng)
+        hidden = _patches(head, unobserved, rng)
         noise[hidden] += 3e-3 * smooth_noise(head[hidden], 15e-3, rng)
         return head + noise, np.where(hidden, 0, rng.uniform(0.5, 0.9, len(head))).astype(np.float32)
 
     neutral, neutral_confidence = noisy(truth.neutral)
-    motions = np.stack([motion(rng, most_deg, most_mm, truth.neutral.mean(0)) for _ in truth.labels])
+    motions = np.stack([random_motion(rng, max_deg, max_mm, truth.neutral.mean(0)) for _ in truth.labels])
     heads = [noisy(head) for head in truth.vertices]
-    return Seen(
+    return ObservedSubject(
         neutral=neutral.astype(np.float32),
         neutral_confidence=neutral_confidence,
         vertices=np.stack([transform_points(T, head) for T, (head, _) in zip(motions, heads, strict=True)]).astype(
@@ -117,37 +119,39 @@ def seen(
     )
 
 
-def _patches(points: np.ndarray, share: float, rng: np.random.Generator) -> np.ndarray:
-    """Balls around random vertices, 15 mm in radius, until this share of the vertices lies in one."""
+def _patches(points: np.ndarray, fraction: float, rng: np.random.Generator) -> np.ndarray:
+    """Balls of 15 mm radius around random vertices that contain this fraction of the vertices."""
     hidden, tree = np.zeros(len(points), bool), cKDTree(points)
-    while hidden.mean() < share:
+    while hidden.mean() < fraction:
         hidden[tree.query_ball_point(points[rng.integers(len(points))], 15e-3)] = True
     return hidden
 
 
-def body_stays(seen: Seen, data: GNMData) -> Seen:
-    """The same heads turned on necks, as the model's skinning has them, while the body stays where it was."""
+def with_still_body(observed: ObservedSubject, data: GNMData) -> ObservedSubject:
+    """Return the heads rotated on their necks by the model's skinning, without motion of the body."""
     weights = data.skinning_weights.astype(np.float64)
-    still = (weights[0] / weights.sum(0))[:, None]  # the root's share
-    back = np.linalg.inv(seen.T_expression_neutral)
-    heads = [head + still * (transform_points(T, head) - head) for T, head in zip(back, seen.vertices, strict=True)]
-    return replace(seen, vertices=np.stack(heads).astype(np.float32))
+    root = (weights[0] / weights.sum(0))[:, None]  # weight of the root
+    inverse = np.linalg.inv(observed.T_expression_neutral)
+    heads = [
+        head + root * (transform_points(T, head) - head) for T, head in zip(inverse, observed.vertices, strict=True)
+    ]
+    return replace(observed, vertices=np.stack(heads).astype(np.float32))
 
 
-def meshes(truth: Performed, seen: Seen) -> SubjectMeshes:
-    """What a registration gave, as stabilization takes it."""
+def observed_meshes(truth: TrueSubject, observed: ObservedSubject) -> SubjectMeshes:
+    """Return the observed meshes as the input of stabilization."""
     return SubjectMeshes(
         subject=truth.name,
-        neutral=seen.neutral,
-        neutral_confidence=seen.neutral_confidence,
+        neutral=observed.neutral,
+        neutral_confidence=observed.neutral_confidence,
         names=truth.labels,
         labels=truth.labels,
-        vertices=seen.vertices,
-        confidence=seen.confidence,
+        vertices=observed.vertices,
+        confidence=observed.confidence,
     )
 
 
-def moved(meshes: SubjectMeshes, motions: np.ndarray) -> SubjectMeshes:
-    """The expressions turned and shifted, one motion each."""
+def transformed(meshes: SubjectMeshes, motions: np.ndarray) -> SubjectMeshes:
+    """Return the meshes with a rigid motion of each expression."""
     heads = [transform_points(T, head) for T, head in zip(motions, meshes.vertices, strict=True)]
     return replace(meshes, vertices=np.stack(heads).astype(np.float32))

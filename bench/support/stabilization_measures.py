@@ -1,11 +1,11 @@
-"""What stabilization left, and what it took, against the truth."""
+"""Measures of stabilization against known truth: remaining motion, and energy lost by expressions."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from bench.support.performances import BROWS, JAW, Performed, Seen
+from bench.support.performances import BROWS, JAW, ObservedSubject, TrueSubject
 from registration.frames import MM_PER_M, transform_points
 from registration.geometry.rigid import angle_deg, motion_fields
 from registration.model.gnm_npz import GNMData
@@ -15,63 +15,66 @@ from registration.stabilize.decisions import corrections, default_actions
 from registration.stabilize.pipeline import StabilizedSubject
 
 
-def face(data: GNMData) -> np.ndarray:
+def face_mask(data: GNMData) -> np.ndarray:
+    """Return the vertices of the face mask."""
     return group(data, "hockey_mask") > 0.5
 
 
-def left(T_neutral_expression: np.ndarray, seen: Seen, truth: Performed, data: GNMData) -> np.ndarray:
-    """Degrees and mm (rms over the face mask) of each residual motion, (2, S)."""
-    return residual(T_neutral_expression @ seen.T_expression_neutral, truth.neutral[face(data)])
+def remaining_motion(
+    T_neutral_expression: np.ndarray, observed: ObservedSubject, truth: TrueSubject, data: GNMData
+) -> np.ndarray:
+    """Return degrees and mm (rms over the face mask) of each remaining motion, (2, S)."""
+    return motion_size(T_neutral_expression @ observed.T_expression_neutral, truth.neutral[face_mask(data)])
 
 
-def residual(motions: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """Degrees and rms mm at some points of each motion (S, 4, 4), as (2, S)."""
-    moved = np.stack([transform_points(motion, points) - points for motion in motions])
-    return np.stack([angle_deg(motions), MM_PER_M * np.sqrt((moved**2).sum(-1).mean(1))])
+def motion_size(motions: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """Return degrees, and rms mm at some points, of each motion (S, 4, 4), as (2, S)."""
+    displacement = np.stack([transform_points(motion, points) - points for motion in motions])
+    return np.stack([angle_deg(motions), MM_PER_M * np.sqrt((displacement**2).sum(-1).mean(1))])
 
 
-def lost_by_label(
+def energy_lost(
     subjects: Sequence[StabilizedSubject],
-    truths: Sequence[Performed],
+    truths: Sequence[TrueSubject],
     head: Head,
     labels: tuple[str, ...] = JAW + BROWS,
 ) -> dict[str, float]:
-    """1 - <d', d> / <d, d> over the exterior skin and all subjects: d true displacements, d' what came out."""
-    inner, own = dict.fromkeys(labels, 0.0), dict.fromkeys(labels, 0.0)
+    """Return 1 - <d', d> / <d, d> by label over all exterior skin: d true, d' stabilized displacements."""
+    products, squares = dict.fromkeys(labels, 0.0), dict.fromkeys(labels, 0.0)
     for subject, truth in zip(subjects, truths, strict=True):
         for k, label in enumerate(truth.labels):
-            if label in inner:
+            if label in products:
                 true = truth.vertices[k] - truth.neutral
-                found = subject.vertices[k] - subject.neutral
-                inner[label] += float((found * true).sum(-1) @ head.area)
-                own[label] += float((true * true).sum(-1) @ head.area)
-    return {label: 1 - inner[label] / own[label] for label in labels}
+                stabilized = subject.vertices[k] - subject.neutral
+                products[label] += float((stabilized * true).sum(-1) @ head.area)
+                squares[label] += float((true * true).sum(-1) @ head.area)
+    return {label: 1 - products[label] / squares[label] for label in labels}
 
 
 @dataclass(frozen=True, kw_only=True)
-class Injected:
-    """What the regional stage did about motions that were put into a third of the samples."""
+class InjectedMotionResult:
+    """The regional stage's effect on motions that were added to a third of the samples."""
 
     components: list[Components]
-    reduced: float  # share of their energy that is gone
+    reduced: float  # fraction of the motions' energy
     lost: float  # of the true expressions' energy, 1 - <d', d> / <d, d> over all samples
 
 
-def injected(
-    truths: Sequence[Performed],
+def remove_injected_motion(
+    truths: Sequence[TrueSubject],
     data: GNMData,
     seed: int,
     *,
     kinds: int = 2,
-    turn_deg: float = 1.0,
-    shift_mm: float = 2.0,
-) -> Injected:
-    """Rigid motions of some kinds (standard deviations as given), each sample's strengths at random."""
+    rotation_deg: float = 1.0,
+    translation_mm: float = 2.0,
+) -> InjectedMotionResult:
+    """Add rigid motions of some kinds (standard deviations as given) with random strengths, and apply the stage."""
     head, rng = Head.of(data), np.random.default_rng(seed)
     true = np.concatenate([truth.vertices - truth.neutral for truth in truths])
     labels = [label for truth in truths for label in truth.labels]
     twists = rng.normal(size=(kinds, 2, 3))
-    twists *= np.array([np.radians(turn_deg), shift_mm / MM_PER_M])[:, None] / np.linalg.norm(
+    twists *= np.array([np.radians(rotation_deg), translation_mm / MM_PER_M])[:, None] / np.linalg.norm(
         twists, axis=2, keepdims=True
     )
     chosen = rng.permutation(len(true)) % 3 == 0
@@ -83,15 +86,18 @@ def injected(
         labels,
         head,
     )
-    found = corrections(components, default_actions(components), labels, head)
+    correction = corrections(components, default_actions(components), labels, head)
     gram = np.einsum("ivc,v,jvc->ij", fields, head.area, fields)
-    remains = spurious - found.twists
+    remaining = spurious - correction.twists
 
     def energy(motions: np.ndarray) -> float:
         return float(np.einsum("si,ij,sj->", motions, gram, motions))
 
     shared = sum(
-        float((d * np.tensordot(twist, fields, 1)).sum(-1) @ head.area) for d, twist in zip(true, remains, strict=True)
+        float((d * np.tensordot(twist, fields, 1)).sum(-1) @ head.area)
+        for d, twist in zip(true, remaining, strict=True)
     )
-    own = float(((true**2).sum(-1) @ head.area).sum())
-    return Injected(components=components, reduced=1 - energy(remains) / energy(spurious), lost=-shared / own)
+    energy_of_true = float(((true**2).sum(-1) @ head.area).sum())
+    return InjectedMotionResult(
+        components=components, reduced=1 - energy(remaining) / energy(spurious), lost=-shared / energy_of_true
+    )

@@ -33,7 +33,7 @@ WAIT_MS = 6000  # until the animation has started
 def stored(head: Head) -> StoredComponents:
     """Return the components of true expressions with added head motion."""
     anatomy = anatomy_of.build_assembly(makehuman.read(makehuman.fetch()), population.mean_person())
-    truths = [performances.perform(anatomy, 1000 + number) for number in range(16)]
+    truths = [performances.true_subject(anatomy, 1000 + number) for number in range(16)]
     rng = np.random.default_rng(5)
     twists = rng.normal(size=(2, 2, 3))
     twists *= np.array([np.radians(1.0), 2e-3])[:, None] / np.linalg.norm(twists, axis=2, keepdims=True)

@@ -50,7 +50,7 @@ def subjects(
     """Subjects outside the first model's span, with expressions of random strength."""
     result = []
     for seed in seeds:
-        truth = performances.perform(assembly, seed, expressions)
+        truth = performances.true_subject(assembly, seed, expressions)
         meshes = tuple(mesh(name, v, model) for name, v in zip(truth.labels, truth.vertices, strict=True))
         tags = {"age": 20 + seed % 50, "gender": ("female", "male")[seed % 2]}
         neutral = mesh("neutral", truth.neutral, model)

@@ -3,7 +3,7 @@
 import pytest
 
 from bench.support import performances
-from bench.support.performances import Performed, Seen
+from bench.support.performances import ObservedSubject, TrueSubject
 from registration.model.gnm_npz import GNMData
 from registration.stabilize.components import Head
 from registration.stabilize.subject_meshes import SkullSkin
@@ -21,10 +21,10 @@ def skin(model: GNMData) -> SkullSkin:  # noqa: F811
 
 
 @pytest.fixture(scope="session")
-def truths(anatomy) -> list[Performed]:  # noqa: F811
-    return [performances.perform(anatomy, 1000 + number) for number in range(3)]
+def truths(anatomy) -> list[TrueSubject]:  # noqa: F811
+    return [performances.true_subject(anatomy, 1000 + number) for number in range(3)]
 
 
 @pytest.fixture(scope="session")
-def seens(truths: list[Performed]) -> list[Seen]:
-    return [performances.seen(truth, number) for number, truth in enumerate(truths)]
+def seens(truths: list[TrueSubject]) -> list[ObservedSubject]:
+    return [performances.observe(truth, number) for number, truth in enumerate(truths)]

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from bench.support.performances import Performed, Seen
+from bench.support.performances import ObservedSubject, TrueSubject
 from registration.model import gnm_npz
 from registration.model.gnm_npz import GNMData
 from registration.storage.registration_folder import save_registration
@@ -33,7 +33,7 @@ def write_subject(folder: Path, name: str, data: GNMData, heads: dict[str, tuple
     return folder
 
 
-def write_run(folder: Path, data: GNMData, truths: Sequence[Performed], seens: Sequence[Seen]) -> Path:
+def write_run(folder: Path, data: GNMData, truths: Sequence[TrueSubject], seens: Sequence[ObservedSubject]) -> Path:
     """One folder a subject."""
     for truth, seen in zip(truths, seens, strict=True):
         heads = {"rest": ("neutral", seen.neutral, seen.neutral_confidence)}

@@ -16,29 +16,31 @@ from tests.registration.report.test_page import a_registration
 
 @pytest.fixture(scope="module")
 def results(truths, seens, skin):
-    return [stabilize_subject(performances.meshes(t, s), skin) for t, s in zip(truths, seens, strict=True)]
+    return [stabilize_subject(performances.observed_meshes(t, s), skin) for t, s in zip(truths, seens, strict=True)]
 
 
 def test_the_motion_is_found_and_procrustes_is_worse(truths, seens, results, model):
     rows = list(zip(results, seens, truths, strict=True))
-    deg, mm = np.concatenate([stabilization_measures.left(r.T_neutral_expression, s, t, model) for r, s, t in rows], 1)
+    deg, mm = np.concatenate(
+        [stabilization_measures.remaining_motion(r.T_neutral_expression, s, t, model) for r, s, t in rows], 1
+    )
     assert np.median(deg) < 0.1 and np.median(mm) < 0.2 and np.percentile(mm, 95) < 0.35
     plain = [
-        stabilization_measures.left(align(s.vertices, s.neutral, np.ones(s.confidence.shape)), s, t, model)
+        stabilization_measures.remaining_motion(align(s.vertices, s.neutral, np.ones(s.confidence.shape)), s, t, model)
         for _, s, t in rows
     ]
     assert np.median(np.concatenate(plain, 1)[1]) > 3 * np.median(mm)
 
 
 def test_without_noise_the_map_trusts_what_stays_and_residuals_fall(truths, skin, model):
-    seen = performances.seen(truths[0], 0, smooth_mm=0, white_mm=0, unseen=0)
-    result = stabilize_subject(performances.meshes(truths[0], seen), skin)
+    seen = performances.observe(truths[0], 0, smooth_mm=0, white_mm=0, unobserved=0)
+    result = stabilize_subject(performances.observed_meshes(truths[0], seen), skin)
     trust = result.confidence_map
     assert 0 <= trust.min() and trust.max() <= 1 and not trust[skin.area == 0].any()
     ears, lids = group(model, "ears") > 0.5, group(model, "left_orbital_region") > 0.5
     assert np.median(trust[ears & (skin.area > 0)]) > 0.98 > np.percentile(trust[lids & (skin.area > 0)], 20)
     assert np.median(result.residual_mm[:, -1]) < 0.75 * np.median(result.residual_mm[:, 0])
-    assert stabilization_measures.left(result.T_neutral_expression, seen, truths[0], model)[1].max() < 0.15
+    assert stabilization_measures.remaining_motion(result.T_neutral_expression, seen, truths[0], model)[1].max() < 0.15
 
 
 def test_vertices_are_what_the_motion_makes(results, seens):
@@ -48,10 +50,13 @@ def test_vertices_are_what_the_motion_makes(results, seens):
 
 
 def test_heads_that_turn_on_their_necks_are_found_as_well(truths, seens, skin, model):
-    turned = performances.body_stays(seens[0], model)
+    turned = performances.with_still_body(seens[0], model)
     assert 1e3 * np.abs(turned.vertices - seens[0].vertices).max() > 5
-    result = stabilize_subject(performances.meshes(truths[0], turned), skin)
-    assert np.median(stabilization_measures.left(result.T_neutral_expression, seens[0], truths[0], model)[1]) < 0.2
+    result = stabilize_subject(performances.observed_meshes(truths[0], turned), skin)
+    assert (
+        np.median(stabilization_measures.remaining_motion(result.T_neutral_expression, seens[0], truths[0], model)[1])
+        < 0.2
+    )
 
 
 def test_unseen_vertices_have_no_say(truths, seens, skin, results):
@@ -61,7 +66,7 @@ def test_unseen_vertices_have_no_say(truths, seens, skin, results):
         vertices=np.where(seen.confidence[..., None] > 0, seen.vertices, 9.0).astype(np.float32),
         neutral=np.where(seen.neutral_confidence[:, None] > 0, seen.neutral, -7.0).astype(np.float32),
     )
-    again = stabilize_subject(performances.meshes(truths[0], changed), skin)
+    again = stabilize_subject(performances.observed_meshes(truths[0], changed), skin)
     np.testing.assert_allclose(again.T_neutral_expression, results[0].T_neutral_expression, atol=1e-9)
     unseen_at_rest = seen.neutral_confidence == 0
     assert not again.confidence_map[unseen_at_rest].any()
@@ -70,20 +75,22 @@ def test_unseen_vertices_have_no_say(truths, seens, skin, results):
 def test_the_world_of_a_capture_does_not_matter(truths, seens, skin, results):
     """Another place and turn for every capture: the same heads come out."""
     rng = np.random.default_rng(7)
-    motions = np.stack([performances.motion(rng, 170.0, 4000.0, np.zeros(3)) for _ in truths[0].labels])
-    found = stabilize_subject(performances.moved(performances.meshes(truths[0], seens[0]), motions), skin)
+    motions = np.stack([performances.random_motion(rng, 170.0, 4000.0, np.zeros(3)) for _ in truths[0].labels])
+    found = stabilize_subject(
+        performances.transformed(performances.observed_meshes(truths[0], seens[0]), motions), skin
+    )
     np.testing.assert_allclose(found.vertices, results[0].vertices, atol=2e-5)
 
 
 def test_one_expression_is_aligned_too(truths, seens, skin, model):
     jaw = truths[0].labels.index("jaw_open")
-    one = performances.meshes(truths[0], seens[0])
+    one = performances.observed_meshes(truths[0], seens[0])
     one = replace(
         one, names=("a",), labels=("jaw_open",), vertices=one.vertices[[jaw]], confidence=one.confidence[[jaw]]
     )
     result = stabilize_subject(one, skin)
     left = result.T_neutral_expression @ seens[0].T_expression_neutral[[jaw]]
-    deg, mm = stabilization_measures.residual(left, truths[0].neutral[stabilization_measures.face(model)])
+    deg, mm = stabilization_measures.motion_size(left, truths[0].neutral[stabilization_measures.face_mask(model)])
     assert deg < 0.3 and mm < 0.4
 
 

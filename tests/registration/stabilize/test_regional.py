@@ -12,7 +12,7 @@ from registration.stabilize.decisions import Decision, change, corrections, deci
 
 @pytest.fixture(scope="module")
 def injected(truths, model):
-    return stabilization_measures.injected(truths, model, seed=0)
+    return stabilization_measures.remove_injected_motion(truths, model, seed=0)
 
 
 def test_most_of_a_spurious_motion_goes_and_expressions_stay(injected):
@@ -24,8 +24,8 @@ def test_most_of_a_spurious_motion_goes_and_expressions_stay(injected):
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", range(3))
 def test_in_a_third_of_400_samples(anatomy, model, seed):
-    truths = [performances.perform(anatomy, 1000 + number) for number in range(20)]
-    found = stabilization_measures.injected(truths, model, seed)
+    truths = [performances.true_subject(anatomy, 1000 + number) for number in range(20)]
+    found = stabilization_measures.remove_injected_motion(truths, model, seed)
     assert found.reduced >= 0.8 and found.lost < 0.02
 
 

@@ -26,8 +26,8 @@ NAMES = ("smile", "jaw_open", "brows_up")
 
 @pytest.fixture(scope="module")
 def run(anatomy, model, tmp_path_factory) -> Path:  # noqa: F811
-    truths = [performances.perform(anatomy, number, NAMES) for number in range(2)]
-    seens = [performances.seen(truth, number, unseen=0.02) for number, truth in enumerate(truths)]
+    truths = [performances.true_subject(anatomy, number, NAMES) for number in range(2)]
+    seens = [performances.observe(truth, number, unobserved=0.02) for number, truth in enumerate(truths)]
     return runs.write_run(tmp_path_factory.mktemp("review"), model, truths, seens)
 
 
