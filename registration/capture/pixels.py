@@ -1,7 +1,7 @@
 """Decode one view: undistorted, resampled by area, in linear light.
 
-A view is decoded at full size in its own 8 or 16 bits and turned to float in strips of rows, so that 6144 x 4096
-needs a few hundred MB. Every result is the mean over those pixels of a block that undistortion found a source for.
+A view is decoded at full size in its own 8 or 16 bits and converted to float in strips of rows, so that 6144 x 4096
+needs a few hundred MB. Every result is the mean over the pixels of a block that undistortion has a source for.
 """
 
 from collections.abc import Callable, Iterator
@@ -19,16 +19,22 @@ from registration.errors import InputError
 from registration.frames import opencv_intrinsics, srgb_to_linear
 from registration.types import Camera, Capture, View, ViewPixels
 
-STRIP_PIXELS = 2**21  # turned to float at a time: 25 MB of float32 RGB
+STRIP_PIXELS = 2**21  # converted to float at a time: 25 MB of float32 RGB
 _COLOUR = cv2.IMREAD_COLOR_RGB | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
 _GRAY = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION
 
 
 def read_view(view: View, capture: Capture, *, downsample: int = 1) -> ViewPixels:
-    """Decode a view at 1/`downsample` of its size (whole blocks only: the remainder at the right and bottom is cut).
+    """Decode and undistort a view at 1/`downsample` of its size; K changes by that factor only.
 
-    Image, mask, normals and labels are undistorted alike and keep K; normals stay in the camera's frame.
-    Raises InputError naming the file if one is missing, truncated, of another size or of an unusable pixel type.
+    Args:
+        view: its image, mask, normals and labels are undistorted alike; normals stay in the camera's frame.
+        capture: names the classes of the labels.
+        downsample: whole factor; the remainder at the right and at the bottom is cut off.
+
+    Raises:
+        InputError: a file is missing, truncated, of another size or of an unusable pixel type, or the factor is larger
+            than the image.
     """
     camera = view.camera
     if not 1 <= downsample <= min(camera.width_px, camera.height_px):
@@ -42,36 +48,34 @@ def read_view(view: View, capture: Capture, *, downsample: int = 1) -> ViewPixel
     strips = list(_strips(camera, downsample))
     valid = _valid(camera, strips)
     rgb = _resample(read_image(view.image, camera), _to_linear, strips, valid)
-    mask = None if view.mask is None else _resample(read_mask(view.mask, camera), _to_share, strips, valid)
+    mask = None if view.mask is None else _resample(read_mask(view.mask, camera), _to_coverage, strips, valid)
     normals = (
         None
         if view.normals is None
         else _unit(_resample(read_normals(view.normals, camera), _to_normals, strips, valid))
     )
-    labels = (
-        None
-        if view.segmentation is None
-        else _label_shares(read_labels(view.segmentation, camera, capture.classes), strips, valid, len(capture.classes))
-    )
-    return ViewPixels(
-        camera=reduced(camera, downsample), rgb=rgb, mask=mask, normals=normals, label_coverage=labels, valid=valid
-    )
+    coverage = None
+    if view.segmentation is not None:
+        labels = read_labels(view.segmentation, camera, capture.classes)
+        coverage = _label_coverage(labels, strips, valid, len(capture.classes))
+    reduced = downsampled_camera(camera, downsample)
+    return ViewPixels(camera=reduced, rgb=rgb, mask=mask, normals=normals, label_coverage=coverage, valid=valid)
 
 
-def reduced(camera: Camera, downsample: int) -> Camera:
-    """The undistorted camera of `read_view`'s arrays: whole blocks of `downsample` x `downsample` pixels."""
+def downsampled_camera(camera: Camera, downsample: int) -> Camera:
+    """Return the undistorted camera of `read_view`'s arrays, whose pixels are blocks of `downsample` x `downsample`."""
     columns, rows = camera.width_px // downsample, camera.height_px // downsample
     whole = camera.cropped(0, 0, columns * downsample, rows * downsample)
     return replace(whole.scaled(columns, rows), distortion=())
 
 
 def undistort_landmarks(view: View, scheme: str) -> Float[np.ndarray, "L 3"]:
-    """A view's landmarks (x_px, y_px, confidence) where the undistorted full-size image shows them."""
+    """Return a view's landmarks (x_px, y_px, confidence) in the undistorted full-size image."""
     landmarks = np.array(view.landmarks[scheme], np.float64)
     camera = view.camera
     if camera.distortion and len(landmarks):
         criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 100, 1e-9)
-        # Points and K share one pixel convention here, so OpenCV's own does not enter.
+        # Points and K have the same pixel convention, so that OpenCV's does not matter.
         undistorted = cv2.undistortPoints(
             landmarks[:, None, :2],
             camera.intrinsics,
@@ -84,7 +88,7 @@ def undistort_landmarks(view: View, scheme: str) -> Float[np.ndarray, "L 3"]:
 
 
 def read_image(path: Path, camera: Camera) -> np.ndarray:
-    """An image as (H, W, 3) uint8 or uint16 sRGB, still distorted. Gray is repeated, alpha and EXIF turns ignored."""
+    """Read an image as (H, W, 3) uint8 or uint16 sRGB, distorted. Grey is repeated; alpha and EXIF are ignored."""
     pixels = _imread(path, "image", camera, _COLOUR)
     if pixels.dtype not in (np.uint8, np.uint16):
         raise InputError(
@@ -98,12 +102,12 @@ def read_image(path: Path, camera: Camera) -> np.ndarray:
 
 
 def read_mask(path: Path, camera: Camera) -> UInt8[np.ndarray, "H W"]:
-    """A mask, 255 = subject, still distorted."""
+    """Read a mask, 255 = subject, distorted."""
     return _imread(path, "mask", camera, _GRAY)
 
 
 def read_normals(path: Path, camera: Camera) -> np.ndarray:
-    """A normal map as (H, W, 3) uint16, encoded and still distorted."""
+    """Read a normal map as (H, W, 3) uint16, encoded and distorted."""
     pixels = _imread(path, "normal map", camera, _COLOUR)
     if pixels.dtype != np.uint16:
         raise InputError(
@@ -117,15 +121,15 @@ def read_normals(path: Path, camera: Camera) -> np.ndarray:
 
 
 def read_labels(path: Path, camera: Camera, classes: tuple[str, ...]) -> UInt8[np.ndarray, "H W"]:
-    """A label map, indices into `classes`, still distorted. Every index must have a name."""
+    """Read a label map, distorted: indices into `classes`. Raises InputError for an index without a name."""
     require_size(path, "label map", camera.width_px, camera.height_px)
     require_complete(path, "label map")
     try:
-        with Image.open(path) as image:  # unlike OpenCV it leaves palette indices what they are
+        with Image.open(path) as image:  # unlike OpenCV it does not convert palette indices to colours
             mode = image.mode
             labels = np.array(image)
     except (OSError, ValueError, SyntaxError) as error:
-        raise _undecodable(path, "label map", str(error)) from None
+        raise _input_error(path, "label map", str(error)) from None
     if mode not in ("L", "P") or labels.dtype != np.uint8:
         raise InputError(
             "The label map is not a map of indices",
@@ -151,11 +155,11 @@ def _imread(path: Path, role: str, camera: Camera, flags: int) -> np.ndarray:
     require_complete(path, role)
     pixels = cv2.imread(str(path), flags)
     if pixels is None or pixels.shape[:2] != (camera.height_px, camera.width_px):
-        raise _undecodable(path, role, "a decoding error")
+        raise _input_error(path, role, "a decoding error")
     return pixels
 
 
-def _undecodable(path: Path, role: str, got: str) -> InputError:
+def _input_error(path: Path, role: str, got: str) -> InputError:
     return InputError(
         f"The {role} cannot be decoded",
         where=path,
@@ -167,7 +171,7 @@ def _undecodable(path: Path, role: str, got: str) -> InputError:
 
 @dataclass(frozen=True, kw_only=True)
 class _Strip:
-    """Rows of the result and where their pixels come from."""
+    """Some rows of the result and the source of their pixels."""
 
     out: slice  # rows of the result
     columns: int  # of the result
@@ -176,7 +180,7 @@ class _Strip:
     warp: tuple[np.ndarray, np.ndarray] | None  # source x and y of every full-size pixel, relative to `source`
 
     def reduce(self, block: np.ndarray) -> np.ndarray:
-        """Block means of the undistorted full-size pixels, from the float rows `source`; no source counts as 0."""
+        """Return block means of undistorted full-size pixels from float rows `source`; without a source they are 0."""
         if self.warp is None:
             block = block[:, : self.columns * self.downsample]
         else:
@@ -187,12 +191,12 @@ class _Strip:
         return cv2.resize(block, size, interpolation=cv2.INTER_AREA)  # exact, because the factor is whole
 
     def average(self, block: np.ndarray, valid: Float[np.ndarray, "H W"]) -> np.ndarray:
-        """`reduce`, over those pixels alone that have a source; 0 where none has."""
+        """As `reduce`, over pixels that have a source only; 0 where none has."""
         mean = self.reduce(block)
         if self.warp is None:
             return mean
-        share = valid[self.out].reshape(mean.shape[:2] + (1,) * (mean.ndim - 2))
-        return np.where(share > 1e-3, mean / np.maximum(share, 1e-3), 0)
+        weight = valid[self.out].reshape(mean.shape[:2] + (1,) * (mean.ndim - 2))
+        return np.where(weight > 1e-3, mean / np.maximum(weight, 1e-3), 0)
 
 
 def _strips(camera: Camera, downsample: int) -> Iterator[_Strip]:
@@ -207,7 +211,7 @@ def _strips(camera: Camera, downsample: int) -> Iterator[_Strip]:
 
 
 def _warp(camera: Camera, rows: slice, width_px: int) -> tuple[slice, tuple[np.ndarray, np.ndarray]]:
-    """The source rows that some undistorted rows need, and the maps into them."""
+    """Return the source rows that undistorted rows need, and the maps into them."""
     intrinsics = opencv_intrinsics(camera.intrinsics)
     window = intrinsics.copy()
     window[1, 2] -= rows.start
@@ -221,7 +225,7 @@ def _warp(camera: Camera, rows: slice, width_px: int) -> tuple[slice, tuple[np.n
 
 
 def _valid(camera: Camera, strips: list[_Strip]) -> Float[np.ndarray, "H W"]:
-    """Share of each block that has a source pixel."""
+    """Return the fraction of each block that has a source."""
     valid = np.ones((strips[-1].out.stop, strips[-1].columns), np.float32)
     if camera.distortion:
         for strip in strips:
@@ -241,16 +245,16 @@ def _resample(
     return result
 
 
-def _label_shares(
+def _label_coverage(
     labels: UInt8[np.ndarray, "H W"], strips: list[_Strip], valid: Float[np.ndarray, "h w"], count: int
 ) -> Float[np.ndarray, "h w K"]:
-    """Share of each class in each block: the classes are resampled one by one, as masks are, so nothing jumps."""
-    shares = np.zeros((*valid.shape, count), np.float32)
+    """Return the coverage of each block by each class: classes are resampled one by one, as masks are."""
+    coverage = np.zeros((*valid.shape, count), np.float32)
     for strip in strips:
         block = labels[strip.source]
         for index in np.flatnonzero(np.bincount(block.ravel(), minlength=count)):
-            shares[strip.out, :, index] = strip.average((block == index).astype(np.float32), valid)
-    return shares
+            coverage[strip.out, :, index] = strip.average((block == index).astype(np.float32), valid)
+    return coverage
 
 
 @cache
@@ -265,7 +269,7 @@ def _to_linear(raw: np.ndarray) -> Float[np.ndarray, "H W 3"]:
     return _linear_table(16)[raw]
 
 
-def _to_share(raw: UInt8[np.ndarray, "H W"]) -> Float[np.ndarray, "H W"]:
+def _to_coverage(raw: UInt8[np.ndarray, "H W"]) -> Float[np.ndarray, "H W"]:
     return raw.astype(np.float32) / 255
 
 
@@ -277,6 +281,6 @@ def _to_normals(raw: np.ndarray) -> Float[np.ndarray, "H W 3"]:
 
 
 def _unit(vectors: Float[np.ndarray, "H W 3"]) -> Float[np.ndarray, "H W 3"]:
-    """Unit vectors; 0 where the mean is too short to have a direction (background, or normals that cancel)."""
+    """Normalize; 0 where the mean is too short to have a direction (background, or normals that cancel)."""
     length = np.linalg.norm(vectors, axis=-1, keepdims=True)
     return np.where(length > 1e-2, vectors / np.maximum(length, 1e-2), 0)

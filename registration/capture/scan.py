@@ -1,6 +1,5 @@
-"""The meshes of a capture: its raw scan and, in tests, the true vertices. Both in metres, capture world."""
+"""Read the meshes of a capture: its raw scan and the ground truth of synthetic ones, metres, capture world."""
 
-import zipfile
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -9,9 +8,14 @@ import trimesh
 from jaxtyping import Float, Int
 
 from registration.errors import InputError
-from registration.storage.npz import check_unpacked_size
+from registration.storage.npz import NpzSchema
 
-MAX_TRUTH_BYTES = 2**30  # 40 million vertices
+_TRUTH = NpzSchema(
+    title="ground truth",
+    fix="np.savez(path, vertices=...) with float (N, 3) vertices in metres, capture world",
+    fields={"vertices": ("float", "N 3")},
+    max_bytes=2**30,  # 40 million vertices
+)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -23,54 +27,36 @@ class Scan:
 
 
 def read_scan(path: Path) -> Scan:
-    """Read a PLY file, vertices in the file's order, larger faces cut into triangles.
+    """Read a PLY file, vertices in the file's order, larger faces split into triangles.
 
-    Raises InputError if it cannot be read, is empty, or holds numbers that are not finite.
+    Raises:
+        InputError: the file cannot be read, has fewer than three vertices, non-finite vertices or wrong indices.
     """
     try:
         mesh = trimesh.load(path, file_type="ply", process=False, maintain_order=True)
         vertices = np.array(getattr(mesh, "vertices", ()), np.float64)
         triangles = np.array(getattr(mesh, "faces", np.zeros((0, 3))), np.int64)
-    except Exception as error:  # trimesh's parsers raise whatever a damaged file makes them trip over
-        raise _refuse(path, "a PLY file with vertices and faces", f"{type(error).__name__}: {error}") from None
+    except Exception as error:  # a damaged file makes trimesh's parsers raise nearly anything
+        raise _input_error(path, "a PLY file with vertices and faces", f"{type(error).__name__}: {error}") from None
     if vertices.ndim != 2 or vertices.shape[1:] != (3,) or len(vertices) < 3:
-        raise _refuse(path, "at least three vertices", f"vertices of shape {vertices.shape}")
+        raise _input_error(path, "at least three vertices", f"vertices of shape {vertices.shape}")
     if not np.isfinite(vertices).all():
-        raise _refuse(path, "finite vertices", f"vertex {np.argwhere(~np.isfinite(vertices))[0, 0]} is not")
+        raise _input_error(path, "finite vertices", f"vertex {np.argwhere(~np.isfinite(vertices))[0, 0]} is not")
     if len(triangles) and not (triangles.min() >= 0 and triangles.max() < len(vertices)):
-        raise _refuse(path, f"face indices below {len(vertices)}", f"{triangles.min()} to {triangles.max()}")
+        raise _input_error(path, f"face indices below {len(vertices)}", f"{triangles.min()} to {triangles.max()}")
     return Scan(vertices=vertices, triangles=triangles)
 
 
 def read_truth(path: Path) -> Float[np.ndarray, "N 3"]:
-    """The vertices (m, capture world) of a `ground_truth.npz`. Raises InputError; never unpickles."""
+    """Read the vertices (m, capture world) of a `ground_truth.npz`. Other fields are ignored.
 
-    def refuse(expected: str, got: object) -> InputError:
-        return InputError(
-            "The ground truth cannot be used",
-            where=path,
-            expected=expected,
-            got=got,
-            fix="np.savez(path, vertices=...) with float (N, 3) vertices in metres, capture world",
-        )
-
-    try:
-        check_unpacked_size(path, MAX_TRUTH_BYTES)
-        with np.load(path, allow_pickle=False) as content:
-            if "vertices" not in content.files:
-                raise refuse('a field "vertices"', f"fields {', '.join(content.files)}")
-            fields = {name: content[name] for name in content.files}  # an object array in any field raises ValueError
-    except (ValueError, OSError, EOFError, zipfile.BadZipFile, KeyError) as error:
-        raise refuse("an NPZ file of plain arrays", error) from None
-    vertices = fields["vertices"]
-    if vertices.ndim != 2 or vertices.shape[1] != 3 or vertices.dtype.kind != "f":
-        raise refuse('floats of shape (N, 3) in field "vertices"', f"{vertices.dtype} of shape {vertices.shape}")
-    if not np.isfinite(vertices).all():
-        raise refuse('finite numbers in field "vertices"', f"row {np.argwhere(~np.isfinite(vertices))[0, 0]} is not")
-    return vertices
+    Raises:
+        InputError: the file cannot be read, or has no finite float (N, 3) field `vertices`.
+    """
+    return _TRUTH.read(path)["vertices"]
 
 
-def _refuse(path: Path, expected: str, got: str) -> InputError:
+def _input_error(path: Path, expected: str, got: str) -> InputError:
     return InputError(
         "The scan cannot be used", where=path, expected=expected, got=got, fix="export it again as PLY, in metres"
     )

@@ -1,6 +1,6 @@
-"""The GNM function in torch: parameters in, posed vertices out; batched and differentiable.
+"""The GNM function in torch [GNM, Model Formulation]: parameters -> posed vertices, batched and differentiable.
 
-Paper, Model Formulation; `gnm_numpy.py` is the same written out plainly.
+`gnm_numpy.py` is the reference implementation.
 """
 
 import numpy as np
@@ -14,7 +14,7 @@ from registration.types import Parameters
 
 
 class GNM(torch.nn.Module):
-    """A model ready to be evaluated on one device in one floating-point type.
+    """A head model that evaluates the GNM function on one device, in one floating-point type.
 
     V vertices, I identity, E expression, J joints, *B any batch axes. Metres and radians, the model's frame.
     """
@@ -32,21 +32,21 @@ class GNM(torch.nn.Module):
         super().__init__()
         joints, vertices = data.skinning_weights.shape
 
-        def keep(name: str, array: np.ndarray | None, *shape: int) -> None:
+        def register(name: str, array: np.ndarray | None, *shape: int) -> None:
             tensor = None if array is None else torch.from_numpy(np.ascontiguousarray(array)).reshape(shape)
             self.register_buffer(name, None if tensor is None else tensor.to(device, dtype), persistent=False)
 
-        keep("template", data.template_vertex_positions, 3 * vertices)
-        keep("identity_basis", data.vertex_identity_basis, -1, 3 * vertices)
-        keep("expression_basis", data.expression_basis, -1, 3 * vertices)
-        keep("joint_template", data.template_joint_positions, 3 * joints)
-        keep("joint_basis", data.joint_identity_basis, -1, 3 * joints)
+        register("template", data.template_vertex_positions, 3 * vertices)
+        register("identity_basis", data.vertex_identity_basis, -1, 3 * vertices)
+        register("expression_basis", data.expression_basis, -1, 3 * vertices)
+        register("joint_template", data.template_joint_positions, 3 * joints)
+        register("joint_basis", data.joint_identity_basis, -1, 3 * joints)
         # The inverse homogeneous map [GNM, Model Formulation] divides by the sum of a vertex' weights.
         weights = data.skinning_weights.astype(np.float64)
-        keep("weights", (weights / weights.sum(0)).T, vertices, joints)
-        # Released models ship zeros here; a product with them would cost as much as a tenth of the bases.
+        register("weights", (weights / weights.sum(0)).T, vertices, joints)
+        # Released models have zeros here; multiplying by them would take a tenth of the time of the bases.
         correctives = data.pose_correctives_regressor
-        keep("corrective_basis", correctives if correctives.any() else None, 9 * joints, 3 * vertices)
+        register("corrective_basis", correctives if correctives.any() else None, 9 * joints, 3 * vertices)
         triangles = torch.from_numpy(data.triangles.astype(np.int64)).to(device)
         self.register_buffer("triangles", triangles, persistent=False)
         self.parents: list[int] = data.joint_parent_indices.tolist()
@@ -61,9 +61,11 @@ class GNM(torch.nn.Module):
     def forward(
         self, parameters: Parameters, offsets: Float[Tensor, "*C V 3"] | None = None
     ) -> Float[Tensor, "*B V 3"]:
-        """Posed vertices in world metres: scale * LBS(bind + correctives + offsets) + translation.
+        """Return posed vertices, metres, world: scale * LBS(bind + correctives + offsets) + translation.
 
-        `offsets` are added in bind space and broadcast over the batch.
+        Args:
+            parameters: of one sample or a batch.
+            offsets: added in the bind pose, metres; broadcast over the batch.
         """
         bind = self.bind(parameters.identity, parameters.expression)
         if offsets is not None:
@@ -74,38 +76,38 @@ class GNM(torch.nn.Module):
     def pose(
         self, bind: Float[Tensor, "*B V 3"], joints: Float[Tensor, "*C J 3"], rotations: Float[Tensor, "*D J 3 3"]
     ) -> Float[Tensor, "*E V 3"]:
-        """The bind pose with pose correctives, skinned; rotations as matrices, each relative to its parent."""
+        """Add pose correctives to the bind pose and skin it; rotations are relative to the joints' parents."""
         if self.corrective_basis is not None:
             bind = bind + self.correctives(rotations)
         return self.skin(bind, joints, rotations)
 
     def bind(self, identity: Float[Tensor, "*B I"], expression: Float[Tensor, "*B E"]) -> Float[Tensor, "*B V 3"]:
-        """The bind pose: template plus both bases [GNM, Model Formulation], without pose correctives."""
+        """Return the bind pose: template plus both bases [GNM, Model Formulation], without pose correctives."""
         flat = self.template + identity @ self.identity_basis + expression @ self.expression_basis
         return flat.unflatten(-1, (-1, 3))
 
     def joints(self, identity: Float[Tensor, "*B I"]) -> Float[Tensor, "*B J 3"]:
-        """Joint positions in the bind pose."""
+        """Return the joint positions in the bind pose, metres."""
         return (self.joint_template + identity @ self.joint_basis).unflatten(-1, (-1, 3))
 
     def correctives(self, rotations: Float[Tensor, "*B J 3 3"]) -> Float[Tensor, "*B V 3"]:
-        """What the rotations add to the bind pose before skinning; in the released file, not in [GNM]."""
+        """Return the pose correctives of rotations in the bind pose; in the released file, not in [GNM]."""
         if self.corrective_basis is None:
             return self.template.new_zeros(*rotations.shape[:-3], *self.weights.shape[:1], 3)
-        turned = rotations - torch.eye(3, dtype=rotations.dtype, device=rotations.device)
-        return (turned.flatten(-3) @ self.corrective_basis).unflatten(-1, (-1, 3))
+        feature = rotations - torch.eye(3, dtype=rotations.dtype, device=rotations.device)
+        return (feature.flatten(-3) @ self.corrective_basis).unflatten(-1, (-1, 3))
 
     def skin(
         self, bind: Float[Tensor, "*B V 3"], joints: Float[Tensor, "*C J 3"], rotations: Float[Tensor, "*D J 3 3"]
     ) -> Float[Tensor, "*E V 3"]:
-        """Linear blend skinning by the kinematic chain; batch axes broadcast."""
-        turned, moved = [rotations[..., 0, :, :]], [joints[..., 0, :]]
+        """Apply linear blend skinning along the kinematic chain; batch axes broadcast."""
+        chained, positions = [rotations[..., 0, :, :]], [joints[..., 0, :]]
         for j, parent in enumerate(self.parents[1:], start=1):
             bone = joints[..., j, :] - joints[..., parent, :]
-            moved.append(moved[parent] + (turned[parent] @ bone[..., None])[..., 0])
-            turned.append(turned[parent] @ rotations[..., j, :, :])
-        rotation = torch.stack(turned, -3)
-        shift = torch.stack(moved, -2) - (rotation @ joints[..., None])[..., 0]
+            positions.append(positions[parent] + (chained[parent] @ bone[..., None])[..., 0])
+            chained.append(chained[parent] @ rotations[..., j, :, :])
+        rotation = torch.stack(chained, -3)
+        shift = torch.stack(positions, -2) - (rotation @ joints[..., None])[..., 0]
         affine = self.weights @ torch.cat([rotation, shift[..., None]], -1).flatten(-2)
         affine = affine.unflatten(-1, (3, 4))
         return (affine[..., :3] @ bind[..., None])[..., 0] + affine[..., 3]

@@ -1,4 +1,4 @@
-"""The official GNM file schema: 23 named arrays in one NPZ, every field checked, written back unchanged."""
+"""Read and write GNM model files: 23 named arrays in one NPZ file, each field checked."""
 
 import hashlib
 import zipfile
@@ -15,7 +15,7 @@ from registration.storage.npz import Defect, Kind, NpzSchema
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class GNMData:
-    """A GNM model as it lies on disk, under the official field names; dtypes are the file's own.
+    """A GNM model under the field names of the official file; dtypes are those of the file.
 
     V vertices, F triangles, Q quads, I identity, E expression, J joints, P mesh components, G vertex groups.
     Metres, +Y up, +Z out of the face, +X the subject's left. Names are NumPy string arrays.
@@ -31,7 +31,7 @@ class GNMData:
     identity_names: Shaped[np.ndarray, "I"]
     joint_names: Shaped[np.ndarray, "J"]
     expression_names: Shaped[np.ndarray, "E"]
-    joint_parent_indices: Integer[np.ndarray, "J"]  # parents come before their children; the root's is negative
+    joint_parent_indices: Integer[np.ndarray, "J"]  # parents precede their children; the root's is negative
     skinning_weights: Float[np.ndarray, "J V"]
     quads: Integer[np.ndarray, "Q 4"]
     triangles: Integer[np.ndarray, "F 3"]
@@ -44,7 +44,7 @@ class GNMData:
     bone_aligned_template_joint_orientations: Float[np.ndarray, "J 3 3"]
     vertex_groups: Float[np.ndarray, "G V"]
     vertex_group_names: Shaped[np.ndarray, "G"]
-    extra: Mapping[str, np.ndarray] = field(default_factory=dict)  # fields of the file that the schema does not know
+    extra: Mapping[str, np.ndarray] = field(default_factory=dict)  # fields of the file outside the schema
 
 
 # The annotations above vanish when shape checks are disabled, so the reader keeps its own table; a test compares both.
@@ -120,7 +120,7 @@ def write(data: GNMData, path: Path) -> None:
 
 
 def content_hash(data: GNMData) -> str:
-    """sha256 over every field's name, type, shape and bytes: equal for equal models, whatever the file."""
+    """Return the sha256 over every field's name, type, shape and bytes; independent of the file's compression."""
     digest = hashlib.sha256()
     for name, array in sorted(_arrays(data).items()):
         array = np.ascontiguousarray(array).reshape(array.shape)
@@ -130,7 +130,7 @@ def content_hash(data: GNMData) -> str:
 
 
 def topology_hash(triangles: Integer[np.ndarray, "F 3"]) -> str:
-    """sha256 over the triangles: two meshes share a topology exactly when this is equal, whatever the integer type."""
+    """Return the sha256 over the triangles, which identifies a topology; independent of the integer type."""
     return hashlib.sha256(np.ascontiguousarray(triangles, dtype="<i8").tobytes()).hexdigest()
 
 

@@ -1,4 +1,4 @@
-"""The GNM function written out plainly in NumPy, float64: the readable twin that tests hold `gnm.py` against."""
+"""Reference implementation of the GNM function in NumPy, float64, with which tests compare `gnm.py`."""
 
 import numpy as np
 from jaxtyping import Float
@@ -17,7 +17,17 @@ def evaluate(
     scale: float = 1.0,
     offsets: Float[np.ndarray, "V 3"] | None = None,
 ) -> Float[np.ndarray, "V 3"]:
-    """Posed vertices in world metres; arguments as in `types.Parameters`, one sample [GNM, Model Formulation]."""
+    """Return the posed vertices of one sample, metres, world [GNM, Model Formulation].
+
+    Args:
+        data: the model.
+        identity: coefficients.
+        expression: coefficients.
+        rotations: axis-angle (radians), each joint relative to its parent.
+        translation: metres.
+        scale: applied to the posed mesh before the translation.
+        offsets: added in the bind pose, metres.
+    """
     bind = data.template_vertex_positions.astype(np.float64)
     for coefficient, mode in zip(identity, data.vertex_identity_basis, strict=True):
         bind = bind + coefficient * mode

@@ -1,4 +1,4 @@
-"""What a model file holds, told to a person: tables on the terminal and a picture of the template."""
+"""Describe a model file: tables in the terminal and an image of the template."""
 
 from pathlib import Path
 
@@ -11,7 +11,7 @@ from registration.frames import MM_PER_M
 from registration.model import gnm_npz, landmarks, regions
 from registration.model.gnm_npz import GNMData
 
-COLOURS = {  # linear shades of the classes in pictures
+COLOURS = {  # of the classes in images, linear
     "skin": (0.86, 0.70, 0.60),
     "left_eye": (0.35, 0.55, 0.95),
     "right_eye": (0.30, 0.75, 0.85),
@@ -20,13 +20,19 @@ COLOURS = {  # linear shades of the classes in pictures
     "ears": (0.95, 0.75, 0.30),
     "mouth_interior": (0.55, 0.35, 0.60),
 }
-_VIEWS = {"the subject's right": 75.0, "front": 0.0, "the subject's left": -75.0}  # turn of the head about +Y, degrees
+_VIEWS = {"the subject's right": 75.0, "front": 0.0, "the subject's left": -75.0}  # rotation about +Y, degrees
 
 
 def describe(path: Path, picture: Path | None = None, console: Console | None = None) -> GNMData:
-    """Print dimensions, parts, joints, regions and landmark schemes of a model file; draw its template to `picture`.
+    """Print dimensions, parts, joints, regions and landmark schemes of a model file.
 
-    Raises InputError for a file that is not a GNM model.
+    Args:
+        path: the model's NPZ file.
+        picture: PNG file for an image of the template; None: none is drawn.
+        console: to print to; None: the terminal.
+
+    Raises:
+        InputError: the file is not a GNM model.
     """
     console = console or Console()
     data = gnm_npz.read(path)
@@ -34,8 +40,8 @@ def describe(path: Path, picture: Path | None = None, console: Console | None = 
     console.print(f"[bold]{path}[/]  GNM {data.variant} {data.version}  sha256 {gnm_npz.content_hash(data)[:12]}")
     for table in (_dimensions(data), _parts(data), _joints(data), _regions(data)):
         console.print(table)
-    told = [f"{scheme.name} ({len(scheme.indices)} points)" for scheme in schemes.values()]
-    console.print(f"landmark schemes: {', '.join(told) or 'none beside the file'}")
+    points = [f"{scheme.name} ({len(scheme.indices)} points)" for scheme in schemes.values()]
+    console.print(f"landmark schemes: {', '.join(points) or 'none beside the file'}")
     if data.extra:
         console.print(f"fields outside the schema, kept: {', '.join(data.extra)}")
     if picture is not None:
@@ -45,26 +51,26 @@ def describe(path: Path, picture: Path | None = None, console: Console | None = 
 
 
 def draw(data: GNMData, path: Path, schemes: dict[str, landmarks.LandmarkScheme]) -> None:
-    """A picture of the template from three sides, coloured by class, with the landmarks of every scheme."""
+    """Draw the template from three sides, coloured by class, with the landmarks of every scheme."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.collections import PolyCollection
     from matplotlib.figure import Figure
     from matplotlib.patches import Patch
 
     vertices = data.template_vertex_positions.astype(np.float64)
-    names, shares = regions.vertex_classes(data)
-    colours = shares @ np.array([COLOURS[name] for name in names])
+    names, membership = regions.vertex_classes(data)
+    colours = membership @ np.array([COLOURS[name] for name in names])
     centre = (vertices.min(0) + vertices.max(0)) / 2
     half = 0.52 * np.ptp(vertices, axis=0).max()
     figure = Figure(figsize=(13, 5.2), dpi=110, layout="constrained")
     FigureCanvasAgg(figure)
-    for axes, (title, turn) in zip(figure.subplots(1, 3), _VIEWS.items(), strict=True):
-        rotation = _turned(turn)
-        seen = (vertices - centre) @ rotation.T
-        polygons, shades = _shaded(seen, data.triangles, colours)
+    for axes, (title, angle) in zip(figure.subplots(1, 3), _VIEWS.items(), strict=True):
+        rotation = _rotation_y(angle)
+        rotated = (vertices - centre) @ rotation.T
+        polygons, shades = _shaded(rotated, data.triangles, colours)
         axes.add_collection(PolyCollection(list(polygons), facecolors=shades, edgecolors=shades, linewidths=0.3))
         for scheme in schemes.values():
-            points, outward = _landmarks_in_view(scheme, seen, data.triangles)
+            points, outward = _landmarks_in_view(scheme, rotated, data.triangles)
             axes.scatter(*points[outward].T[:2], s=5, color="black", linewidths=0)
         axes.set(xlim=(-half, half), ylim=(-half, half), aspect="equal", title=title)
         axes.set_axis_off()
@@ -76,16 +82,16 @@ def draw(data: GNMData, path: Path, schemes: dict[str, landmarks.LandmarkScheme]
     figure.savefig(path)
 
 
-def _turned(degrees: float) -> Float[np.ndarray, "3 3"]:
+def _rotation_y(degrees: float) -> Float[np.ndarray, "3 3"]:
     c, s = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
     return np.array([[c, 0, s], [0, 1, 0], [-s, 0, c]])
 
 
 def _shaded(
-    seen: Float[np.ndarray, "V 3"], triangles: Int[np.ndarray, "F 3"], colours: Float[np.ndarray, "V 3"]
+    vertices: Float[np.ndarray, "V 3"], triangles: Int[np.ndarray, "F 3"], colours: Float[np.ndarray, "V 3"]
 ) -> tuple[Float[np.ndarray, "G 3 2"], Float[np.ndarray, "G 3"]]:
-    """The triangles that face +Z, far ones first, and their lit colours."""
-    corners = seen[triangles]
+    """The triangles that face +Z, the most distant first, and their shaded colours."""
+    corners = vertices[triangles]
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     normals /= np.linalg.norm(normals, axis=1, keepdims=True) + 1e-20
     front = np.flatnonzero(normals[:, 2] > 0)
@@ -96,12 +102,12 @@ def _shaded(
 
 
 def _landmarks_in_view(
-    scheme: landmarks.LandmarkScheme, seen: Float[np.ndarray, "V 3"], triangles: Int[np.ndarray, "F 3"]
+    scheme: landmarks.LandmarkScheme, vertices: Float[np.ndarray, "V 3"], triangles: Int[np.ndarray, "F 3"]
 ) -> tuple[Float[np.ndarray, "L 3"], np.ndarray]:
-    corners = seen[triangles]
-    normals = np.zeros_like(seen)
+    corners = vertices[triangles]
+    normals = np.zeros_like(vertices)
     np.add.at(normals, triangles, np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])[:, None])
-    return scheme.points(seen), scheme.points(normals)[:, 2] > 0
+    return scheme.points(vertices), scheme.points(normals)[:, 2] > 0
 
 
 def _table(title: str, *columns: str) -> Table:
@@ -138,15 +144,15 @@ def _parts(data: GNMData) -> Table:
 def _joints(data: GNMData) -> Table:
     table = _table("joints", "name", "parent", "x mm", "y mm", "z mm")
     names = data.joint_names.tolist()
-    for name, parent, at in zip(names, data.joint_parent_indices, data.template_joint_positions, strict=True):
-        table.add_row(name, names[parent] if parent >= 0 else "-", *(f"{c * MM_PER_M:.1f}" for c in at))
+    for name, parent, position in zip(names, data.joint_parent_indices, data.template_joint_positions, strict=True):
+        table.add_row(name, names[parent] if parent >= 0 else "-", *(f"{c * MM_PER_M:.1f}" for c in position))
     return table
 
 
 def _regions(data: GNMData) -> Table:
     table = _table("classes and vertex groups", "name", "vertices")
-    names, shares = regions.vertex_classes(data)
-    for name, count in zip(names, shares.sum(0), strict=True):
+    names, membership = regions.vertex_classes(data)
+    for name, count in zip(names, membership.sum(0), strict=True):
         table.add_row(f"[bold]class {name}[/]", f"{count:,.0f}")
     for role, mask in (("exterior", regions.exterior(data)), ("neck_other", regions.neck_other(data))):
         table.add_row(f"[bold]role {role}[/]", f"{mask.sum():,}")

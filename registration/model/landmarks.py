@@ -17,7 +17,7 @@ _FIX = "write one landmark a row as `i0 w0 i1 w1 i2 w2`: vertex indices from 0, 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class LandmarkScheme:
-    """L points on the surface. A scheme file's order is taken as it is; whether it fits a capture's is for the fit."""
+    """L points on the surface, in the order of the scheme's file; captures must have the same order."""
 
     name: str  # "68" for head_sparse_68.txt
     indices: Int[np.ndarray, "L 3"]
@@ -28,7 +28,7 @@ class LandmarkScheme:
     @overload
     def points(self, vertices: Float[Tensor, "*B V 3"]) -> Float[Tensor, "*B L 3"]: ...
     def points(self, vertices: np.ndarray | Tensor) -> np.ndarray | Tensor:
-        """The landmarks on these vertices, in their units and frame; NumPy in, NumPy out, torch in, torch out."""
+        """Return the landmarks on vertices, in the vertices' units and frame; of NumPy arrays or torch tensors."""
         if isinstance(vertices, Tensor):
             indices = torch.as_tensor(self.indices, device=vertices.device)
             return (vertices[..., indices, :] * vertices.new_tensor(self.weights)[..., None]).sum(-2)
@@ -36,43 +36,49 @@ class LandmarkScheme:
 
 
 def read_scheme(path: Path, vertex_count: int, name: str | None = None) -> LandmarkScheme:
-    """The scheme in a text file of rows `i0 w0 i1 w1 i2 w2`, named after the file `head_sparse_NAME.txt` unless told.
+    """Read a scheme from a text file of rows `i0 w0 i1 w1 i2 w2`.
 
-    Raises InputError for a file that cannot be read as such rows, indices outside `vertex_count` vertices and weights
-    that do not sum to one.
+    Args:
+        path: the file.
+        vertex_count: number of the model's vertices.
+        name: of the scheme; None: NAME of the file `head_sparse_NAME.txt`.
+
+    Raises:
+        InputError: the file has other rows, a vertex index is out of range, or weights do not sum to one.
     """
     path = Path(path)
     try:
         rows = [[float(word) for word in line.split()] for line in path.read_text("ascii").splitlines() if line.strip()]
     except (OSError, ValueError) as error:
-        raise _wrong("cannot be read", path, "rows of six numbers", f"{type(error).__name__}: {error}") from error
+        raise _input_error("cannot be read", path, "rows of six numbers", f"{type(error).__name__}: {error}") from error
     for number, row in enumerate(rows):
         if len(row) != 6 or not np.isfinite(row).all():
-            raise _wrong("has a wrong row", path, "six finite numbers", f"{row} in row {number}")
+            raise _input_error("has a wrong row", path, "six finite numbers", f"{row} in row {number}")
     if not rows:
-        raise _wrong("is empty", path, "at least one row", "none")
+        raise _input_error("is empty", path, "at least one row", "none")
     table = np.array(rows)
     indices, weights = table[:, ::2], table[:, 1::2]
     bad = np.flatnonzero(((indices < 0) | (indices >= vertex_count) | (indices != np.round(indices))).any(1))
     if len(bad):
         got = f"{indices[bad[0]].tolist()} in row {bad[0]}"
-        raise _wrong("has a wrong vertex index", path, f"indices of the model's {vertex_count} vertices", got)
+        raise _input_error("has a wrong vertex index", path, f"indices of the model's {vertex_count} vertices", got)
     bad = np.flatnonzero(np.abs(weights.sum(1) - 1) > 0.01)
     if len(bad):
-        raise _wrong("has wrong weights", path, "three weights that sum to 1", f"{weights[bad[0]]} in row {bad[0]}")
+        got = f"{weights[bad[0]]} in row {bad[0]}"
+        raise _input_error("has wrong weights", path, "three weights that sum to 1", got)
     weights = weights / weights.sum(1, keepdims=True)  # the files round to three digits
     name = name or path.stem.removeprefix(_PREFIX)
     return LandmarkScheme(name=name, indices=indices.astype(np.int64), weights=weights)
 
 
 def schemes_beside(model_path: Path, vertex_count: int) -> dict[str, LandmarkScheme]:
-    """All schemes whose files `head_sparse_NAME.txt` lie in the model file's folder, by name. Raises InputError."""
+    """Read all schemes `head_sparse_NAME.txt` in the model file's folder, by name. Raises InputError."""
     files = sorted(Path(model_path).parent.glob(f"{_PREFIX}*.txt"))
     return {scheme.name: scheme for scheme in (read_scheme(file, vertex_count) for file in files)}
 
 
 def write_scheme(scheme: LandmarkScheme, model_path: Path) -> Path:
-    """Write a scheme as `head_sparse_NAME.txt` beside a model file; returns its path."""
+    """Write a scheme as `head_sparse_NAME.txt` into a model file's folder. Returns its path."""
     rows = zip(scheme.indices.tolist(), scheme.weights.tolist(), strict=True)
     lines = [" ".join(f"{i} {w:.9g}" for i, w in zip(index, weight, strict=True)) for index, weight in rows]
     path = Path(model_path).with_name(f"{_PREFIX}{scheme.name}.txt")
@@ -80,5 +86,5 @@ def write_scheme(scheme: LandmarkScheme, model_path: Path) -> Path:
     return path
 
 
-def _wrong(what: str, path: Path, expected: object, got: object) -> InputError:
-    return InputError(f"the landmark scheme {what}", where=path, expected=expected, got=got, fix=_FIX)
+def _input_error(what: str, path: Path, expected: object, got: object) -> InputError:
+    return InputError(f"The landmark scheme {what}", where=path, expected=expected, got=got, fix=_FIX)

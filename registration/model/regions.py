@@ -1,4 +1,4 @@
-"""Regions of a model by *role*. This file alone knows how the file's vertex groups are called."""
+"""Regions of a model by *role*. Only this module knows the names of the file's vertex groups."""
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -8,7 +8,7 @@ from registration.errors import InputError
 from registration.model.gnm_npz import GNMData
 
 CLASSES = ("skin", "left_eye", "right_eye", "upper_lip", "lower_lip", "ears", "mouth_interior")
-# Every class but `skin`, which is what these leave over.
+# Every class but `skin`, which is the rest.
 _SOURCES = {
     "left_eye": ("left_eye",),
     "right_eye": ("right_eye",),
@@ -21,11 +21,11 @@ _INSIDE = 0.5  # a weight above this counts as membership where a yes or no is n
 
 
 def group(data: GNMData, name: str) -> Float[np.ndarray, "V"]:
-    """The weights of one vertex group, float32. Raises InputError, with the names there are, if it is missing."""
+    """Return the weights of one vertex group, float32. Raises InputError, which lists the groups, if it is missing."""
     names = data.vertex_group_names.tolist()
     if name not in names:
         raise InputError(
-            f"the model has no vertex group '{name}'",
+            f"The model has no vertex group '{name}'",
             where="vertex_group_names",
             expected=f"a group '{name}'",
             got=", ".join(names),
@@ -35,15 +35,15 @@ def group(data: GNMData, name: str) -> Float[np.ndarray, "V"]:
 
 
 def vertex_classes(data: GNMData) -> tuple[tuple[str, ...], Float[np.ndarray, "V K"]]:
-    """The classes' names, in order, and each vertex' soft share of each; rows sum to one.
+    """Return the classes' names, in order, and each vertex' soft membership of each; rows sum to one.
 
-    `skin` is what no other class claims, so the captures' `neck_other` is in it.
+    `skin` is the rest, with `neck_other` of the captures in it.
     """
-    claimed = {
+    memberships = {
         label: np.max([np.clip(group(data, name), 0, 1) for name in sources], axis=0)
         for label, sources in _SOURCES.items()
     }
-    shares = np.stack([claimed.get(label, np.zeros(len(data.template_vertex_positions))) for label in CLASSES], 1)
+    shares = np.stack([memberships.get(label, np.zeros(len(data.template_vertex_positions))) for label in CLASSES], 1)
     shares[:, 0] = np.clip(1 - shares.sum(1), 0, 1)
     return CLASSES, (shares / shares.sum(1, keepdims=True)).astype(np.float32)
 
@@ -57,43 +57,43 @@ def neck_other(data: GNMData) -> Bool[np.ndarray, "V"]:
 
 
 def exterior(data: GNMData) -> Bool[np.ndarray, "V"]:
-    """The skin that can be seen from outside, lips and lid rims with it, and so may carry offsets.
+    """Skin that is visible from outside, with lips and eyelid rims, and may have offsets.
 
-    Sockets, nostril and mouth linings are not in it, nor are the eyeballs, which move but keep their shape.
+    Eye sockets, the lining of nostrils and mouth, and the eyeballs, which move rigidly, are not in it.
     """
     return group(data, "skin_exterior") > _INSIDE
 
 
 def components(data: GNMData) -> Int[np.ndarray, "V"]:
-    """Each vertex' index into `mesh_component_names`. Raises InputError for a vertex of no component."""
+    """Return each vertex' index into `mesh_component_names`. Raises InputError for a vertex of no component."""
     weights = np.stack([group(data, name) for name in data.mesh_component_names.tolist()])
-    lost = np.flatnonzero(weights.max(0) <= _INSIDE)
-    if len(lost):
+    missing = np.flatnonzero(weights.max(0) <= _INSIDE)
+    if len(missing):
         raise InputError(
-            "some vertices belong to no mesh component",
+            "Some vertices belong to no mesh component",
             where="vertex_groups, mesh_component_names",
             expected="every vertex in the vertex group of one component",
-            got=f"{len(lost)} vertices in none, first {lost[0]}",
+            got=f"{len(missing)} vertices in none, first {missing[0]}",
             fix="use a model file whose components' vertex groups cover the mesh",
         )
     return weights.argmax(0)
 
 
 def solids(data: GNMData) -> dict[str, Int[np.ndarray, "_ 3"]]:
-    """The triangles of what can be run into: skin, left eye, right eye, teeth with their gums, tongue."""
+    """Triangles of the parts that must not intersect: skin, left eye, right eye, teeth with their gums, tongue."""
     upper, lower = "upper_teeth_and_gums", "lower_teeth_and_gums"
     roles = {"skin": ("skin",), "left eye": ("left_eye",), "right eye": ("right_eye",), "teeth": (upper, lower)}
-    found = {}
+    triangles = {}
     for role, names in (roles | {"tongue": ("tongue",)}).items():
         members = np.max([group(data, name) for name in names], axis=0) > _INSIDE
-        found[role] = data.triangles[members[data.triangles].all(1)].astype(np.int64)
-    return found
+        triangles[role] = data.triangles[members[data.triangles].all(1)].astype(np.int64)
+    return triangles
 
 
 def crossing_parts(data: GNMData) -> Int[np.ndarray, "F"]:
-    """For each triangle the number of its part: parts may run through one another, faces of one part do not.
+    """Return each triangle's part number: intersections are searched between parts, not within one.
 
-    The components of the mesh are parts, and so are the lips.
+    Parts are the components of the mesh and both lips.
     """
     lips = [group(data, name)[data.triangles].min(1) > 0.5 for name in ("upper_lip", "lower_lip")]
     parts = components(data)[data.triangles[:, 0]]
@@ -109,22 +109,22 @@ def eyeball_shells(data: GNMData) -> tuple[Bool[np.ndarray, "V"], Bool[np.ndarra
 
 
 def eyeballs(data: GNMData) -> tuple[Bool[np.ndarray, "V"], Bool[np.ndarray, "V"]]:
-    """The left and the right eyeball, all of each."""
+    """The left and the right eyeball, complete."""
     return group(data, "left_eye") > _INSIDE, group(data, "right_eye") > _INSIDE
 
 
 def skin(data: GNMData) -> Bool[np.ndarray, "V"]:
-    """All skin, linings included: what is neither eyeball nor tooth, gum or tongue."""
+    """All skin, with inner surfaces: all but eyeballs, teeth, gums and tongue."""
     return group(data, "skin") > _INSIDE
 
 
 def lower_teeth(data: GNMData) -> Bool[np.ndarray, "V"]:
-    """Lower teeth with their gums: they move with the jaw, and tell how it moves."""
+    """Lower teeth with their gums, which move rigidly with the jaw."""
     return group(data, "lower_teeth_and_gums") > _INSIDE
 
 
 def jaw_parts(data: GNMData) -> Bool[np.ndarray, "V"]:
-    """What moves with the jaw though it is no skin: lower teeth with their gums, and the tongue."""
+    """Parts other than skin that move with the jaw: lower teeth with their gums, and the tongue."""
     return lower_teeth(data) | tongue(data)
 
 
@@ -162,13 +162,13 @@ def palate(data: GNMData) -> Bool[np.ndarray, "V"]:
 
 def gums(data: GNMData) -> tuple[Bool[np.ndarray, "V"], Bool[np.ndarray, "V"]]:
     """Upper and lower gums, each without its teeth."""
-    found = group(data, "gums") > _INSIDE
+    gums = group(data, "gums") > _INSIDE
     upper = group(data, "upper_teeth_and_gums") > _INSIDE
-    return found & upper, found & ~upper
+    return gums & upper, gums & ~upper
 
 
 def mouth_lining(data: GNMData) -> Bool[np.ndarray, "V"]:
-    """The inside of lips and cheeks; skin, but not exterior. Empty in a model whose mouth stays shut."""
+    """The inside of lips and cheeks: skin that is not exterior. Empty in a model without oral cavity."""
     return group(data, "mouth_sock") > _INSIDE
 
 
@@ -179,26 +179,26 @@ def lids(data: GNMData) -> Float[np.ndarray, "V"]:
 
 
 def inner_lips(data: GNMData) -> Float[np.ndarray, "V"]:
-    """The part of the lips that a closed mouth hides: 1 within 2 mm of the mouth's lining, 0 beyond 5 mm."""
+    """The part of the lips that is hidden in a closed mouth: 1 within 2 mm of the mouth's lining, 0 beyond 5 mm."""
     lips = np.clip(group(data, "upper_lip") + group(data, "lower_lip"), 0, 1)
     return lips * _nearness(data, group(data, "mouth_sock") > _INSIDE, 2e-3, 5e-3)
 
 
 def blush(data: GNMData) -> Float[np.ndarray, "V"]:
-    """Where skin changes its colour with expression and effort: the cheeks, up to the cheekbones and the eyes."""
+    """Skin whose colour changes with expression and effort: the cheeks, up to the cheekbones and the eyes."""
     names = ("cheek", "zygomatic", "infraorbital")
     groups = [group(data, f"{side}_{name}_region") for side in ("left", "right") for name in names]
     return np.clip(np.max(groups, axis=0), 0, 1)
 
 
 def nostrils(data: GNMData) -> Bool[np.ndarray, "V"]:
-    """The lining of the nostrils: skin that is neither exterior nor of the mouth nor behind the eyes."""
+    """The inner surface of the nostrils: skin that is neither exterior nor in the mouth or the eye sockets."""
     other = (group(data, "mouth_sock") > _INSIDE) | (group(data, "eye_sockets") > _INSIDE)
     return (group(data, "skin") > _INSIDE) & ~exterior(data) & ~other
 
 
 def offset_regions(data: GNMData) -> dict[str, Bool[np.ndarray, "V"]]:
-    """Parts of the skin whose offsets a recipe may treat on their own, by name."""
+    """Regions of the skin for which a recipe may have settings of its own, by name."""
     lips = (group(data, "upper_lip") > _INSIDE) | (group(data, "lower_lip") > _INSIDE)
     linings = (group(data, "mouth_sock") > _INSIDE) | (group(data, "eye_sockets") > _INSIDE)
     return {
@@ -211,23 +211,23 @@ def offset_regions(data: GNMData) -> dict[str, Bool[np.ndarray, "V"]]:
 
 
 def skull_skin(data: GNMData) -> Bool[np.ndarray, "V"]:
-    """Skin that may lie still on the skull: the exterior without the neck and the nape, which stay with the body, and
-    without what jaw, mouth and cheeks move: lips, chin, cheeks up to the eye's rim, and the skin before the ears."""
+    """Skin that may be at rest on the skull: the exterior without neck and nape, which follow the body, and without
+    the skin that jaw, mouth and cheeks move: lips, chin, cheeks up to the eyelids, and the skin before the ears."""
     sides = [f"{side}_{name}_region" for name in ("infraorbital", "cheek", "parotid") for side in ("left", "right")]
     moving = _any(data, (*_MOUTH, *sides))
     return exterior(data) & ~neck_other(data) & ~moving
 
 
 def head_skin(data: GNMData) -> Bool[np.ndarray, "V"]:
-    """Skin that head shape is measured on: the exterior without the neck, which turns at a joint of its own."""
+    """Skin on which head shape is measured: the exterior without the neck, which rotates at its own joint."""
     return exterior(data) & ~neck_other(data)
 
 
 def head_regions(data: GNMData) -> dict[str, Bool[np.ndarray, "V"]]:
-    """Parts of `head_skin` that figures are split by; they may overlap and need not cover it."""
+    """Regions of `head_skin` for which metrics are given; they may overlap and need not cover it."""
     parts = stabilization_regions(data)
     back = parts.pop("neck_back")
-    found = {
+    regions = {
         "face": group(data, "hockey_mask") > _INSIDE,
         **parts,
         "forehead": group(data, "forehead_region") > _INSIDE,
@@ -235,7 +235,7 @@ def head_regions(data: GNMData) -> dict[str, Bool[np.ndarray, "V"]]:
         "ears": ears(data),
         "back": back,
     }
-    return {name: members & head_skin(data) for name, members in found.items()}
+    return {name: members & head_skin(data) for name, members in regions.items()}
 
 
 _EXPRESSION_GROUPS = {  # region of an expression component's name -> the group that holds its soft mask
@@ -246,27 +246,27 @@ _EXPRESSION_GROUPS = {  # region of an expression component's name -> the group 
 
 
 def expression_regions(data: GNMData) -> dict[str, tuple[Int[np.ndarray, "K"], Float[np.ndarray, "V"]]]:
-    """Of each region of the skin that expressions are modelled in: its components, by number, and its soft mask.
+    """Return, for each region of the expression basis, the indices of its components and its soft mask.
 
-    Left eye, right eye, lower face; a region of which the file names no component is left out.
+    Left eye, right eye, lower face; regions without a component in the file are missing.
     """
     names = data.expression_names.tolist()
-    found = {}
+    regions = {}
     for region, source in _EXPRESSION_GROUPS.items():
         members = [k for k, name in enumerate(names) if name.startswith(region)]
         if members:
-            found[region.removesuffix("_region")] = (np.array(members), np.clip(group(data, source), 0, 1))
-    return found
+            regions[region.removesuffix("_region")] = (np.array(members), np.clip(group(data, source), 0, 1))
+    return regions
 
 
 _MOUTH = ("upper_lip", "lower_lip", "upper_lip_region", "lower_lip_region", "chin_region")
-STEADY_REGIONS = ("nose", "neck_back")  # of `stabilization_regions`: where expressions move the skin least
+REFERENCE_REGIONS = ("nose", "neck_back")  # of `stabilization_regions`: where expressions move the skin least
 
 
 def stabilization_regions(data: GNMData) -> dict[str, Bool[np.ndarray, "V"]]:
-    """The five regions in which a person looks for motion of the whole head [GNM, Head Expression]; all exterior.
+    """The five regions in which an operator looks for motion of the whole head [GNM, Head Expression]; all exterior.
 
-    They may overlap, where cheeks meet lower lids, and leave ears and forehead out.
+    They overlap where cheeks meet lower eyelids, and do not contain ears and forehead.
     """
     sides = [f"{side}_{name}_region" for name in ("infraorbital", "cheek") for side in ("left", "right")]
     face = ("hockey_mask", "ears", "forehead_region")
@@ -276,8 +276,8 @@ def stabilization_regions(data: GNMData) -> dict[str, Bool[np.ndarray, "V"]]:
         "nose": ("nose_region",),
         "mouth": (*_MOUTH, *sides),
     }
-    found = {name: _any(data, groups) & exterior(data) for name, groups in sources.items()}
-    return found | {"neck_back": exterior(data) & ~_any(data, face)}
+    regions = {name: _any(data, groups) & exterior(data) for name, groups in sources.items()}
+    return regions | {"neck_back": exterior(data) & ~_any(data, face)}
 
 
 def _any(data: GNMData, names: tuple[str, ...]) -> Bool[np.ndarray, "V"]:
@@ -285,7 +285,7 @@ def _any(data: GNMData, names: tuple[str, ...]) -> Bool[np.ndarray, "V"]:
 
 
 def _nearness(data: GNMData, members: Bool[np.ndarray, "V"], near: float, far: float) -> Float[np.ndarray, "V"]:
-    """1 up to `near` (metres, in the template) from the nearest member, falling to 0 at `far`."""
+    """1 within `near` (metres, in the template) of the nearest member, decreasing to 0 at `far`."""
     points = data.template_vertex_positions
     if not members.any():
         return np.zeros(len(points), np.float32)

@@ -107,7 +107,7 @@ def regional_components(
     """
     settings = settings or Regional()
     _check(displacements, labels)
-    steady = [_twists(displacements, head.regions[name], head) for name in regions.STEADY_REGIONS]
+    steady = [_twists(displacements, head.regions[name], head) for name in regions.REFERENCE_REGIONS]
     return [_components(displacements, labels, name, steady, head, settings) for name in head.regions]
 
 

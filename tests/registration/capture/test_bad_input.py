@@ -285,17 +285,17 @@ def scan_not_finite(root: Path) -> None:
     (root / "scan.ply").write_text(head + "nan 0 0\n1 0 0\n0 1 0\n")
 
 
-@bad("The ground truth cannot be used", where="ground_truth.npz", got="allow_pickle=False", fix="np.savez")
+@bad("ground truth's field 'extra' cannot be read", where="ground_truth.npz", got="allow_pickle=False", fix="np.savez")
 def ground_truth_with_a_pickle(root: Path) -> None:
     np.savez(root / "ground_truth.npz", vertices=np.zeros((3, 3)), extra=np.array([{}], object))
 
 
-@bad("The ground truth cannot be used", where="ground_truth.npz", got="points", fix="np.savez")
+@bad("ground truth's field 'vertices' is missing", where="ground_truth.npz", got="missing: vertices", fix="np.savez")
 def ground_truth_without_vertices(root: Path) -> None:
     np.savez(root / "ground_truth.npz", points=np.zeros((3, 3)))
 
 
-@bad("The ground truth cannot be used", where="ground_truth.npz", got="row 1", fix="np.savez")
+@bad("ground truth's field 'vertices' has a wrong value", where="ground_truth.npz", got="at (1, 1)", fix="np.savez")
 def ground_truth_not_finite(root: Path) -> None:
     np.savez(root / "ground_truth.npz", vertices=np.array([[0, 0, 0], [0, np.inf, 0.0]]))
 

@@ -212,7 +212,7 @@ def test_parts_that_touch_of_the_full_head(full):
 def test_stabilization_regions_are_exterior_and_mirrored(tiny):
     found = regions.stabilization_regions(tiny)
     assert list(found) == ["left_periocular", "right_periocular", "nose", "mouth", "neck_back"]
-    assert set(regions.STEADY_REGIONS) < set(found)
+    assert set(regions.REFERENCE_REGIONS) < set(found)
     exterior, mirror = regions.exterior(tiny), tiny.mirror_indices
     for mask in found.values():
         assert mask.any() and exterior[mask].all()
