@@ -45,7 +45,7 @@ def test_input_errors_are_printed_without_a_traceback(
         ("--views 0", "number of cameras"),
         ("--size 480 20000", "image size"),
         ("--size 0 10", "image size"),
-        ("--views 500 --size 8000 8000", "too many and too large"),
+        ("--views 500 --size 8000 8000", "too many pixels"),
         ("--seed -1", "seed"),
         ("--expression grin", "no such expression"),
         ("--target nose", "NAME=WEIGHT"),
