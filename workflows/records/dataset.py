@@ -156,10 +156,10 @@ def _record(folder: Path) -> DatasetRecord | None:
     return record
 
 
-def _check_labels(folder: Path, labels: Mapping[str, str], known: Mapping[str, str]) -> None:
+def _check_labels(folder: Path, labels: Mapping[str, str], categories: Mapping[str, str]) -> None:
     for where, label in labels.items():
-        if label != NEUTRAL and label not in known:
-            expected = ", ".join(sorted(known)) or "neutrals only"
+        if label != NEUTRAL and label not in categories:
+            expected = ", ".join(sorted(categories)) or "neutrals only"
             raise _input_error(
                 "A label is unknown", folder / where, f"one of {MANIFEST}'s categories: {expected}", label
             )

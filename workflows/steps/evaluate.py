@@ -68,14 +68,14 @@ def evaluate_models(
     check_out(out)
     named = model_paths if isinstance(model_paths, Mapping) else _named(model_paths)
     models = {name: gnm_npz.read(path) for name, path in named.items()}
-    people = read_held_out(held_out, captures)
-    check(models, people.subjects, people.triangles, settings)
-    inputs = {**{f"model {name}": gnm_npz.content_hash(data) for name, data in models.items()}, **people.inputs}
+    subjects = read_held_out(held_out, captures)
+    check(models, subjects.subjects, subjects.triangles, settings)
+    inputs = {**{f"model {name}": gnm_npz.content_hash(data) for name, data in models.items()}, **subjects.inputs}
     digest, file = input_hash(inputs, to_jsonable(settings)), Path(out) / MANIFEST
     existing = EvaluationManifest.read(file) if file.is_file() and not force else None
     if existing is not None and existing.input_hash == digest:
         return existing
-    evaluation = evaluate(models, people.subjects, people.triangles, settings, progress)
+    evaluation = evaluate(models, subjects.subjects, subjects.triangles, settings, progress)
     manifest = EvaluationManifest(
         input_hash=digest,
         figures=to_jsonable(evaluation.metrics),
@@ -180,7 +180,7 @@ def _write(manifest: EvaluationManifest, evaluation: ModelEvaluation, models: Ma
     """Write or replace the folder in one rename."""
     with atomic_directory(out) as temporary:
         manifest.write(temporary / MANIFEST)
-        distances = {name: one.vertex_mm.astype(np.float32) for name, one in evaluation.models.items()}
+        distances = {name: model.vertex_mm.astype(np.float32) for name, model in evaluation.models.items()}
         np.savez(
             temporary / VERTICES,
             allow_pickle=False,

@@ -53,21 +53,19 @@ def hold_out(
     product = Product(Path(out), input_hash(digests, {"categories": source.categories}), HoldOutResult)
     if (existing := product.find()) is not None and file.is_file():
         return replace(existing, people=str(file)).to_json()
-    people, lost, skin = [], list[str](), SkullSkin.of(data)
+    subjects, lost, skin = [], list[str](), SkullSkin.of(data)
     for name in names:
         meshes = true_meshes(source.subjects[name], data) if name in with_truths else None
         meshes = meshes or registered_meshes(Path(registrations) / name, data)
         if meshes is None:
             lost.append(name)
             continue
-        people.append(held_out(name, meshes, skin, source.categories, source.tags(name)))
-    write_held_out(people, data.triangles, file)
+        subjects.append(held_out(name, meshes, skin, source.categories, source.tags(name)))
+    write_held_out(subjects, data.triangles, file)
     result = HoldOutResult(
         input_hash=product.input_hash,
         people=str(file),
-        sources={
-            subject.subject: "true meshes" if subject.subject in with_truths else "registrations" for subject in people
-        },
+        sources={s.subject: "true meshes" if s.subject in with_truths else "registrations" for s in subjects},
         lost=tuple(lost),
     )
     product.write(result)
