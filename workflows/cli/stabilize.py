@@ -33,7 +33,7 @@ def stabilize(
         force: Stabilize again although the folder holds the result of the same input.
     """
     from registration.progress import console_progress
-    from workflows.records.run import known_model
+    from workflows.records.run import Selection, known_model
     from workflows.steps.stabilize import stabilize_run
 
     with console_progress() as progress:
@@ -42,8 +42,8 @@ def stabilize(
             model_path=model or known_model(run),
             out=out,
             decisions=decisions,
-            skip_failed=skip_failed,
-            force=force,
+            selection=Selection(skip_failed=skip_failed),
+            reuse="none" if force else "same inputs",
             progress=progress,
         )
     figures = outcome.figures

@@ -46,16 +46,21 @@ class StabilizationInputs:
             yield subject_meshes(subject.subject, load_registration(folder / subject.neutral), expressions, self.skin)
 
 
-def read_run(
-    folder: Path, data: GNMData, *, skip_failed: bool = False, only: Collection[str] | None = None
-) -> StabilizationInputs:
+@dataclass(frozen=True, kw_only=True)
+class Selection:
+    """Which registrations of a run are used."""
+
+    skip_failed: bool = False  # exclude failed registrations instead of refusing the run
+    only: Collection[str] | None = None  # names of the subject folders to use; None: all
+
+
+def read_run(folder: Path, data: GNMData, selection: Selection = Selection()) -> StabilizationInputs:  # noqa: B008
     """Read and check the subjects of a run, in natural order of their folders' names.
 
     Args:
         folder: holds subject folders, or is one.
         data: the model that the captures were registered with.
-        skip_failed: exclude failed registrations instead of refusing them.
-        only: names of the subject folders to read; None: all.
+        selection: of subject folders and registrations.
 
     Raises:
         InputError: there is no subject; a `subject.json` is malformed; a subject has no usable neutral or no
@@ -63,8 +68,8 @@ def read_run(
             is not finite.
     """
     skin, topology = SkullSkin.of(data), gnm_npz.topology_hash(data.triangles)
-    folders = [path for path in _subject_folders(folder) if only is None or path.name in only]
-    subjects = tuple(_subject(path, skip_failed) for path in folders)
+    folders = [path for path in _subject_folders(folder) if selection.only is None or path.name in selection.only]
+    subjects = tuple(_subject(path, selection.skip_failed) for path in folders)
     inputs = {"model": gnm_npz.content_hash(data)}
     for subject in subjects:
         for name in (subject.neutral, *(name for name, _ in subject.expressions)):

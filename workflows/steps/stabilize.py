@@ -1,9 +1,9 @@
 """`gnmreg stabilize`, also as a step: both stages over a run's registrations, with one subject in memory at a time."""
 
-from collections.abc import Collection, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
@@ -26,11 +26,12 @@ from registration.stabilize.stabilized_folder import StoredComponents
 from registration.storage.hashing import input_hash, to_jsonable, versions
 from workflows.pages.stabilization import write_stabilize_page
 from workflows.records.decisions import read_decisions
-from workflows.records.run import STABILIZED, StabilizationInputs, read_run
+from workflows.records.run import STABILIZED, Selection, StabilizationInputs, read_run
 from workflows.records.step_results import StabilizeResult
 from workflows.records.subject import read_usable
 
 LOG = "decisions.jsonl"  # within the run
+Reuse = Literal["same inputs", "any decisions", "none"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -49,10 +50,8 @@ def stabilize_run(
     out: Path | None = None,
     decisions: Path | None = None,
     settings: Stabilization | None = None,
-    skip_failed: bool = False,
-    only: Collection[str] | None = None,
-    force: bool = False,
-    whatever_decided: bool = False,
+    selection: Selection = Selection(),  # noqa: B008  frozen
+    reuse: Reuse = "same inputs",
     progress: Progress | None = None,
 ) -> StabilizationResult:
     """Stabilize all registrations of a run and write the stabilized set (docs/formats.md).
@@ -63,10 +62,9 @@ def stabilize_run(
         out: folder of the stabilized set; None: RUN/stabilized. A set of the same inputs is kept.
         decisions: log of decisions about components; None: none.
         settings: of both stages.
-        skip_failed: exclude failed registrations instead of refusing the run.
-        only: names of the subject folders to use; None: all.
-        force: compute the set again even if there is one of the same inputs.
-        whatever_decided: also keep a set of other decisions: its components are the same.
+        selection: of subject folders and registrations.
+        reuse: which existing set is returned: of the same inputs; also of other decisions, since its components are the
+            same; or none.
         progress: where to report to.
 
     Raises:
@@ -76,15 +74,15 @@ def stabilize_run(
     out = Path(run) / STABILIZED if out is None else Path(out)
     data = gnm_npz.read(model_path)
     head = Head.of(data)
-    inputs = read_run(run, data, skip_failed=skip_failed, only=only)
+    inputs = read_run(run, data, selection)
     disk.check_out(out)
     _check_count(inputs, run)
     dataset = input_hash(inputs.inputs, to_jsonable(settings))
     decided = [] if decisions is None else read_decisions(decisions, dataset)
     digest = input_hash(inputs.inputs, {"settings": to_jsonable(settings), "decisions": to_jsonable(decided)})
-    if not force and disk.is_stabilized(out):
+    if reuse != "none" and disk.is_stabilized(out):
         manifest = disk.read_manifest(out)
-        if manifest["input_hash"] == digest or (whatever_decided and manifest["dataset"] == dataset):
+        if manifest["input_hash"] == digest or (reuse == "any decisions" and manifest["dataset"] == dataset):
             return StabilizationResult(out=out, dataset=dataset, figures=manifest["figures"])
     with disk.fresh_set(out) as temporary:
         ids, components, effect = _write_subjects(temporary, inputs, data, head, settings, decided, progress)
@@ -132,7 +130,11 @@ def stabilize_subjects(
     if total < LEAST_SAMPLES:
         return StabilizeResult(out=None, reason=f"{total} expressions of {len(names)} subjects").to_json()
     result = stabilize_run(
-        Path(run), model_path=Path(model), out=Path(out), skip_failed=True, only=tuple(counts), progress=progress
+        Path(run),
+        model_path=Path(model),
+        out=Path(out),
+        selection=Selection(skip_failed=True, only=tuple(counts)),
+        progress=progress,
     )
     manifest = disk.read_manifest(result.out)
     return StabilizeResult(

@@ -15,6 +15,7 @@ from registration.stabilize import stabilized_folder as disk
 from registration.stabilize.components import Components, Head
 from registration.stabilize.decisions import ACTIONS
 from workflows.records.decisions import read_decisions
+from workflows.records.run import Selection
 from workflows.steps.stabilize import LOG, stabilize_run
 from workflows.web import panels
 from workflows.web.glb import AMPLITUDE_SIGMAS, animated_glb
@@ -40,7 +41,12 @@ def review(
         InputError: as `stabilize_run`; the log at `decisions` belongs to another dataset; the port is in use.
     """
     outcome = stabilize_run(
-        run, model_path=model_path, out=out, skip_failed=skip_failed, whatever_decided=True, progress=progress
+        run,
+        model_path=model_path,
+        out=out,
+        selection=Selection(skip_failed=skip_failed),
+        reuse="any decisions",
+        progress=progress,
     )
     log = Path(run) / LOG if decisions is None else Path(decisions)
     saved = read_decisions(log, outcome.dataset) if log.is_file() else []

@@ -17,7 +17,7 @@ from tests.coregister.conftest import anatomy, model, model_file, source, wheel 
 from tests.registration.stabilize import runs
 from workflows.cli.app import main
 from workflows.records.decisions import append_decisions, read_decisions
-from workflows.records.run import read_run
+from workflows.records.run import Selection, read_run
 from workflows.steps.stabilize import stabilize_run
 
 NAMES = ("smile", "jaw_open", "brows_up")
@@ -177,7 +177,7 @@ def test_bad_runs_are_told_before_any_work(own, spoil, what, model_file, monkeyp
 
 def test_failed_registrations_can_be_left_out(own, model_file):  # noqa: F811
     spoil_status(own)
-    outcome = stabilize_run(own, model_path=model_file, skip_failed=True)
+    outcome = stabilize_run(own, model_path=model_file, selection=Selection(skip_failed=True))
     manifest = disk.read_manifest(outcome.out)
     assert outcome.figures["samples"] == 5 and manifest["left_out"] == {"synth_0001": ["smile"]}
 
