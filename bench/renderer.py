@@ -196,8 +196,8 @@ def measure_stock(case: Case) -> dict[str, float]:
 
 
 def _stages(renderer: type, scene: type) -> list[tuple[type, str]]:
-    adjoint = ("_interior_gradients", "_edge_gradients", "_crossing_gradients")
-    return [(scene, "move"), (renderer, "_draw"), *((renderer, name) for name in adjoint)]
+    adjoint = ("_interior_gradients", "_silhouette_gradients", "_intersection_gradients")
+    return [(scene, "update_vertices"), (renderer, "_render"), *((renderer, name) for name in adjoint)]
 
 
 def misses(case: Case, iterations: int = 5) -> int:

@@ -1,4 +1,4 @@
-"""Which Mitsuba variant runs: LLVM on the CPU or CUDA, chosen once per process."""
+"""The choice of the Mitsuba variant, LLVM on the CPU or CUDA, once per process."""
 
 from typing import Literal
 
@@ -8,12 +8,18 @@ Variant = Literal["llvm", "cuda"]
 
 
 def activate(variant: Variant = "llvm", *, deterministic: bool = False) -> torch.device:
-    """Select the variant and return the torch device whose memory it shares.
+    """Set the Mitsuba variant, torch's deterministic mode and the number of threads.
 
-    Sums over pixels run in a fixed order, so on the CPU two runs were equal bit for bit with any mode; a difference in
-    the last bit would grow to tenths of a millimetre within a fit. What is left to chance is the order in which threads
-    build the BVH: `deterministic` takes that away too, with one thread, for about twice the time. On CUDA torch's sums
-    stay unordered, and equality is no promise.
+    Sums over pixels have a fixed order, because a difference in the last bit would grow to tenths of a millimetre
+    within a fit. On the CPU only the order in which threads build the BVH is left undefined.
+
+    Args:
+        variant: `llvm` (CPU) or `cuda`.
+        deterministic: use one thread, which also fixes the order of BVH builds, for about twice the time. On CUDA
+            torch's sums stay unordered, and results may differ.
+
+    Returns:
+        The torch device whose memory the variant shares.
 
     Raises:
         InputError: no usable libLLVM (`llvm`), or no CUDA device (`cuda`).
@@ -35,10 +41,10 @@ def activate(variant: Variant = "llvm", *, deterministic: bool = False) -> torch
     import mitsuba as mi
 
     mi.set_variant(f"{variant}_ad_rgb")
-    # What use_deterministic_algorithms does, but for seconds of importing its compiler, which is not used here.
+    # Equals use_deterministic_algorithms, which would import torch's compiler for seconds.
     torch.set_deterministic_debug_mode("warn" if variant == "cuda" else "error")
     torch.utils.deterministic.fill_uninitialized_memory = False  # type: ignore[attr-defined]
     if deterministic:
         torch.set_num_threads(1)
-    dr.set_thread_count(torch.get_num_threads())  # OMP_NUM_THREADS is for both: processes side by side share the cores
+    dr.set_thread_count(torch.get_num_threads())  # OMP_NUM_THREADS holds for both: processes share the cores
     return torch.device("cuda" if variant == "cuda" else "cpu")

@@ -1,15 +1,16 @@
-"""The gradient of curves in which parts of the mesh run through one another: lids and eyeballs, gums and teeth, lips.
+"""The gradient of the curves in which parts of the mesh intersect: lids and eyeballs, gums and teeth, lips.
 
-Such a curve bounds what is seen as a silhouette does, but no edge of the mesh marks it. It is found between the centres
-of neighbouring pixels that see different parts: a few rays halve the way from one to the other until faces f and h lie
-close to either side of the change. Along the line 1 / depth of a face's plane is linear, so that the planes meet at
+Such a curve is a discontinuity of the image like a silhouette, but not an edge of the mesh. It is located between the
+centres of neighbouring pixels that see different parts: bisection with a few rays gives faces f and h close to either
+side of the change. 1 / depth of a face's plane is linear along the line between the centres, so that the planes
+intersect at
 
     s = D_1 / (D_1 - D_2),   D = 1 / depth_f - 1 / depth_h
 
-D_1 at the first centre, D_2 at the second. If that is where the change is and f is the nearer before it, they run
-through one another there; else one hides the other, and the silhouettes know. A
-curve that is steeper than 45 degrees in the image is counted where it crosses rows, any other where it crosses columns:
-each such point stands for one pixel of the curve's extent, and with the adjoint g of the pixel that it lies in
+with D_1 at the first centre and D_2 at the second. If the change is there and f is nearer before it, the parts
+intersect; otherwise one occludes the other, which `silhouette.py` handles. A curve steeper than 45 degrees in the image
+is sampled where it crosses rows, any other where it crosses columns: each point stands for one pixel of the curve's
+extent, and with the adjoint g of the pixel that contains it
 
     dLoss = g . (value_f - value_h) ds,   ds = dD / (D_1 - D_2),
     dD = (sum_j b_hj <n_h, dx_hj> / <n_h, d> - sum_j b_fj <n_f, dx_fj> / <n_f, d>) / depth^2
@@ -17,7 +18,7 @@ each such point stands for one pixel of the curve's extent, and with the adjoint
 where d is the ray's direction, b are barycentrics and n normals of the faces there, and j runs over their corners.
 """
 
-from __future__ import annotations  # mi.Float exists only once a variant is chosen
+from __future__ import annotations  # mi.Float exists only after a variant is set
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -28,157 +29,174 @@ import mitsuba as mi
 from registration.render.adjoint import Adjoint, RowSum
 from registration.render.cameras import CameraLanes, PixelList
 from registration.render.scene import TriangleScene
-from registration.render.shading import NO_FACE, Drawn, Hits, Surface
+from registration.render.shading import NO_FACE, ForwardState, Hits, RenderMesh
 
-_HALVINGS = 6  # of the way between two pixels' centres
-_SLACK = 0.03  # of the barycentrics of a point that still counts as one of the face
+_BISECTIONS = 6  # of the segment between two pixels' centres
+_TOLERANCE = 0.03  # by which barycentrics of a point in the face may be negative
 
 
 @dataclass(frozen=True, kw_only=True)
 class _Side:
-    """A face on one side of a crossing, seen along a camera's rays."""
+    """A face on one side of an intersection curve, relative to a camera."""
 
     face: mi.UInt32
     normal: mi.Vector3f  # not unit
-    reach: mi.Float  # <normal, plane - centre>
+    distance: mi.Float  # <normal, p - camera centre>, p in the plane; in lengths of the normal
 
     @classmethod
-    def of(cls, surface: Surface, face: mi.UInt32, centre: mi.Point3f) -> _Side:
-        normal, offset = surface.plane(face)
-        return cls(face=face, normal=normal, reach=offset - dr.dot(normal, centre))
+    def create(cls, mesh: RenderMesh, face: mi.UInt32, centre: mi.Point3f) -> _Side:
+        normal, offset = mesh.plane(face)
+        return cls(face=face, normal=normal, distance=offset - dr.dot(normal, centre))
 
-    def shares(self, surface: Surface, centre: mi.Point3f, direction: mi.Vector3f) -> list[mi.Float]:
-        """Barycentrics of where a ray meets the plane."""
-        p0, p1, p2 = (surface.position(vertex) for vertex in surface.corners(self.face))
-        x = centre + direction / self.nearness(direction) - p0
+    def barycentric(self, mesh: RenderMesh, centre: mi.Point3f, direction: mi.Vector3f) -> list[mi.Float]:
+        """Return the barycentric coordinates of a ray's intersection with the plane."""
+        p0, p1, p2 = (mesh.position(vertex) for vertex in mesh.corners(self.face))
+        x = centre + direction / self.inverse_depth(direction) - p0
         scale = dr.rcp(dr.squared_norm(self.normal))
         b1 = dr.dot(dr.cross(x, p2 - p0), self.normal) * scale
         b2 = dr.dot(dr.cross(p1 - p0, x), self.normal) * scale
         return [1 - b1 - b2, b1, b2]
 
-    def nearness(self, direction: mi.Vector3f) -> mi.Float:
-        """1 / depth of the plane along a ray."""
-        return dr.dot(self.normal, direction) / self.reach
+    def inverse_depth(self, direction: mi.Vector3f) -> mi.Float:
+        """Return 1 / depth of the plane along a ray."""
+        return dr.dot(self.normal, direction) / self.distance
 
 
-def backward(scene: TriangleScene, drawn: Drawn, parts: mi.UInt32, adjoint: Adjoint, vertices: RowSum) -> None:
-    """Add the crossings' part of d(adjoint . image) to the gradient of positions.
+@dataclass(frozen=True, kw_only=True)
+class _Pairs:
+    """Neighbouring pixels that see different parts, each pair once."""
 
-    `parts` (F,) numbers the parts of the mesh; part 0 covers most of what is seen.
+    pixel: mi.UInt32  # indices in the list of pixels
+    other: mi.UInt32
+    step: mi.Vector2f  # from pixel to other, px
+
+
+def backward(scene: TriangleScene, state: ForwardState, parts: mi.UInt32, adjoint: Adjoint, vertices: RowSum) -> None:
+    """Add the intersection curves' part of d(adjoint . image).
+
+    Args:
+        scene: the mesh for ray casting.
+        state: of the forward rendering.
+        parts: (F,) part of each face; part 0 is the largest.
+        adjoint: of the image.
+        vertices: gradients of positions (columns 0 to 2).
     """
-    for hits in drawn.hits:
+    for hits in state.hits:
         if hits.count:
-            pixel, other, step = _pairs(parts, drawn.pixels, hits)
-            if dr.width(pixel):
-                _cross(scene, drawn, parts, hits, pixel, other, step, adjoint, vertices)
+            pairs = _find_pairs(parts, state.pixels, hits)
+            if dr.width(pairs.pixel):
+                _add_gradients(scene, state, parts, hits, pairs, adjoint, vertices)
                 dr.eval(vertices.total)
 
 
-def _pairs(parts: mi.UInt32, pixels: PixelList, hits: Hits) -> tuple[mi.UInt32, mi.UInt32, mi.Vector2f]:
-    """Neighbours that see different parts, each pair once: two places in the list, and the step between them (px)."""
-    own = dr.compress(hits.small)
-    if dr.width(own) == 0:
-        return own, own, mi.Vector2f(0)
-    count = dr.opaque(mi.UInt32, dr.width(own))
-    lane = dr.arange(mi.UInt32, 4 * dr.width(own))
-    turn = lane // count
-    pixel = dr.gather(mi.UInt32, own, lane - turn * count)
-    ahead = mi.Float(1) - 2 * mi.Float(turn >> 1)  # right and down, then left and up
-    step = dr.select((turn & 1) == 0, mi.Vector2f(ahead, 0), mi.Vector2f(0, ahead))
+def _find_pairs(parts: mi.UInt32, pixels: PixelList, hits: Hits) -> _Pairs:
+    """Find the pairs of neighbours of which at least one sees a part other than the largest."""
+    small = dr.compress(hits.small)
+    if dr.width(small) == 0:
+        return _Pairs(pixel=small, other=small, step=mi.Vector2f(0))
+    count = dr.opaque(mi.UInt32, dr.width(small))
+    lane = dr.arange(mi.UInt32, 4 * dr.width(small))
+    neighbour = lane // count
+    pixel = dr.gather(mi.UInt32, small, lane - neighbour * count)
+    sign = mi.Float(1) - 2 * mi.Float(neighbour >> 1)  # right and down, then left and up
+    step = dr.select((neighbour & 1) == 0, mi.Vector2f(sign, 0), mi.Vector2f(0, sign))
     view, x, y = (dr.gather(mi.UInt32, values, pixel) for values in (pixels.view, pixels.x, pixels.y))
-    other, listed = pixels.at(view, mi.Point2f(mi.Float(x) + 0.5, mi.Float(y) + 0.5) + step, mi.Bool(True))
+    other, listed = pixels.lookup(view, mi.Point2f(mi.Float(x) + 0.5, mi.Float(y) + 0.5) + step, mi.Bool(True))
     face = dr.gather(mi.UInt32, hits.seen, other, listed)
-    met = listed & (face != NO_FACE)
+    hit = listed & (face != NO_FACE)
     first, second = (
         dr.gather(mi.UInt32, parts, dr.gather(mi.UInt32, hits.seen, pixel)),
-        dr.gather(mi.UInt32, parts, face, met),
+        dr.gather(mi.UInt32, parts, face, hit),
     )
-    # A pair of small parts is met from both of its pixels.
-    differ = met & (first != second) & ((second == 0) | (ahead > 0))
+    # A pair of two small parts is found from both of its pixels: count it once.
+    differ = hit & (first != second) & ((second == 0) | (sign > 0))
     dr.eval(pixel, other, step, differ)
     lanes = dr.compress(differ)
-    return tuple(dr.gather(type(values), values, lanes) for values in (pixel, other, step))
+    pixel, other, step = (dr.gather(type(values), values, lanes) for values in (pixel, other, step))
+    return _Pairs(pixel=pixel, other=other, step=step)
 
 
-def _cross(
+def _add_gradients(
     scene: TriangleScene,
-    drawn: Drawn,
+    state: ForwardState,
     parts: mi.UInt32,
     hits: Hits,
-    pixel: mi.UInt32,
-    other: mi.UInt32,
-    step: mi.Vector2f,
+    pairs: _Pairs,
     adjoint: Adjoint,
     vertices: RowSum,
 ) -> None:
-    surface, pixels = drawn.surface, drawn.pixels
-    view, x, y = (dr.gather(mi.UInt32, values, pixel) for values in (pixels.view, pixels.x, pixels.y))
+    """Add the gradients of the intersection points between pairs of pixels; see the module."""
+    mesh, pixels = state.mesh, state.pixels
+    view, x, y = (dr.gather(mi.UInt32, values, pairs.pixel) for values in (pixels.view, pixels.x, pixels.y))
     camera = pixels.camera(view)
     start = mi.Point2f(mi.Float(x), mi.Float(y)) + dr.opaque(mi.Point2f, hits.offset)
 
     def ray(s: mi.Float) -> mi.Vector3f:
-        point = start + s * step
+        point = start + s * pairs.step
         return camera.direction(point.x, point.y)
 
-    faces, active = _halve(scene, parts, hits.seen, pixel, other, camera.centre, ray)
-    sides = [_Side.of(surface, face, camera.centre) for face in faces]
-    # D at both centres: where f is before h, and behind it.
-    before, after = (sides[0].nearness(ray(s)) - sides[1].nearness(ray(s)) for s in (mi.Float(0), mi.Float(1)))
+    faces, active = _bisect(scene, parts, hits.seen, pairs, camera.centre, ray)
+    sides = [_Side.create(mesh, face, camera.centre) for face in faces]
+    # D at both centres: f is in front of h at the first, behind it at the second.
+    before, after = (
+        sides[0].inverse_depth(ray(s)) - sides[1].inverse_depth(ray(s)) for s in (mi.Float(0), mi.Float(1))
+    )
     s = before / (before - after)
-    active &= (before > after) & (s >= 0) & (s < 1) & _steeper(sides, camera, step) & ~_touch(surface, faces)
+    active &= (
+        (before > after) & (s >= 0) & (s < 1) & _crosses_steeply(sides, camera, pairs.step) & ~_adjacent(mesh, faces)
+    )
     s = dr.select(active, s, 0.5)
-    shares = [side.shares(surface, camera.centre, ray(s)) for side in sides]
-    for value in (*shares[0], *shares[1]):
-        active &= value > -_SLACK
-    values = [drawn.channels(view, face, part) for face, part in zip(faces, shares, strict=True)]
-    jump = adjoint.times([f - h for f, h in zip(*values, strict=True)], dr.select(s < 0.5, pixel, other))
-    weight = drawn.share * jump * dr.square(sides[0].nearness(ray(s))) / (before - after)
-    for side, part, sign in zip(sides, shares, (-1, 1), strict=True):
-        push = sign * weight / dr.dot(side.normal, ray(s)) * side.normal
-        for vertex, b in zip(surface.corners(side.face), part, strict=True):
-            vertices.add(vertex, dr.select(active, b * push, 0))
+    barycentric = [side.barycentric(mesh, camera.centre, ray(s)) for side in sides]
+    for value in (*barycentric[0], *barycentric[1]):
+        active &= value > -_TOLERANCE
+    values = [state.channels(view, face, b) for face, b in zip(faces, barycentric, strict=True)]
+    jump = adjoint.dot([f - h for f, h in zip(*values, strict=True)], dr.select(s < 0.5, pairs.pixel, pairs.other))
+    weight = state.ray_weight * jump * dr.square(sides[0].inverse_depth(ray(s))) / (before - after)
+    for side, weights, sign in zip(sides, barycentric, (-1, 1), strict=True):
+        gradient = sign * weight / dr.dot(side.normal, ray(s)) * side.normal
+        for vertex, b in zip(mesh.corners(side.face), weights, strict=True):
+            vertices.add(vertex, dr.select(active, b * gradient, 0))
 
 
-def _halve(
+def _bisect(
     scene: TriangleScene,
     parts: mi.UInt32,
     seen: mi.UInt32,
-    pixel: mi.UInt32,
-    other: mi.UInt32,
+    pairs: _Pairs,
     centre: mi.Point3f,
     ray: Callable[[mi.Float], mi.Vector3f],
 ) -> tuple[list[mi.UInt32], mi.Bool]:
-    """The faces close to either side of a change of parts, and whether no third part came between."""
-    faces = [dr.gather(mi.UInt32, seen, place) for place in (pixel, other)]
+    """Return faces close to either side of a change of parts, and whether no third part is between them."""
+    faces = [dr.gather(mi.UInt32, seen, pixel) for pixel in (pairs.pixel, pairs.other)]
     first, second = (dr.gather(mi.UInt32, parts, face) for face in faces)
     before, after, active = mi.Float(0), mi.Float(1), mi.Bool(True)
-    for _ in range(_HALVINGS):
+    for _ in range(_BISECTIONS):
         middle = 0.5 * (before + after)
         hit = scene.cast_rays(centre, ray(middle), active, coherent=False)
         active &= hit.is_valid()
         part = dr.gather(mi.UInt32, parts, hit.prim_index, active)
         is_first, is_second = active & (part == first), active & (part == second)
         active &= is_first | is_second
-        faces = [dr.select(here, hit.prim_index, face) for here, face in zip((is_first, is_second), faces, strict=True)]
+        faces = [dr.select(same, hit.prim_index, face) for same, face in zip((is_first, is_second), faces, strict=True)]
         before, after = dr.select(is_first, middle, before), dr.select(is_second, middle, after)
     return faces, active
 
 
-def _steeper(sides: list[_Side], camera: CameraLanes, step: mi.Vector2f) -> mi.Bool:
-    """Whether the step, along rows or columns, is the one that crosses the curve the more steeply."""
+def _crosses_steeply(sides: list[_Side], camera: CameraLanes, step: mi.Vector2f) -> mi.Bool:
+    """Return whether the step's direction, row or column, is the one that crosses the curve more steeply."""
     f, h = sides
     x, y = (
-        dr.abs(dr.dot(f.normal, axis) / f.reach - dr.dot(h.normal, axis) / h.reach) / focal
+        dr.abs(dr.dot(f.normal, axis) / f.distance - dr.dot(h.normal, axis) / h.distance) / focal
         for axis, focal in ((camera.axes[0], camera.fx), (camera.axes[1], camera.fy))
     )
     return dr.select(step.x != 0, x >= y, y > x)
 
 
-def _touch(surface: Surface, faces: list[mi.UInt32]) -> mi.Bool:
-    """Whether two faces share a vertex: then they are one surface, and their values agree where they meet."""
-    first, second = (surface.corners(face) for face in faces)
-    touch = mi.Bool(False)
+def _adjacent(mesh: RenderMesh, faces: list[mi.UInt32]) -> mi.Bool:
+    """Return whether two faces share a vertex: their values are then continuous."""
+    first, second = (mesh.corners(face) for face in faces)
+    adjacent = mi.Bool(False)
     for a in first:
         for b in second:
-            touch |= a == b
-    return touch
+            adjacent |= a == b
+    return adjacent

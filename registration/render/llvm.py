@@ -1,8 +1,8 @@
-"""Finds a libLLVM with which Dr.Jit can render on the CPU, without risking this process.
+"""Selection of a libLLVM with which Dr.Jit can render on the CPU, tested in a child process.
 
 Dr.Jit 1.5.0 *aborts* the process with a libLLVM older than 16: version 15 cannot select an instruction for `minimum`,
-version 14 switches the backend off and the first kernel divides by zero. So the first such kernel runs in a child
-process, and the library that passed is named to Dr.Jit in `DRJIT_LIBLLVM_PATH`. Linux only.
+version 14 disables the backend and the first kernel divides by zero. Therefore such a kernel is first run in a child
+process, and the library that passes is set in `DRJIT_LIBLLVM_PATH` for Dr.Jit. Linux only.
 """
 
 import contextlib
@@ -25,7 +25,7 @@ OLDEST_MAJOR = 16
 TESTED_MAJOR = 19
 PACKAGES = (f"libllvm{TESTED_MAJOR}", "libatomic1")  # Dr.Jit links libatomic, which a minimal Debian lacks
 
-# drjit alone, not mitsuba: the same code generator in a fifth of the time.
+# drjit without mitsuba: the same code generator, in a fifth of the time.
 _PROBE = """
 import drjit
 from drjit.llvm import Float
@@ -35,11 +35,14 @@ print(next(line.split(maxsplit=5)[5].strip() for line in open("/proc/self/maps")
 
 
 def ensure_usable() -> Path:
-    """The libLLVM that Dr.Jit will load, proven to compile and run a kernel; call it before importing drjit.
+    """Find a libLLVM that compiles and runs a kernel, and set it in `DRJIT_LIBLLVM_PATH` of this process.
 
-    A library that the user names in `DRJIT_LIBLLVM_PATH` is the only one tried; else Dr.Jit's own choice is tried,
-    then every installed version from 16 on, newest first. The one that passes is set in `DRJIT_LIBLLVM_PATH` of this
-    process, and is remembered until the file or drjit changes.
+    To be called before drjit is imported. If the user has set `DRJIT_LIBLLVM_PATH`, only that library is tested;
+    otherwise Dr.Jit's own choice, then every installed version from 16 on, newest first. The result is cached until the
+    library or drjit changes.
+
+    Returns:
+        The library's path.
 
     Raises:
         InputError: no library passes; the message has the command that installs one.
@@ -51,10 +54,13 @@ def ensure_usable() -> Path:
 
 
 def install() -> Path:
-    """As `ensure_usable`; where no library passes, root on Debian or Ubuntu first gets one from the distribution.
+    """Do as `ensure_usable`; if no library passes, install one with apt-get, as root on Debian or Ubuntu.
+
+    Returns:
+        The library's path.
 
     Raises:
-        InputError: no library passes and none was installed.
+        InputError: no library passes, also after the installation.
     """
     try:
         return ensure_usable()
@@ -68,7 +74,7 @@ def install() -> Path:
 
 
 def _find(named: str | None) -> Path:
-    """Probe libraries until one passes, and remember it."""
+    """Test libraries until one passes, and cache the result."""
     failures = {}
     for candidate in [named] if named else [None, *_installed()]:
         library, failure = _probe(candidate)
@@ -81,37 +87,37 @@ def _find(named: str | None) -> Path:
         where=f"{ENVIRONMENT}={named}" if named else "this machine's libraries",
         expected=f"libLLVM {OLDEST_MAJOR} or newer ({TESTED_MAJOR} is tested)",
         got="; ".join(f"{candidate}: {failure}" for candidate, failure in failures.items()),
-        fix=f"unset {ENVIRONMENT}, or name another library there"
+        fix=f"unset {ENVIRONMENT}, or set it to another library"
         if named
         else f"sudo apt-get install -y {' '.join(_packages())}",
     )
 
 
 def _probe(candidate: str | None) -> tuple[Path | None, str]:
-    """Compile and run one `minimum` kernel in a child process: the library that was loaded, or why it failed."""
+    """Run a `minimum` kernel in a child process; return the library that was loaded, or None and the reason."""
     environment = {key: value for key, value in os.environ.items() if key != ENVIRONMENT}
     if candidate:
         if not Path(candidate).is_file():
             return None, "no such file"
         environment[ENVIRONMENT] = candidate
     with tempfile.TemporaryDirectory() as empty:
-        environment["DRJIT_CACHE_DIR"] = empty  # a kernel from Dr.Jit's own cache would prove nothing
+        environment["DRJIT_CACHE_DIR"] = empty  # a kernel from Dr.Jit's cache would not be compiled
         try:
             run = subprocess.run(
                 [sys.executable, "-P", "-c", _PROBE], env=environment, capture_output=True, text=True, timeout=120
             )
         except subprocess.TimeoutExpired:
-            return None, "no answer within 120 s"
+            return None, "no result within 120 s"
     if run.returncode == 0:
         return Path(run.stdout.splitlines()[-1]), ""
     lines = [line.strip() for line in run.stderr.splitlines() if line.strip()]
-    # LLVM and Dr.Jit say the reason first; of chained Python errors the first one is the cause.
-    told = ([line for line in lines if re.match(r"[\w.]+Error: ", line)] or lines or ["no message"])[0]
-    return None, f"{told} (exit code {run.returncode})"
+    # The first line of LLVM and Dr.Jit has the reason; of chained Python errors the first one is the cause.
+    reason = ([line for line in lines if re.match(r"[\w.]+Error: ", line)] or lines or ["no message"])[0]
+    return None, f"{reason} (exit code {run.returncode})"
 
 
 def _installed() -> list[str]:
-    """Every libLLVM that is new enough by its name, newest first."""
+    """Return every installed libLLVM that is new enough by its file name, newest first."""
     folders = [*map(Path, ("/usr/local/lib", "/usr/lib", "/usr/lib64")), *Path("/usr/lib").glob("*-linux-gnu")]
     folders += [Path(folder) for folder in os.environ.get("LD_LIBRARY_PATH", "").split(":") if folder]
     folders += Path("/usr/lib").glob("llvm-*/lib")
@@ -124,52 +130,52 @@ def _installed() -> list[str]:
 
 
 def _packages() -> list[str]:
-    """What to install: the distribution's libLLVM nearest to the tested one."""
-    wanted, *rest = PACKAGES
-    found = ""
+    """Return the packages to install: the distribution's libLLVM nearest to the tested one, and its dependencies."""
+    default, *others = PACKAGES
+    listing = ""
     if shutil.which("apt-cache"):
-        found = subprocess.run(
+        listing = subprocess.run(
             ["apt-cache", "search", "--names-only", r"^libllvm[0-9]+(t64)?$"], capture_output=True, text=True
         ).stdout
-    offers = {line.split()[0]: int(re.findall(r"\d+", line)[0]) for line in found.splitlines()}
-    usable = [name for name, major in offers.items() if major >= OLDEST_MAJOR]
-    return [min(usable, key=lambda name: abs(offers[name] - TESTED_MAJOR), default=wanted), *rest]
+    versions = {line.split()[0]: int(re.findall(r"\d+", line)[0]) for line in listing.splitlines()}
+    usable = [name for name, major in versions.items() if major >= OLDEST_MAJOR]
+    return [min(usable, key=lambda name: abs(versions[name] - TESTED_MAJOR), default=default), *others]
 
 
 def _cache_file() -> Path:
-    """Where proofs are kept. Raises RuntimeError for a user without a home."""
+    """Return the file of cached results. Raises RuntimeError for a user without a home folder."""
     return cache_folder() / "llvm.json"
 
 
 def _fingerprint(library: Path) -> dict[str, str | int]:
-    """What must be unchanged for an earlier proof to hold. Raises OSError if the library is gone."""
+    """Return what must be unchanged for a cached result to be valid. Raises OSError if the library does not exist."""
     status = library.stat()
     drjit = importlib.metadata.version("drjit")
     return {"library": str(library), "mtime_ns": status.st_mtime_ns, "bytes": status.st_size, "drjit": drjit}
 
 
 def _recall(named: str | None) -> Path | None:
-    """The library that passed before for the same `DRJIT_LIBLLVM_PATH`, if it is still the same."""
+    """Return the cached library for this `DRJIT_LIBLLVM_PATH`, if it has not changed, else None."""
     try:
-        proven = json.loads(_cache_file().read_text())[named or ""]
-        library = Path(proven["library"])
-        return library if _fingerprint(library) == proven else None
+        saved = json.loads(_cache_file().read_text())[named or ""]
+        library = Path(saved["library"])
+        return library if _fingerprint(library) == saved else None
     except (OSError, ValueError, LookupError, TypeError, RuntimeError):
         return None
 
 
 def _remember(named: str | None, library: Path) -> None:
-    """Keep the proof; a home that is missing or read-only costs a probe each time and no more."""
+    """Cache the result; without a writable home the test is repeated in every process."""
     with contextlib.suppress(OSError, RuntimeError):
         file = _cache_file()
         try:
-            known = dict(json.loads(file.read_text()))
+            results = dict(json.loads(file.read_text()))
         except (OSError, ValueError, TypeError):
-            known = {}
-        # Under its own path too: this process and its children find it named in their environment from now on.
-        known |= dict.fromkeys([named or "", str(library)], _fingerprint(library))
+            results = {}
+        # Also under its own path, which this process and its children now have in their environment.
+        results |= dict.fromkeys([named or "", str(library)], _fingerprint(library))
         file.parent.mkdir(parents=True, exist_ok=True)
-        write_json(file, known)
+        write_json(file, results)
 
 
 if __name__ == "__main__":

@@ -1,28 +1,28 @@
-"""The renderer's mathematics in plain torch: slow, exact and short, to be read and to test the renderer against.
+"""The renderer's mathematics in plain torch: slow, exact and short; documentation, and the reference of its tests.
 
-`Reference` draws what `renderer.Renderer` draws, of tiny scenes: every ray is tried against every face.
+`ReferenceRenderer` renders what `renderer.Renderer` renders, for tiny scenes: every ray is tested against every face.
 
-A ray. In the camera's frame a ray goes along d = K^-1 (x, y, 1): d_z = 1, so that t along it is depth. It meets a face
+Rays. In the camera's frame a ray has direction d = K^-1 (x, y, 1): d_z = 1, so that t along it is depth. It hits a face
 with corners p_0, p_1, p_2 where t d = b_0 p_0 + b_1 p_1 + b_2 p_2 with barycentrics of sum 1. By Cramer's rule
 
     b_j = w_j / W,  t = D / W,  w_0 = <d, p_1 x p_2> and cyclic,  W = w_0 + w_1 + w_2,  D = <p_0, p_1 x p_2>
 
 It is a hit if no b_j is negative and t > 0. The camera sees the face's outer side if D < 0.
 
-Inside the faces. Which face a ray meets is found without gradients. Its b_j are then functions of the attached corners,
-and every channel is one of the b_j: autograd does the rest.
+Interior of faces. The face that a ray hits is determined without gradients. Its b_j are differentiable functions of the
+corners, and every channel is a function of the b_j: autograd computes their gradients.
 
-Silhouettes. A pixel is a box, over which the channels f are averaged; they jump along the projections x(s) of edges.
-With the adjoint g of the pixel that holds x, and n a unit normal of the edge in the image,
+Silhouettes. A pixel is a box, over which the channels f are averaged; they are discontinuous at projections x(s) of
+edges. With the adjoint g of the pixel that contains x, and n a unit normal of the edge in the image,
 
     dLoss = sum over edges of the integral of g . [f(x - h n) - f(x + h n)] n . dx  along x,  h -> 0
 
-Either normal will do: turning it changes two signs. So will every edge: where nothing jumps, inside a smooth surface or
-behind another part, the two sides agree. Thus nothing here asks what is a silhouette, a seam of the texture, hidden, or
-outside. The integral is a midpoint rule; both sides are seen by rays of their own.
+Both signs of the normal give the same result. All edges are summed: at an edge without a discontinuity, inside a smooth
+surface or behind another part, both sides agree. No test for silhouettes, texture seams or occlusion is needed. The
+integral is a midpoint rule, with a ray on either side.
 
-What no edge marks is not in the sum: parts must not run through one another. Nor may two edges that show lie on one
-another in an image (a face seen exactly edge-on): the jump between them would count twice.
+Limits: discontinuities that are not at edges are missing, so parts must not intersect; and two visible edges must not
+coincide in an image (a face seen exactly edge-on), because the jump between them would count twice.
 """
 
 import numpy as np
@@ -36,8 +36,8 @@ from registration.types import Camera, Pixels, Rendered
 _H_PX = 1e-6  # see the formula above; float64 resolves it
 
 
-class Reference:
-    """Draws one topology, with float64 throughout. See `Renderer`, whose arguments these are."""
+class ReferenceRenderer:
+    """Renders one topology in float64, with the arguments of `Renderer`."""
 
     def __init__(
         self,
@@ -47,9 +47,9 @@ class Reference:
     ):
         """
         Args:
-            triangles: of welded vertices.
+            triangles: of vertices that are not duplicated at uv seams.
             corner_uvs: in [0, 1]^2; (0, 0) is the texture's lower left corner.
-            vertex_classes: soft class shares of the vertices.
+            vertex_classes: soft class weights of the vertices.
         """
         self._triangles = torch.tensor(triangles.astype(np.int64))
         self._corner_uvs = torch.tensor(corner_uvs, dtype=torch.float64)
@@ -63,16 +63,16 @@ class Reference:
         pixels: Pixels,
         offset: tuple[float, float] = (0.5, 0.5),
     ) -> Rendered:
-        """Draw pixels by one ray each; differentiable by autograd, but for the silhouettes.
+        """Render pixels by one ray each; differentiable by autograd, except at silhouettes.
 
         Args:
             vertices: world frame, metres.
             texture: linear, row 0 at v = 1, at least 2 x 2 texels; without one, RGB is zero.
-            pixels: what to draw.
-            offset: where a pixel's ray goes, from the pixel's corner (px).
+            pixels: which pixels to render.
+            offset: position of the ray in each pixel, from its corner (px).
         """
-        at = torch.stack([pixels.x, pixels.y], 1) + torch.tensor(offset, dtype=torch.float64)
-        parts = [self._see(vertices, texture, c, at[pixels.view == n]) for n, c in enumerate(pixels.cameras)]
+        xy = torch.stack([pixels.x, pixels.y], 1) + torch.tensor(offset, dtype=torch.float64)
+        parts = [self._shade(vertices, texture, c, xy[pixels.view == n]) for n, c in enumerate(pixels.cameras)]
         rgb, normals, mask, classes = torch.cat(parts).split([3, 3, 1, self._classes.shape[1]], 1)
         return Rendered(rgb=rgb, normals=normals, mask=mask[:, 0], classes=classes)
 
@@ -84,57 +84,60 @@ class Reference:
         adjoint: Rendered,
         points: int = 8,
     ) -> Float[Tensor, "V 3"]:
-        """dLoss / d(vertices), per metre, from what comes into sight and leaves it: see the module.
+        """Return dLoss / d(vertices), per metre, due to changes of visibility; see the module.
 
         Args:
             vertices: world frame, metres.
-            texture: as drawn.
-            pixels: as drawn; an edge counts where it lies in a listed pixel.
+            texture: as rendered.
+            pixels: as rendered; an edge counts where it lies in a listed pixel.
             adjoint: dLoss / d(every channel of every listed pixel).
-            points: of the quadrature along what a pixel holds of an edge.
+            points: of the quadrature along the piece of an edge inside a pixel.
         """
         vertices = vertices.detach().double().requires_grad_()
         g = torch.cat([adjoint.rgb, adjoint.normals, adjoint.mask[:, None], adjoint.classes], 1).detach()
         loss = 0 * vertices.sum()
         for view, camera in enumerate(pixels.cameras):
             x, normal, length_px = self._edge_points(vertices, camera, points)
-            pixel = _pixel_at(pixels.index[view], x)
+            pixel = _listed_pixel(pixels.index[view], x)
             x, normal, length_px, pixel = (values[pixel >= 0] for values in (x, normal, length_px, pixel))
             with torch.no_grad():
-                before, beyond = (self._see(vertices, texture, camera, x + h * normal) for h in (-_H_PX, _H_PX))
-                weight = length_px * (g[pixel] * (before - beyond)).sum(1)
-            loss = loss + (weight[:, None] * normal * x).sum()  # only x is attached
+                inner, outer = (self._shade(vertices, texture, camera, x + h * normal) for h in (-_H_PX, _H_PX))
+                weight = length_px * (g[pixel] * (inner - outer)).sum(1)
+            loss = loss + (weight[:, None] * normal * x).sum()  # only x carries a gradient
         return torch.autograd.grad(loss, vertices)[0]
 
-    def _see(
-        self, vertices: Tensor, texture: Tensor | None, camera: Camera, at: Float[Tensor, "N 2"]
+    def _shade(
+        self, vertices: Tensor, texture: Tensor | None, camera: Camera, xy: Float[Tensor, "N 2"]
     ) -> Float[Tensor, "N D"]:
-        """Colour, normal, coverage and classes at image positions (px); zero where nothing is hit."""
+        """Return colour, normal, coverage and classes at image positions (px); zero where no face is hit."""
         vertices = vertices.double()
         corners = _local(vertices, camera)[self._triangles]
-        at = at.detach()
-        directions = torch.cat([at, torch.ones_like(at[:, :1])], 1) @ _tensor(np.linalg.inv(camera.intrinsics).T)
+        xy = xy.detach()
+        directions = torch.cat([xy, torch.ones_like(xy[:, :1])], 1) @ _tensor(np.linalg.inv(camera.intrinsics).T)
         face, is_hit = _nearest(corners.detach(), directions)
         face = face[is_hit]
-        shares, _, is_outer = _meet(corners[face], directions[is_hit])
+        barycentric, _, is_outer = _intersect(corners[face], directions[is_hit])
 
         def blend(values: Float[Tensor, "H 3 C"]) -> Float[Tensor, "H C"]:
-            return (shares[..., None] * values).sum(1)
+            return (barycentric[..., None] * values).sum(1)
 
         colour = torch.zeros(len(face), 3, dtype=torch.float64)
         if texture is not None:
-            colour = _look_up(texture.double(), blend(self._corner_uvs[face]))
+            colour = _sample_texture(texture.double(), blend(self._corner_uvs[face]))
         normal = blend(vertex_normals(vertices, self._triangles)[self._triangles[face]])
         normal = torch.nn.functional.normalize(normal, dim=1) * torch.where(is_outer, 1.0, -1.0)[:, None]
         classes = blend(self._classes[self._triangles[face]])
-        seen = torch.cat([colour, normal, torch.ones_like(colour[:, :1]), classes], 1)
-        return seen.new_zeros(len(at), seen.shape[1]).index_put((is_hit,), seen)
+        channels = torch.cat([colour, normal, torch.ones_like(colour[:, :1]), classes], 1)
+        return channels.new_zeros(len(xy), channels.shape[1]).index_put((is_hit,), channels)
 
     def _edge_points(
         self, vertices: Float[Tensor, "V 3"], camera: Camera, points: int
     ) -> tuple[Float[Tensor, "N 2"], Float[Tensor, "N 2"], Float[Tensor, "N"]]:
-        """Points on the projections of all edges before the camera (px, attached), the edges' normals, and the length
-        of edge (px) for which a point stands. Pixels' borders cut an edge into pieces, each with as many points."""
+        """Sample the projections of all edges in front of the camera: `points` per piece of an edge inside a pixel.
+
+        Returns:
+            Points (px, with gradients), normals of their edges, and the length of edge per point (px).
+        """
         ends = _local(vertices, camera)[self._ends]  # (E, 2, 3)
         ends = ends[(ends[..., 2] > 0).all(1)] @ _tensor(camera.intrinsics.T)
         a, b = (ends[..., :2] / ends[..., 2:]).unbind(1)
@@ -144,13 +147,13 @@ class Reference:
         borders = [(torch.arange(size + 1) - a[:, k, None]) / along[:, k, None] for k, size in enumerate(sizes)]
         cuts = torch.cat([*borders, 0 * along], 1).detach().nan_to_num().clamp(0, 1)
         cuts = torch.nn.functional.pad(cuts.sort(1).values, (0, 1), value=1.0)
-        share = cuts.diff() / points
-        edge, piece = (share > 0).nonzero(as_tuple=True)
-        share, start = share[edge, piece, None], cuts[edge, piece, None]
-        s = (start + share * (torch.arange(points) + 0.5)).reshape(-1, 1)
-        edge, share = edge.repeat_interleave(points), share.expand(-1, points).reshape(-1)
+        step = cuts.diff() / points
+        edge, piece = (step > 0).nonzero(as_tuple=True)
+        step, start = step[edge, piece, None], cuts[edge, piece, None]
+        s = (start + step * (torch.arange(points) + 0.5)).reshape(-1, 1)
+        edge, step = edge.repeat_interleave(points), step.expand(-1, points).reshape(-1)
         normal = torch.stack([-along[:, 1], along[:, 0]], 1) / length[:, None]
-        return torch.lerp(a[edge], b[edge], s), normal[edge], share * length[edge]
+        return torch.lerp(a[edge], b[edge], s), normal[edge], step * length[edge]
 
 
 def _tensor(matrix: np.ndarray) -> Tensor:
@@ -158,16 +161,19 @@ def _tensor(matrix: np.ndarray) -> Tensor:
 
 
 def _local(vertices: Float[Tensor, "V 3"], camera: Camera) -> Float[Tensor, "V 3"]:
-    """World to the camera's frame, metres."""
+    """Transform from the world to the camera's frame, metres."""
     pose = _tensor(camera.T_cam_world)
     return vertices @ pose[:3, :3].T + pose[:3, 3]
 
 
-def _meet(
+def _intersect(
     corners: Float[Tensor, "*B 3 3"], directions: Float[Tensor, "N 3"]
 ) -> tuple[Float[Tensor, "N 3"], Float[Tensor, "N"], Bool[Tensor, "*B"]]:
-    """Barycentrics and depths (m) at which rays meet the planes of faces, one each or one for all; and whether the
-    camera sees the faces' outer sides."""
+    """Intersect rays with the planes of faces, one face per ray or one for all.
+
+    Returns:
+        Barycentrics, depths (m), and whether the camera sees the faces' outer sides.
+    """
     crosses = torch.linalg.cross(corners.roll(-1, -2), corners.roll(-2, -2))
     w = (crosses @ directions[..., None])[..., 0] if crosses.ndim == 3 else directions @ crosses.T
     determinant = (corners[..., 0, :] * crosses[..., 0, :]).sum(-1)
@@ -178,30 +184,30 @@ def _meet(
 def _nearest(
     corners: Float[Tensor, "F 3 3"], directions: Float[Tensor, "N 3"]
 ) -> tuple[Int[Tensor, "N"], Bool[Tensor, "N"]]:
-    """The first face that each ray meets, and whether there is one."""
+    """Return the first face that each ray hits, and whether there is one."""
     depth = torch.full((len(directions),), torch.inf, dtype=torch.float64)
     nearest = torch.zeros(len(directions), dtype=torch.int64)
     for face, triangle in enumerate(corners):
-        shares, t, _ = _meet(triangle, directions)
-        nearer = (shares >= 0).all(1) & (t > 0) & (t < depth)
+        barycentric, t, _ = _intersect(triangle, directions)
+        nearer = (barycentric >= 0).all(1) & (t > 0) & (t < depth)
         depth[nearer], nearest[nearer] = t[nearer], face
     return nearest, depth.isfinite()
 
 
-def _look_up(texture: Float[Tensor, "R R 3"], uv: Float[Tensor, "N 2"]) -> Float[Tensor, "N 3"]:
-    """Bilinear between the texels' centres, clamped beyond the outermost; row 0 at v = 1."""
+def _sample_texture(texture: Float[Tensor, "R R 3"], uv: Float[Tensor, "N 2"]) -> Float[Tensor, "N 3"]:
+    """Interpolate bilinearly between texel centres, clamped at the border; row 0 at v = 1."""
     size = len(texture)
-    place = (torch.stack([uv[:, 0], 1 - uv[:, 1]], 1) * size - 0.5).clamp(0, size - 1)
-    first = place.detach().long().clamp(max=size - 2)
+    position = (torch.stack([uv[:, 0], 1 - uv[:, 1]], 1) * size - 0.5).clamp(0, size - 1)
+    first = position.detach().long().clamp(max=size - 2)
     column, row = first.unbind(1)
-    fx, fy = (place - first).split(1, 1)
+    fx, fy = (position - first).split(1, 1)
     above = torch.lerp(texture[row, column], texture[row, column + 1], fx)
     below = torch.lerp(texture[row + 1, column], texture[row + 1, column + 1], fx)
     return torch.lerp(above, below, fy)
 
 
-def _pixel_at(index: Int[Tensor, "H W"], x: Float[Tensor, "N 2"]) -> Int[Tensor, "N"]:
-    """The listed pixel that holds an image position (px), or -1."""
+def _listed_pixel(index: Int[Tensor, "H W"], x: Float[Tensor, "N 2"]) -> Int[Tensor, "N"]:
+    """Return the listed pixels that contain image positions (px), or -1."""
     column, row = x.detach().floor().long().unbind(1)
     inside = (column >= 0) & (column < index.shape[1]) & (row >= 0) & (row < index.shape[0])
     return torch.where(inside, index[row.where(inside, 0), column.where(inside, 0)].long(), -1)

@@ -12,7 +12,7 @@ import torch
 import trimesh
 
 from registration.render import backend
-from registration.render.reference import Reference
+from registration.render.reference import ReferenceRenderer
 from registration.render.renderer import Renderer
 from registration.types import Camera, Pixels, Rendered
 from tests.registration.render.test_renderer import camera
@@ -127,7 +127,7 @@ def gradients(image: Rendered, adjoint: Rendered, group: str, inputs: list[torch
     )
 
 
-def mean_of_offsets(renderer: Renderer, reference: Reference, *scene) -> Rendered:
+def mean_of_offsets(renderer: Renderer, reference: ReferenceRenderer, *scene) -> Rendered:
     """The twin's image, with the renderer's rays."""
     images = [reference(*scene, offset) for offset in renderer._pixel_offsets]
     return Rendered(**{name: sum(getattr(image, name) for image in images) / len(images) for name in GROUPS})
@@ -145,7 +145,7 @@ def assert_close(found: torch.Tensor, expected: torch.Tensor, share: float) -> N
 @pytest.mark.parametrize("pixel_samples", [1, 16])
 def test_values(make, pixel_samples):
     scene = make()
-    renderer, reference = Renderer(*scene.mesh, pixel_samples=pixel_samples), Reference(*scene.mesh)
+    renderer, reference = Renderer(*scene.mesh, pixel_samples=pixel_samples), ReferenceRenderer(*scene.mesh)
     inputs = scene.positions, random_texture(), scene.pixels
     image, expected = renderer(*inputs), mean_of_offsets(renderer, reference, *inputs)
     assert 0.2 < expected.mask.mean() < 0.9
@@ -159,7 +159,9 @@ def test_the_texture_is_clamped_at_its_border():
     scene = squares()
     scene = replace(scene, corner_uvs=np.tile([[0, 0], [1, 0], [1, 1]], (4, 1, 1)))
     texture = random_texture(4)
-    image, expected = (draw(*scene.mesh)(scene.positions, texture, scene.pixels) for draw in (Renderer, Reference))
+    image, expected = (
+        draw(*scene.mesh)(scene.positions, texture, scene.pixels) for draw in (Renderer, ReferenceRenderer)
+    )
     # The renderer's outermost texel weighs 0.999 there.
     torch.testing.assert_close(image.rgb.double(), expected.rgb, atol=2e-3, rtol=0)
 
@@ -171,7 +173,7 @@ def test_inside_a_ball(group, pixel_samples):
     scene = balls()
     half = slice(len(scene.triangles) // 2, None)
     scene = replace(scene, triangles=scene.triangles[half], corner_uvs=scene.corner_uvs[half])
-    renderer, reference = Renderer(*scene.mesh, pixel_samples=pixel_samples), Reference(*scene.mesh)
+    renderer, reference = Renderer(*scene.mesh, pixel_samples=pixel_samples), ReferenceRenderer(*scene.mesh)
     everywhere = Pixels.full(scene.cameras)
     mask = everywhere.image(reference(scene.positions, None, everywhere).mask[:, None])[..., 0]
     # What is convex and covers the centres around a pixel covers it all.
@@ -191,7 +193,7 @@ def test_inside_a_ball(group, pixel_samples):
 def test_gradients(make, group):
     """Of positions, with silhouettes: the mean over the renderer's samples; and of the texture, which has none."""
     scene = make()
-    renderer, reference = Renderer(*scene.mesh, edge_samples=256.0), Reference(*scene.mesh)
+    renderer, reference = Renderer(*scene.mesh, edge_samples=256.0), ReferenceRenderer(*scene.mesh)
     inputs = [scene.positions.requires_grad_(), random_texture().requires_grad_()]
     image = renderer(*inputs, scene.pixels)
     adjoint = random_adjoint(image, group)
@@ -208,7 +210,7 @@ def test_the_twins_silhouettes_by_hand():
     """A square's share of the image is the area of its projection (the shoelace formula)."""
     scene = squares()
     scene = replace(scene, triangles=scene.triangles[:2], corner_uvs=scene.corner_uvs[:2], cameras=scene.cameras[:1])
-    reference, view, pixels = Reference(*scene.mesh), scene.cameras[0], Pixels.full(scene.cameras[:1])
+    reference, view, pixels = ReferenceRenderer(*scene.mesh), scene.cameras[0], Pixels.full(scene.cameras[:1])
     vertices = torch.tensor(scene.vertices, requires_grad=True)
     projected = torch.cat([vertices[:4], torch.ones(4, 1)], 1) @ torch.tensor(
         (view.intrinsics @ view.T_cam_world[:3]).T

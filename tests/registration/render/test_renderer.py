@@ -21,7 +21,7 @@ from registration.model.atlas import texture_atlas
 from registration.model.regions import vertex_classes
 from registration.render import backend
 from registration.render.renderer import Renderer
-from registration.render.shading import Footprint
+from registration.render.shading import TexelFootprint
 from registration.types import Camera, Pixels, Rendered
 from tests.conftest import FIXTURES
 
@@ -262,7 +262,7 @@ def test_a_place_that_is_no_number_reads_the_texture_and_nothing_else():
     """Barycentrics of rays that miss are anything; a texel far outside the texture would end the process."""
     size = 7
     for u, v in ((np.nan, 0.5), (0.5, np.nan), (np.inf, -np.inf), (1e30, -1e30)):
-        footprint = Footprint.of(mi.Point2f(mi.Float([u, 0.3]), mi.Float([v, 0.3])), size)
+        footprint = TexelFootprint.from_uv(mi.Point2f(mi.Float([u, 0.3]), mi.Float([v, 0.3])), size)
         for texel, _ in footprint.texels():
             assert (np.array(texel) < size**2).all()
 
@@ -364,7 +364,7 @@ def test_cameras_of_two_sizes_or_with_distortion_are_refused():
     one, vertices = camera((0, 0, 0.5)), torch.tensor(SQUARE)
     pixels = Pixels.full([one, one])
     for other in (replace(one, width_px=30), replace(one, distortion=(0.1, 0.0, 0.0, 0.0))):
-        with pytest.raises(ValueError, match="one size without distortion"):
+        with pytest.raises(ValueError, match="one image size and no distortion"):
             square()(vertices, None, replace(pixels, cameras=(one, other)))
 
 
