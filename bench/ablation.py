@@ -1,11 +1,11 @@
-"""What each term of a fit is worth: the draft recipe without it, on a neutral and on an expression from it.
+"""Ablation of the terms of a fit: the draft recipe without each term, on a neutral and on an expression.
 
     python -m bench.ablation --model MODEL.npz --neutral CAPTURE --expression CAPTURE --out FOLDER [--only NAME ...]
 
-Registrations are kept in FOLDER, so that a run that was stopped goes on where it was. The expression starts from the
-neutral of the whole recipe throughout: what is left out is left out of its own fit only. mm on the face; "too deep"
-counts vertices more than 0.3 mm deeper in another part than in the template; seconds are those of the stages, on
-whatever else the machine was doing.
+Registrations are kept in FOLDER, so that an interrupted run resumes. The expression always starts from the neutral of
+the complete recipe; the term is missing from its own fit only. Errors are in mm on the face; "too deep" counts vertices
+more than 0.3 mm deeper in another part than in the template; seconds are the sum of the stages, under the machine's
+load at the time.
 """
 
 import argparse
@@ -36,7 +36,7 @@ def _weights(**changes: float) -> Callable[[Recipe], Recipe]:
 
 
 def _without_large_steps(recipe: Recipe) -> Recipe:
-    """Every vertex steps on its own."""
+    """Return the recipe with independent steps of all vertices, without the large-steps preconditioner."""
 
     def change(stage: Stage) -> Stage:
         return stage if stage.lengths is None else replace(stage, lengths=replace(stage.lengths, smoothing_mm=0.0))
@@ -85,7 +85,7 @@ def main() -> None:
     heads = ("without", "mean", "median", "too deep", "s")
     neutral_table = Table(*heads, title=f"{options.neutral.name}, draft")
     drifting = ("without", "mean", "median", "drift", "p95", "too deep", "s")
-    expression_table = Table(*drifting, title=f"{options.expression.name}, draft, from the whole recipe's neutral")
+    expression_table = Table(*drifting, title=f"{options.expression.name}, draft, from the complete recipe's neutral")
     with console_progress() as progress:
         for name in dict.fromkeys(["everything", *options.only]):
             recipe, folder = VARIANTS[name](draft()), options.out / name.replace(" ", "_")

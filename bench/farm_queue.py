@@ -1,8 +1,8 @@
-"""The queue with 20,000 captures that need no work: what filling, asking, coordinating and storing it costs.
+"""Cost of the queue itself with 20,000 jobs without work: submission, polling, coordination and storage.
 
     python -m bench.farm_queue [--captures 20000] [--db URL] [--seconds 60] [--settle 15]
 
-Workers run for some seconds only: with one job at a time they are bound by their asking the queue, four times a second.
+Workers run only for some seconds: with one job at a time they are limited by polling, four times a second.
 """
 
 import argparse
@@ -30,8 +30,8 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--captures", type=int, default=20_000)
     parser.add_argument("--db", default="sqlite", help="sqlite, postgres (a server is started), or a URL")
-    parser.add_argument("--seconds", type=float, default=60.0, help="how long two workers run")
-    parser.add_argument("--settle", type=float, default=15.0, help="seconds before the coordinator's memory is read")
+    parser.add_argument("--seconds", type=float, default=60.0, help="run time of two workers, s")
+    parser.add_argument("--settle", type=float, default=15.0, help="delay before the coordinator's memory is read, s")
     options = parser.parse_args()
     with tempfile.TemporaryDirectory(prefix="gnmreg-queue-") as name:
         if options.db == "postgres":
@@ -102,7 +102,7 @@ def _size_mb(url: str) -> float:
     if is_sqlite(url):
         file = sqlite_file(checked_url(url))
         with engine(url).connect() as connection:
-            connection.exec_driver_sql("PRAGMA wal_checkpoint(TRUNCATE)")  # else the log would be counted too
+            connection.exec_driver_sql("PRAGMA wal_checkpoint(TRUNCATE)")  # otherwise the log would be counted, too
         return sum(path.stat().st_size for path in file.parent.glob(f"{file.name}*") if path.is_file()) / MB
     with engine(checked_url(url)).connect() as connection:
         return float(connection.execute(sa.text("SELECT pg_database_size(current_database())")).scalar_one()) / MB

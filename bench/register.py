@@ -1,8 +1,9 @@
-"""Register captures and print how well, how fast and with how much memory; nothing is kept.
+"""Register captures and print accuracy, time and memory; the results are not kept.
 
     python -m bench.register --model MODEL.npz CAPTURE... [--recipe draft]
 
-Each capture gets a process of its own, so that the peak is its own; seconds are the whole command's.
+Each capture is registered in a separate process, so that its memory peak can be measured; seconds are those of the
+whole command.
 """
 
 import argparse
@@ -22,7 +23,7 @@ from rich.table import Table
 
 @dataclass(frozen=True, kw_only=True)
 class Measured:
-    """One registration, as seen from outside."""
+    """Cost and manifest of one registration."""
 
     seconds: float
     peak_gb: float
@@ -31,7 +32,7 @@ class Measured:
 
     @property
     def row(self) -> tuple[str, ...]:
-        """The cells of the table behind the capture's name."""
+        """Return the table's cells after the capture's name."""
         figures = self.manifest.get("figures", {})
         scan = figures.get("scan_to_mesh", {}).get("face", {})
         truth = figures.get("vertex_error", {}).get("face", {})
@@ -53,7 +54,7 @@ def measure(capture: Path, model: Path, recipe: str) -> Measured:
             process = subprocess.Popen(
                 [*command, "--out", str(out), "--recipe", recipe], stdout=stream, stderr=subprocess.STDOUT
             )
-            usage = os.wait4(process.pid, 0)[2]  # of this process alone; subprocess itself would not tell
+            usage = os.wait4(process.pid, 0)[2]  # of this process alone; subprocess does not report it
         seconds = time.perf_counter() - begun
         manifest = out / "manifest.json"
         return Measured(

@@ -1,12 +1,12 @@
-"""What one step of the renderer costs, as a ratio to the bare ray cast of every pixel of every view.
+"""Cost of one iteration of the renderer, relative to ray casting alone.
 
     python -m bench.renderer --case 22x512 --case 8x512 --case 8x256 [--variant llvm|cuda] [--memory] [--stock]
 
-A case is VIEWSxSIDE. The scene is the first model's head and the studio's rig; the head moves in every iteration. The
-floor is one coherent cast of *all* pixels with the BVH built; what the renderer draws is what a fit compares, the
-pixels in and near the head. Stages are medians over interleaved repeats. `misses` counts kernels that had to be
-compiled after the second iteration; `memory_growth` is the process' size at iteration 1,000 over that at 100, minus 1.
-`--stock` compares our whole iteration and that of Mitsuba's own projective integrator with the same floor.
+A case is VIEWSxSIDE: the first model's head and the studio's rig; the vertices change in every iteration. The baseline
+is one coherent cast of *all* pixels with the BVH already built. The renderer renders the pixels that a fit compares,
+those in and near the head. Stages are medians over interleaved repeats. `misses` counts kernels that were compiled
+after the second iteration; `memory_growth` is the process's size at iteration 1,000 divided by that at 100, minus 1.
+`--stock` also compares an iteration of Mitsuba's projective integrator [Zhang 2023] with the same baseline.
 """
 
 import argparse
@@ -35,24 +35,24 @@ from registration.types import Pixels
 REPEATS = 7
 CLASSES = 9  # 16 channels: colour, normal, mask and these
 TEXTURE_PX = 512
-NEAR = 0.08  # of the head's height: how far around the head a fit compares pixels
-MOTION = 1e-4  # metres, standard deviation, of every vertex in every iteration
+NEAR = 0.08  # distance from the head, relative to its height, up to which a fit compares pixels
+MOTION = 1e-4  # standard deviation of the vertices' motion, metres
 CAST, MOVE, FORWARD, INTERIOR, EDGES, CROSSINGS, WHOLE, STOCK = (
-    "bare ray cast of all pixels (the floor)",
+    "ray cast of all pixels (baseline)",
     "vertex update and BVH",
     "forward, 16 channels",
     "interior adjoint, with texture",
     "silhouettes",
-    "crossings of parts",
+    "intersection curves",
     "whole iteration",
-    "stock Mitsuba's whole iteration, 3 channels",
+    "Mitsuba's projective integrator, whole iteration, 3 channels",
 )
 STAGES = (MOVE, FORWARD, INTERIOR, EDGES, CROSSINGS)
 STOCK_CASE = "2x256"
 
 
 class Case:
-    """One scene on the device, ready to be timed."""
+    """One scene on the device."""
 
     def __init__(self, views: int, side: int, device: torch.device):
         from registration.render.renderer import Renderer
@@ -63,9 +63,9 @@ class Case:
         options = RigOptions(cameras=views, size_px=(side, side))
         cameras = make_rig(options, centre=centre, head_height_m=float(np.ptp(head[:, 1])))
         self.triangles = triangles = data.triangles.astype(np.int64)
-        shares = label_weights(data)[:, :CLASSES]
+        classes = label_weights(data)[:, :CLASSES]
         self.corner_uvs = texture_atlas(data)
-        self.renderer = Renderer(triangles, self.corner_uvs, shares.astype(np.float32))
+        self.renderer = Renderer(triangles, self.corner_uvs, classes.astype(np.float32))
         self.all = Pixels.full(cameras, device)
         self.rest = torch.as_tensor(head, dtype=torch.float32, device=device)
         generator = torch.Generator().manual_seed(0)
@@ -78,54 +78,54 @@ class Case:
         count = len(self.pixels.view)
         shapes = ((count, 3), (count, 3), (count,), (count, CLASSES))
         self.adjoint = [torch.rand(shape, generator=generator).to(device) for shape in shapes]
-        moves = MOTION * torch.randn((8, *self.rest.shape), generator=generator).to(device)
-        self._moved = itertools.cycle([(self.rest + move).requires_grad_() for move in moves])
+        displacements = MOTION * torch.randn((8, *self.rest.shape), generator=generator).to(device)
+        self._moved = itertools.cycle([(self.rest + delta).requires_grad_() for delta in displacements])
 
     def moved(self) -> torch.Tensor:
-        """The head a little elsewhere: a BVH that is not rebuilt would not count."""
+        """Return other vertices than before, so that the BVH is rebuilt."""
         return next(self._moved)
 
     def iterate(self) -> None:
         vertices = self.moved()
-        drawn = self.renderer(vertices, self.texture, self.pixels)
-        image = (drawn.rgb, drawn.normals, drawn.mask, drawn.classes)
+        rendered = self.renderer(vertices, self.texture, self.pixels)
+        image = (rendered.rgb, rendered.normals, rendered.mask, rendered.classes)
         torch.autograd.grad(image, (vertices, self.texture), self.adjoint)
 
 
 def _near(mask: np.ndarray) -> np.ndarray:
-    """A head's pixels and those around it that a fit compares."""
+    """Return the pixels that a fit compares: those of the head and around it."""
     distance = cv2.distanceTransform((~mask).astype(np.uint8), cv2.DIST_L2, 5)
     return distance < NEAR * np.ptp(np.flatnonzero(mask.any(1))) + 2
 
 
 @dataclass
 class Clock:
-    """Wraps the renderer's stages and adds up the seconds spent in each until asked."""
+    """Accumulates the seconds spent in each of the renderer's stages."""
 
     seconds: dict[str, float]
 
-    def around(self, owner: Any, name: str, stage: str) -> None:
+    def wrap(self, owner: Any, name: str, stage: str) -> None:
         import drjit as dr
 
         inner: Callable[..., Any] = getattr(owner, name)
 
         def timed(*args: Any, **kwargs: Any) -> Any:
             dr.sync_thread()
-            begun = time.perf_counter()
+            start = time.perf_counter()
             result = inner(*args, **kwargs)
             dr.sync_thread()
-            self.seconds[stage] = self.seconds.get(stage, 0.0) + time.perf_counter() - begun
+            self.seconds[stage] = self.seconds.get(stage, 0.0) + time.perf_counter() - start
             return result
 
         setattr(owner, name, timed)
 
     def take(self) -> dict[str, float]:
-        taken, self.seconds = self.seconds, {}
-        return taken
+        seconds, self.seconds = self.seconds, {}
+        return seconds
 
 
-def floor(case: Case) -> Callable[[], None]:
-    """The cast of all pixels, row by row, on the BVH that Mitsuba builds of the mesh by itself."""
+def baseline(case: Case) -> Callable[[], None]:
+    """Return the cast of all pixels, row by row, with Mitsuba's own BVH of the mesh."""
     import drjit as dr
     import mitsuba as mi
 
@@ -152,17 +152,17 @@ def floor(case: Case) -> Callable[[], None]:
 
 
 def timed(call: Callable[[], None]) -> float:
-    begun = time.perf_counter()
+    start = time.perf_counter()
     call()
-    return time.perf_counter() - begun
+    return time.perf_counter() - start
 
 
 def measure(case: Case) -> dict[str, float]:
-    """Median seconds of every stage."""
+    """Return the median seconds of every stage."""
     from registration.render.renderer import Renderer
     from registration.render.scene import TriangleScene
 
-    cast = floor(case)
+    cast = baseline(case)
     for _ in range(3):
         case.iterate()
         cast()
@@ -173,7 +173,7 @@ def measure(case: Case) -> dict[str, float]:
         found.setdefault(CAST, []).append(timed(cast))
         found.setdefault(WHOLE, []).append(timed(case.iterate))
         for (owner, name, _original), stage in zip(originals, STAGES, strict=True):
-            clock.around(owner, name, stage)
+            clock.wrap(owner, name, stage)
         case.iterate()
         for owner, name, original in originals:
             setattr(owner, name, original)
@@ -183,11 +183,11 @@ def measure(case: Case) -> dict[str, float]:
 
 
 def measure_stock(case: Case) -> dict[str, float]:
-    """Median seconds of the floor, of our iteration and of stock Mitsuba's."""
+    """Return the median seconds of the baseline, of our iteration and of Mitsuba's integrator."""
     from bench.support import stock_renderer
 
-    theirs = stock_renderer.iteration(case.all.cameras, case.triangles, case.corner_uvs, case.texture, case.moved)
-    calls = {CAST: floor(case), WHOLE: case.iterate, STOCK: theirs}
+    stock = stock_renderer.iteration(case.all.cameras, case.triangles, case.corner_uvs, case.texture, case.moved)
+    calls = {CAST: baseline(case), WHOLE: case.iterate, STOCK: stock}
     for _ in range(3):
         for call in calls.values():
             call()
@@ -201,7 +201,7 @@ def _stages(renderer: type, scene: type) -> list[tuple[type, str]]:
 
 
 def misses(case: Case, iterations: int = 5) -> int:
-    """Kernels compiled in some more iterations."""
+    """Return the number of kernels compiled in further iterations."""
     import drjit as dr
 
     with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
@@ -227,7 +227,7 @@ def memory_growth(device: torch.device) -> float:
 
 def show(name: str, case: Case, seconds: dict[str, float]) -> None:
     title = f"{name}: {len(case.all.view):,} rays, {case.hits:.0%} hit, {len(case.pixels.view):,} pixels compared"
-    table = Table("stage", "ms", "x the floor", title=title, title_justify="left")
+    table = Table("stage", "ms", "x baseline", title=title, title_justify="left")
     for stage in (CAST, *STAGES, WHOLE, STOCK):
         if stage in seconds:
             table.add_row(stage, f"{1000 * seconds[stage]:.1f}", f"{seconds[stage] / seconds[CAST]:.2f}")

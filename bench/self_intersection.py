@@ -1,10 +1,10 @@
-"""Self-intersection: what the penalty costs, how right it is, what comes apart again, what a model does by itself.
+"""The self-intersection penalty: cost, accuracy, separation of crossed parts, and a model's own self-intersections.
 
     python -m bench.self_intersection --model MODEL.npz [--samples FILE.npz]
 
-`--samples` has faces to look at beside random ones: arrays `identity_deltas` and `expression_deltas` (N, V, 3), metres,
-with `identity_names` and `expression_names`. Depths in crossed parts are measured apart from the penalty, by winding
-numbers and closest points (`bench/support/crossed_parts.py`), and told as an excess over the template's own.
+`--samples` has further faces to measure besides random ones: arrays `identity_deltas` and `expression_deltas` (N, V,
+3), metres, with `identity_names` and `expression_names`. Depths in crossed parts are measured independently of the
+penalty, by winding numbers and closest points (`bench/support/crossed_parts.py`), as the excess over the template's.
 """
 
 import argparse
@@ -27,13 +27,13 @@ from registration.model.gnm_npz import GNMData
 REPEATS = 15
 PUSHES_MM = (1.0, 2.0, 3.0, 4.0, 5.0)
 DIRECTIONS = {"sideways": (1.0, 0.0, 0.0), "forwards": (0.0, 0.0, 1.0), "askew": (-0.7, 0.3, 0.7)}
-HEADS = 20  # random ones of each kind
-SIGMA = 0.5  # of random expression coefficients: those of independent components add up to grimaces
+HEADS = 20  # random heads of each kind
+SIGMA = 0.5  # of random expression coefficients: with 1, independent components would add up to grimaces
 MARGIN_MM = 0.05
 
 
 def cost(data: GNMData) -> Table:
-    """Medians of wall-clock milliseconds, on the template and on a head with crossed lips."""
+    """Return median wall-clock milliseconds on the template and on a head with crossed lips."""
     table = Table("head", "construct", "refresh", "call", "call and backward", "a step, refreshed every 10")
     begun = time.perf_counter()
     penalty = SelfIntersectionPenalty(data, torch.device("cpu"))
@@ -61,7 +61,7 @@ def median_ms(work: Callable[[], object]) -> float:
 
 
 def pushed_tongue(data: GNMData, penalty: SelfIntersectionPenalty) -> Table:
-    """The tongue's vertices pushed into the teeth."""
+    """Return vertices with the tongue pushed into the teeth."""
     table = Table("tongue pushed", "by, mm", "vertices inside", "deepest, mm", "largest error, mm")
     tongue, teeth = regions.tongue(data), crossed_parts.teeth_of(data)
     for name, direction in DIRECTIONS.items():
@@ -80,7 +80,7 @@ def recovered(data: GNMData) -> Table:
     """Lips and a lid that crossed, after the penalty was minimised over the skin's offsets."""
     table = Table("crossed", "by, mm", "too deep, mm", "after", "cheeks moved, mm", "skin moved, mm", "seconds")
     template = torch.as_tensor(data.template_vertex_positions)
-    for name, cross, measure, rate in (  # the rate is per mm of what is to be undone
+    for name, cross, measure, rate in (  # the rate is per mm of displacement to undo
         ("lips", crossed_parts.raised_lower_lip, crossed_parts.lip_depths_mm, 1e-4),
         ("upper lid", crossed_parts.pressed_lid, crossed_parts.eyeball_depths_mm, 4e-5),
     ):
@@ -97,7 +97,7 @@ def recovered(data: GNMData) -> Table:
 
 
 def faces(data: GNMData, samples: Path | None) -> Iterator[tuple[str, Tensor]]:
-    """Heads of the model: given ones, then random ones kind by kind."""
+    """Return heads of the model: the given ones, then random ones of each kind."""
     template = data.template_vertex_positions.astype(np.float64)
     if samples is not None:
         with np.load(samples) as arrays:
@@ -114,7 +114,7 @@ def faces(data: GNMData, samples: Path | None) -> Iterator[tuple[str, Tensor]]:
 
 
 def own_overlap(data: GNMData, penalty: SelfIntersectionPenalty, samples: Path | None) -> Table:
-    """What the model's own faces overlap beyond the template: vertices, and the deepest; medians of random ones."""
+    """Return penetrating vertices and greatest depth of the faces beyond the template; medians of random ones."""
     table = Table("face", *penalty.pairs, title="vertices / deepest, mm; for random faces the median / the worst")
     found: dict[str, list[dict[str, tuple[int, float]]]] = {}
     for name, vertices in faces(data, samples):

@@ -1,13 +1,13 @@
-"""How well the term against sliding (`losses/uv_ssim.py`) puts vertices back, what disturbs it, and what it costs.
+"""Accuracy, robustness and cost of the uv-space SSIM term (`losses/uv_ssim.py`), which prevents tangential sliding.
 
     python -m bench.uv_ssim [--model NPZ] [--head-px 256] [--photo] [--captures NEUTRAL EXPRESSION]
 
-An expression of the model with a noise texture, seen by eight cameras, pixel noise 0.01. Every vertex starts one, two
-or three millimetres (rms) from its place, on the true surface, where another term keeps it. Errors are along the skin,
-of the face without lids and inner lips, where two cameras see it at 60 degrees or less. `--photo` adds what the fit's
-photometric term does against sliding: its texture follows the images, so that it forgives. Of the disturbed fits, which
-start at the truth, moves of all vertices are shown against the undisturbed one. `--captures` are two folders of one
-subject whose truth has the model's topology; the reference is then unwrapped from the neutral's images.
+An expression of the model with a noise texture is rendered by eight cameras with pixel noise 0.01. Every vertex starts
+one, two or three millimetres (rms) from its true position, on the true surface, where another term keeps it. Errors are
+tangential, of the face without lids and inner lips, where at least two cameras see it at 60 degrees or less. `--photo`
+adds the fit's photometric term, whose texture follows the images and so allows sliding. Disturbed fits start at the
+truth; the displacement of all vertices from the undisturbed fit is shown. `--captures` are two folders of one subject
+whose ground truth has the model's topology; the reference texture is then unwrapped from the neutral's images.
 """
 
 import argparse
@@ -42,13 +42,13 @@ STAGES = ((40, 20.0, 4e-3, 2e-3), (60, 8.0, 2e-3, 1e-3), (60, 4.0, 1e-3, 5e-5)) 
 STILL = STAGES[1:]  # from the truth
 SLIDE = 0.5  # weights
 SURFACE = 0.02
-HELD = 0.3  # of the surface, where vertices should stay
+HELD = 0.3  # weight of the term that keeps vertices on the surface
 NOISE = 0.01  # of the pixels, linear
 REPEATS = 20
 
 
 class Photo:
-    """The fit's photometric term: a texture that is drawn, compared, and moved half way to what was seen."""
+    """The fit's photometric term: a texture that is rendered, compared, and updated half way to the images."""
 
     def __init__(self, problem: Problem, size_px: int):
         ones = np.ones((len(problem.truth), 1), np.float32)
@@ -73,7 +73,7 @@ class Photo:
 def terms(
     problem: Problem, size_px: int, batches: Sequence[Targets] = (), photo: bool = False, held: float = SURFACE
 ) -> dict[str, Term]:
-    """The surface, and what else is asked for; batches are taken in turn."""
+    """Return the surface term and the requested others; batches are used in turn."""
     surface, loss, steps = OnSurface(problem), problem.loss(size_px), iter(range(10**9))
     found: dict[str, Term] = {"surface": lambda vertices: held * surface(vertices)}
     if photo:
@@ -102,7 +102,9 @@ def recovery(table: Table, name: str, problem: Problem, size_px: int, photo: boo
 
 
 def disturbances(problem: Problem, size_px: int) -> Table:
-    table = Table("from the truth", "median mm", "p99", "max", title="moved against the undisturbed, all vertices")
+    table = Table(
+        "from the truth", "median mm", "p99", "max", title="displacement from the undisturbed fit, all vertices"
+    )
     still = sliding.fit(problem, terms(problem, size_px, [problem.batch], held=HELD), problem.truth, STILL)
 
     def moves(name: str, from_: np.ndarray, to: np.ndarray) -> None:
@@ -118,7 +120,7 @@ def disturbances(problem: Problem, size_px: int) -> Table:
 
 
 def costs(problem: Problem, size_px: int) -> Table:
-    """Medians of wall and processor time, of one call."""
+    """Return medians of wall and processor time of one call."""
     table = Table("ms", "wall", "processor", title=f"{len(problem.batch.names)} views, texture of {size_px} px")
     vertices = torch.tensor(problem.truth, dtype=torch.float32, requires_grad=True)
 
@@ -143,7 +145,7 @@ def costs(problem: Problem, size_px: int) -> Table:
 
 
 def captured(data: GNMData, neutral: Path, expression: Path, head_px: int, size_px: int, slide_mm: float) -> Problem:
-    """From two captures with truth; the texture is the mean of the neutral's views."""
+    """Return the problem of two captures with ground truth; the texture is the mean of the neutral's views."""
     device, corner_uvs = backend.activate(), texture_atlas(data)
     batches, truths = [], []
     for folder in (neutral, expression):
@@ -173,8 +175,8 @@ def captured(data: GNMData, neutral: Path, expression: Path, head_px: int, size_
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--model", type=Path, metavar="NPZ", help="the first model, unless told")
-    parser.add_argument("--head-px", type=int, default=256, help="the head's height in the images")
+    parser.add_argument("--model", type=Path, metavar="NPZ", help="default: the first model")
+    parser.add_argument("--head-px", type=int, default=256, help="height of the head in the images, px")
     parser.add_argument("--slides", type=float, nargs="*", default=[1.0, 2.0, 3.0], metavar="MM")
     parser.add_argument("--photo", action="store_true")
     parser.add_argument("--captures", type=Path, nargs=2, metavar=("NEUTRAL", "EXPRESSION"))
@@ -207,7 +209,7 @@ def main() -> None:
 
 
 def views_of(batch: Targets, seed: int) -> Targets:
-    """Eight views at random, as a step of a fit has them."""
+    """Return eight random views, like a batch of a fit."""
     chosen = np.random.default_rng(seed).choice(len(batch.names), min(8, len(batch.names)), replace=False)
     return batch.select(sorted(chosen.tolist()), batch.rgb.device)
 

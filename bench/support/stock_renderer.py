@@ -1,14 +1,14 @@
-"""What Mitsuba's own projective integrator costs on the renderer's scene: an iteration to time beside ours.
+"""An iteration of Mitsuba's projective integrator [Zhang 2023] on the renderer's scene, for comparison.
 
-It is `direct_projective` as a user would make it unshaded, nothing patched: `sample` is the diffuse texture of the
-first hit, the boundary term for primary visibility is the library's, and there is no indirect light. One ray per pixel
-each for the image, the interior's adjoint and the boundary's. Of the ways to draw unshaded this is the cheapest: the
-ready-made plugins need the texture as an area light, and `prb_projective` took 1.7 times and `direct_projective` 2.2
-times as long.
+It is `direct_projective` without lighting and without patches: `sample` returns the diffuse texture of the first hit,
+the boundary term of primary visibility is the library's, and there is no indirect light. It casts one ray per pixel
+each for the image, the adjoint of the interior and that of the boundary. Of the ways to render without lighting this is
+the fastest: the existing plugins need the texture as an area light; `prb_projective` took 1.7 times and
+`direct_projective` 2.2 times as long.
 
-The comparison flatters it: three channels against our sixteen, since the boundary term does not reach further channels
-(AOVs), and no vertex normals to differentiate. On the other hand it draws whole films, where we draw the pixels that a
-fit compares, and view after view, since the sensor that batches views has no adjoint.
+The comparison is not exact. In its favour: three channels instead of our sixteen, because the boundary term does not
+support further channels (AOVs), and no vertex normals to differentiate. Against it: it renders whole images instead of
+the pixels that a fit compares, and one view at a time, because the sensor that batches views has no adjoint.
 """
 
 from collections.abc import Callable, Sequence
@@ -28,14 +28,19 @@ def iteration(
     texture: Float[torch.Tensor, "R R 3"],
     moved: Callable[[], Float[torch.Tensor, "V 3"]],
 ) -> Callable[[], None]:
-    """Draws all views of a mesh and carries random adjoint images back to its vertices and texture.
+    """Return a function that renders all views and propagates random adjoint images to vertices and texture.
 
-    `moved` gives the vertices of each iteration.
+    Args:
+        cameras: the views.
+        triangles: of vertices that are not duplicated at uv seams.
+        corner_uvs: of the atlas.
+        texture: linear.
+        moved: returns the vertices of each iteration.
     """
     import drjit as dr
     import mitsuba as mi
 
-    # Mitsuba has one uv per vertex: a vertex on a seam is drawn several times.
+    # Mitsuba has one uv per vertex: vertices on a seam are duplicated.
     corners = np.column_stack([triangles.ravel(), corner_uvs.reshape(-1, 2)])
     rows, faces = np.unique(corners, axis=0, return_inverse=True)
     welded = mi.UInt32(rows[:, 0].astype(np.uint32))
@@ -89,13 +94,13 @@ def _split(vertices: torch.Tensor, welded: Any) -> Any:
 
 
 def _integrator() -> type:
-    """The class, which can be written down only once a variant is chosen."""
+    """Return the integrator's class, which can be defined only after a variant is set."""
     import drjit as dr
     import mitsuba as mi
     from mitsuba.ad.integrators.direct_projective import DirectProjectiveIntegrator
 
     class Unshaded(DirectProjectiveIntegrator):
-        """The diffuse colour of what is seen first."""
+        """Return the diffuse colour of the first hit."""
 
         def sample(
             self,
