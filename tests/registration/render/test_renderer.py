@@ -370,9 +370,8 @@ def test_cameras_of_two_sizes_or_with_distortion_are_refused():
 
 def test_a_mesh_with_fins_is_refused():
     with pytest.raises(InputError, match="not a manifold"):
-        Renderer(
-            np.array([[0, 1, 2], [1, 0, 3], [0, 1, 3]]), np.zeros((3, 3, 2), np.float32), np.ones((4, 1), np.float32)
-        )
+        faces = np.array([[0, 1, 2], [1, 0, 3], [0, 1, 3]])
+        Renderer(faces, np.zeros((3, 3, 2), np.float32), np.ones((4, 1), np.float32))
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="there is a CUDA device")
@@ -382,19 +381,18 @@ def test_cuda_without_a_device_is_an_input_error():
 
 
 @pytest.mark.cuda
-def test_the_gpu_draws_and_differentiates_as_the_cpu_does():
+def test_the_gpu_renders_and_differentiates_as_the_cpu_does():
     texture = random_texture(64)
 
-    def drawn(variant: backend.Variant) -> tuple[Rendered, torch.Tensor]:
+    def rendered(variant: backend.Variant) -> tuple[Rendered, torch.Tensor]:
         device = backend.activate(variant)
         renderer, vertices, pixels = tiny(edge_samples=64.0)
-        pixels = Pixels.full(pixels.cameras, device)
         attached = vertices.to(device).requires_grad_()
-        image = renderer(attached, texture.to(device), pixels)
+        image = renderer(attached, texture.to(device), Pixels.full(pixels.cameras, device))
         (image.rgb.sum() + image.normals[:, 0].sum() + image.mask.sum() + image.classes[:, 0].sum()).backward()
         return Rendered(**{name: v.detach().cpu() for name, v in vars(image).items()}), attached.grad.cpu()
 
-    (cpu, cpu_gradient), (gpu, gpu_gradient) = drawn("llvm"), drawn("cuda")
+    (cpu, cpu_gradient), (gpu, gpu_gradient) = rendered("llvm"), rendered("cuda")
     for name, values in vars(cpu).items():
         wrong = (values - getattr(gpu, name)).abs().reshape(len(values), -1).amax(1)
         assert (wrong > 1e-3).double().mean() < 2e-3, name
