@@ -1,6 +1,5 @@
-"""A stabilized set <-> its folder on disk. Files and fields are described in docs/formats.md."""
+"""Read and write a stabilized set as a folder on disk. Files and fields are described in docs/formats.md."""
 
-import json
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -10,32 +9,80 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from registration.errors import InputError
 from registration.stabilize.components import Components
 from registration.stabilize.pipeline import StabilizedSubject
-from registration.storage.files import atomic_directory, read_json_of_kind, refuse_foreign
-from registration.storage.hashing import hash_arrays, to_jsonable
+from registration.storage.files import atomic_directory, refuse_foreign
+from registration.storage.hashing import hash_arrays
+from registration.storage.npz import Kind, NpzSchema
+from registration.storage.records import Record
 
-SCHEMA = 1
 KIND = "gnm-stabilized"
 MANIFEST, PAGE, COMPONENTS, SUBJECTS = "manifest.json", "index.html", "components.npz", "subjects"
 _FILES = (MANIFEST, PAGE, COMPONENTS, SUBJECTS)
+_TITLE, _FIX = "stabilized set", "run `gnmreg stabilize` again"
 _SUBJECT_ARRAYS = ("neutral", "T_neutral_expression", "vertices", "confidence_map", "residual_mm", "T_head_world")
-_COMPONENT_ARRAYS = (
-    *("rows", "modes", "coefficients", "energy", "twists", "rigid_share", "rigid_size", "free_of_label", "shared"),
-    *("flagged", "steady_twists"),
+_SUBJECT = NpzSchema(
+    title=_TITLE,
+    fix=_FIX,
+    fields={
+        "neutral": ("float", "V 3"),
+        "T_neutral_expression": ("float", "S 4 4"),
+        "vertices": ("float", "S V 3"),
+        "confidence_map": ("float", "V"),
+        "residual_mm": ("float", "S R"),
+        "T_head_world": ("float", "4 4"),
+        "subject": ("text", ""),
+        "names": ("text", "S"),
+        "labels": ("text", "S"),
+    },
+    finite=False,
 )
+_COMPONENTS = NpzSchema(
+    title=_TITLE,
+    fix=_FIX,
+    fields={"regions": ("text", "N"), "subjects": ("text", "S"), "names": ("text", "S"), "labels": ("text", "S")},
+)
+_COMPONENT_ARRAYS: dict[str, tuple[Kind, str]] = {  # of each region: fields of `Components`
+    "rows": ("integer", "R"),
+    "modes": ("float", "K R 3"),
+    "coefficients": ("float", "S K"),
+    "energy": ("float", "K"),
+    "twists": ("float", "K 6"),
+    "rigid_share": ("float", "K"),
+    "rigid_size": ("float", "K"),
+    "free_of_label": ("float", "K"),
+    "shared": ("float", "K"),
+    "flagged": ("bool", "K"),
+    "steady_twists": ("float", "2 K 6"),
+}
+_ALONG = "along"  # array of each region: a field of `StoredComponents`
+
+
+@dataclass(frozen=True, kw_only=True)
+class StabilizedManifest(Record, kind=KIND, schema=1, title=_TITLE, fix=_FIX):
+    """`manifest.json` of a stabilized set."""
+
+    content_id: str  # sha256 of the arrays of all files
+    input_hash: str  # sha256 of inputs, settings and decisions
+    dataset: str  # sha256 of inputs and settings, without decisions
+    subjects: tuple[str, ...]  # in the order of their files
+    left_out: Mapping[str, tuple[str, ...]]  # subject -> excluded registrations
+    decisions: tuple[Mapping[str, Any], ...]  # as `to_jsonable` returns them
+    figures: Mapping[str, Any]
+    config: Mapping[str, Any]  # the settings, as `to_jsonable` returns them
+    inputs: Mapping[str, str]  # name -> sha256
+    versions: Mapping[str, str]
 
 
 @dataclass(frozen=True, kw_only=True)
 class StoredComponents:
-    """What a person looks at: read from `components.npz`."""
+    """The components that an operator reviews: `components.npz`."""
 
     components: tuple[Components, ...]
     subjects: tuple[str, ...]  # of every sample, as the next two
     names: tuple[str, ...]
     labels: tuple[str, ...]
-    along: Mapping[str, Float[np.ndarray, "K V 3"]]  # region -> what the whole head does along with a coefficient of 1
+    along: Mapping[str, Float[np.ndarray, "K V 3"]]  # region -> displacement of the whole head for a coefficient of 1
 
 
 def check_out(out: Path) -> None:
@@ -44,31 +91,34 @@ def check_out(out: Path) -> None:
 
 
 def is_stabilized(out: Path) -> bool:
-    """Whether the folder holds a manifest that we wrote."""
-    return read_json_of_kind(out / MANIFEST, KIND) is not None
+    """Return whether the folder holds a manifest that we wrote, of any schema version."""
+    return StabilizedManifest.is_ours(Path(out) / MANIFEST)
 
 
-def read_manifest(out: Path) -> dict[str, Any]:
-    """Raises InputError for a folder that is not ours, or of another schema version."""
-    manifest = read_json_of_kind(out / MANIFEST, KIND)
-    if manifest is None:
-        raise _unreadable(out, expected=f'{MANIFEST} with "kind": "{KIND}"', got="none")
-    if manifest.get("schema") != SCHEMA:
-        raise _unreadable(out / MANIFEST, expected=f"schema {SCHEMA}", got=manifest.get("schema"))
-    return manifest
+def read_manifest(out: Path) -> StabilizedManifest:
+    """Read the manifest of a stabilized set.
+
+    Raises:
+        InputError: no manifest, not ours, another schema version, or a field that is missing or of a wrong type.
+    """
+    return StabilizedManifest.read(Path(out) / MANIFEST)
 
 
 @contextmanager
-def fresh_set(out: Path) -> Iterator[Path]:
-    """As `artifacts.atomic_directory`, for a stabilized set. Raises InputError as `check_out`."""
+def new_stabilized_set(out: Path) -> Iterator[Path]:
+    """Yield a new folder for a set, as `atomic_directory`. Raises InputError as `check_out`."""
     check_out(out)
-    with atomic_directory(out) as fresh:
-        (fresh / SUBJECTS).mkdir()
-        yield fresh
+    with atomic_directory(out) as temporary:
+        (temporary / SUBJECTS).mkdir()
+        yield temporary
 
 
 def write_subject(subject: StabilizedSubject, folder: Path, number: int) -> str:
-    """Writes `subjects/NNNN.npz`; returns the content id of its arrays. A subject's name may be no file's."""
+    """Write `subjects/NNNN.npz`, numbered because a subject's name may be no file name.
+
+    Returns:
+        The content id of its arrays.
+    """
     arrays = {name: getattr(subject, name) for name in _SUBJECT_ARRAYS}
     for name in ("neutral", "vertices", "confidence_map", "residual_mm"):
         arrays[name] = arrays[name].astype(np.float32)
@@ -78,8 +128,8 @@ def write_subject(subject: StabilizedSubject, folder: Path, number: int) -> str:
 
 
 def read_subject(folder: Path, number: int) -> StabilizedSubject:
-    """Raises InputError for a file that is missing or damaged."""
-    arrays = _read(folder / SUBJECTS / f"{number:04d}.npz", (*_SUBJECT_ARRAYS, "subject", "names", "labels"))
+    """Read what `write_subject` wrote. Raises InputError for a file that is missing or damaged."""
+    arrays = _SUBJECT.read(folder / SUBJECTS / f"{number:04d}.npz")
     return StabilizedSubject(
         subject=str(arrays["subject"]),
         names=tuple(arrays["names"].tolist()),
@@ -89,13 +139,13 @@ def read_subject(folder: Path, number: int) -> StabilizedSubject:
 
 
 def write_components(stored: StoredComponents, folder: Path) -> str:
-    """Writes `components.npz`; returns the content id of its arrays."""
+    """Write `components.npz`. Returns the content id of its arrays."""
     arrays: dict[str, np.ndarray] = {}
     for part in stored.components:
         for name in _COMPONENT_ARRAYS:
             value = getattr(part, name)
             arrays[f"{part.region}_{name}"] = value.astype(np.float32) if name == "modes" else value
-        arrays[f"{part.region}_along"] = stored.along[part.region].astype(np.float32)
+        arrays[f"{part.region}_{_ALONG}"] = stored.along[part.region].astype(np.float32)
     texts = {name: np.array(getattr(stored, name)) for name in ("subjects", "names", "labels")}
     regions = np.array([part.region for part in stored.components])
     np.savez(folder / COMPONENTS, allow_pickle=False, regions=regions, **texts, **arrays)
@@ -103,12 +153,15 @@ def write_components(stored: StoredComponents, folder: Path) -> str:
 
 
 def read_components(folder: Path) -> StoredComponents:
-    """Raises InputError for a file that is missing or damaged."""
+    """Read what `write_components` wrote. Raises InputError for a file that is missing or damaged."""
     file = folder / COMPONENTS
-    arrays = _read(file, ("regions", "subjects", "names", "labels"))
+    arrays = _COMPONENTS.read(file)
     regions = arrays["regions"].tolist()
-    if missing := [f"{r}_{name}" for r in regions for name in _COMPONENT_ARRAYS if f"{r}_{name}" not in arrays]:
-        raise _unreadable(file, expected=f"the array {missing[0]!r}", got="no such array")
+    for region in regions:
+        fields = {f"{region}_{n}": kind for n, kind in {**_COMPONENT_ARRAYS, _ALONG: ("float", "K V 3")}.items()}
+        schema = NpzSchema(title=_TITLE, fix=_FIX, fields=fields, finite=False)
+        if (defect := schema.find_defect(arrays)) is not None:
+            raise schema.error(defect, file)
     return StoredComponents(
         components=tuple(
             Components(region=r, **{name: arrays[f"{r}_{name}"] for name in _COMPONENT_ARRAYS}) for r in regions
@@ -116,31 +169,5 @@ def read_components(folder: Path) -> StoredComponents:
         subjects=tuple(arrays["subjects"].tolist()),
         names=tuple(arrays["names"].tolist()),
         labels=tuple(arrays["labels"].tolist()),
-        along={r: arrays[f"{r}_along"] for r in regions},
-    )
-
-
-def write_manifest(manifest: Mapping[str, Any], folder: Path) -> None:
-    text = json.dumps(to_jsonable({"kind": KIND, "schema": SCHEMA, **manifest}), indent=1, allow_nan=False) + "\n"
-    (folder / MANIFEST).write_text(text, encoding="utf-8")
-
-
-def _read(file: Path, needed: tuple[str, ...]) -> dict[str, np.ndarray]:
-    try:
-        with np.load(file, allow_pickle=False) as archive:
-            arrays = {name: archive[name] for name in archive.files}
-    except Exception as error:  # whatever a broken file makes zipfile, zlib and numpy raise
-        raise _unreadable(file, expected="an undamaged NPZ file", got=f"{type(error).__name__}: {error}") from error
-    if missing := [name for name in needed if name not in arrays]:
-        raise _unreadable(file, expected=f"the array {missing[0]!r}", got="no such array")
-    return arrays
-
-
-def _unreadable(where: object, *, expected: object, got: object) -> InputError:
-    return InputError(
-        "The stabilized set cannot be read",
-        where=where,
-        expected=expected,
-        got=got,
-        fix="run `gnmreg stabilize` again",
+        along={r: arrays[f"{r}_{_ALONG}"] for r in regions},
     )

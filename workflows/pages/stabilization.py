@@ -1,6 +1,6 @@
 """The HTML page of a stabilized set: self-contained."""
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from itertools import islice
 from typing import Any
 
@@ -11,6 +11,7 @@ from registration.report.charts import loss_curves
 from registration.report.inputs import HeatMap
 from registration.stabilize.components import Components, Head
 from registration.stabilize.pipeline import StabilizedSubject
+from registration.stabilize.stabilized_folder import StabilizedManifest
 from workflows.pages.base import heat_images, render
 
 LIMIT_MM = 2.0  # at the end of the colour scale
@@ -18,25 +19,25 @@ _MAX_SUBJECTS = 12  # with maps; a page of hundreds would be too large to open
 
 
 def write_stabilize_page(
-    manifest: Mapping[str, Any], components: Sequence[Components], subjects: Iterable[StabilizedSubject], head: Head
+    manifest: StabilizedManifest, components: Sequence[Components], subjects: Iterable[StabilizedSubject], head: Head
 ) -> str:
     """Return the page: maps and residuals of the first subjects, and all components with their scores."""
-    figures = manifest["figures"]
+    figures = manifest.figures
     tiles = (
-        (f"{figures['samples']}", "", f"expressions of {len(manifest['subjects'])} subjects"),
+        (f"{figures['samples']}", "", f"expressions of {len(manifest.subjects)} subjects"),
         (f"{figures['residual_median_mm']:.2f}", "mm", "median residual of the skin that follows the skull"),
         (f"{figures['regional_turn_deg']:.2f}", "°", "rotation by the second stage, rms"),
         (f"{figures['regional_rms_mm']:.2f}", "mm", "displacement by the second stage, rms"),
     )
-    still_mm = manifest["config"].automatic.still_mm
+    still_mm = manifest.config["automatic"]["still_mm"]
     shown = [_subject(subject, head, still_mm) for subject in islice(subjects, _MAX_SUBJECTS)]
     return render(
         "stabilization.html",
-        dataset=manifest["dataset"],
+        dataset=manifest.dataset,
         tiles=tiles,
         limit_mm=LIMIT_MM,
         subjects=shown,
-        not_shown=len(manifest["subjects"]) - len(shown),
+        not_shown=len(manifest.subjects) - len(shown),
         components=[row for part in components for row in _rows(part, head)],
     )
 

@@ -144,7 +144,7 @@ def _stabilized(folder: Path) -> dict[str, dict[str, Any]]:
     """By subject: neutral, expressions and their labels, in one frame. Empty if the run was not stabilized."""
     if not stabilized.is_stabilized(folder):
         return {}
-    count = len(stabilized.read_manifest(folder)["subjects"])
+    count = len(stabilized.read_manifest(folder).subjects)
     subjects = (stabilized.read_subject(folder, number) for number in range(count))
     return {
         subject.subject: {

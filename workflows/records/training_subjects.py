@@ -51,7 +51,7 @@ class RegisteredSubjects:
             for name, usable in self.usable.items()
             for folder in (usable.neutral, *(usable.expressions if self.steady else ()))
         }
-        return ids | ({"stabilized": stabilized.read_manifest(self.steady)["content_id"]} if self.steady else {})
+        return ids | ({"stabilized": stabilized.read_manifest(self.steady).content_id} if self.steady else {})
 
     def __iter__(self) -> Iterator[TrainingSubject]:
         model, weights = GNM(self.model), SkullSkin.of(self.model).area
@@ -91,7 +91,7 @@ class RegisteredSubjects:
 
 def _subject_numbers(steady: Path | None) -> dict[str, int]:
     """Subject -> number in the stabilized set."""
-    return {} if steady is None else {name: k for k, name in enumerate(stabilized.read_manifest(steady)["subjects"])}
+    return {} if steady is None else {name: k for k, name in enumerate(stabilized.read_manifest(steady).subjects)}
 
 
 def has_truths(captures: SubjectCaptures, model: GNMData) -> bool:

@@ -82,24 +82,24 @@ def stabilize_run(
     digest = input_hash(inputs.inputs, {"settings": to_jsonable(settings), "decisions": to_jsonable(decided)})
     if reuse != "none" and disk.is_stabilized(out):
         manifest = disk.read_manifest(out)
-        if manifest["input_hash"] == digest or (reuse == "any decisions" and manifest["dataset"] == dataset):
-            return StabilizationResult(out=out, dataset=dataset, figures=manifest["figures"])
-    with disk.fresh_set(out) as temporary:
+        if manifest.input_hash == digest or (reuse == "any decisions" and manifest.dataset == dataset):
+            return StabilizationResult(out=out, dataset=dataset, figures=dict(manifest.figures))
+    with disk.new_stabilized_set(out) as temporary:
         ids, components, effect = _write_subjects(temporary, inputs, data, head, settings, decided, progress)
         figures = _figures(components, effect, temporary, len(inputs.subjects))
-        manifest = {
-            "content_id": input_hash(ids, {}),
-            "input_hash": digest,
-            "dataset": dataset,
-            "subjects": [subject.subject for subject in inputs.subjects],
-            "left_out": {subject.subject: subject.excluded for subject in inputs.subjects if subject.excluded},
-            "decisions": decided,
-            "figures": figures,
-            "config": settings,
-            "inputs": inputs.inputs,
-            "versions": versions(),
-        }
-        disk.write_manifest(manifest, temporary)
+        manifest = disk.StabilizedManifest(
+            content_id=input_hash(ids, {}),
+            input_hash=digest,
+            dataset=dataset,
+            subjects=tuple(subject.subject for subject in inputs.subjects),
+            left_out={subject.subject: tuple(subject.excluded) for subject in inputs.subjects if subject.excluded},
+            decisions=tuple(to_jsonable(decided)),
+            figures=figures,
+            config=to_jsonable(settings),
+            inputs=inputs.inputs,
+            versions=versions(),
+        )
+        manifest.write(temporary / disk.MANIFEST)
         stabilized = (disk.read_subject(temporary, k) for k in range(len(inputs.subjects)))
         page = write_stabilize_page(manifest, components, stabilized, head)
         (temporary / disk.PAGE).write_text(page, encoding="utf-8")
@@ -139,8 +139,8 @@ def stabilize_subjects(
     manifest = disk.read_manifest(result.out)
     return StabilizeResult(
         out=out,
-        content_id=manifest["content_id"],
-        input_hash=manifest["input_hash"],
+        content_id=manifest.content_id,
+        input_hash=manifest.input_hash,
         figures=to_jsonable(result.figures),
     ).to_json()
 

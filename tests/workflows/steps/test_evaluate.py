@@ -199,7 +199,18 @@ def test_a_run_gives_its_neutrals_and_what_was_stabilized(model, run):
         T_head_world=np.eye(4),
     )
     stabilized.write_subject(steady, place, 0)
-    stabilized.write_manifest({"subjects": ["anna"]}, place)
+    stabilized.StabilizedManifest(
+        content_id="",
+        input_hash="",
+        dataset="",
+        subjects=("anna",),
+        left_out={},
+        decisions=(),
+        figures={},
+        config={},
+        inputs={},
+        versions={},
+    ).write(place / stabilized.MANIFEST)
     anna, ben = read_held_out(run).subjects
     np.testing.assert_array_equal(anna.expressions, steady.vertices)
     assert anna.categories == ("jaw_open",) and len(ben.expressions) == 0

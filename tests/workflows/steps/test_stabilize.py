@@ -179,7 +179,7 @@ def test_failed_registrations_can_be_left_out(own, model_file):  # noqa: F811
     spoil_status(own)
     outcome = stabilize_run(own, model_path=model_file, selection=Selection(skip_failed=True))
     manifest = disk.read_manifest(outcome.out)
-    assert outcome.figures["samples"] == 5 and manifest["left_out"] == {"synth_0001": ["smile"]}
+    assert outcome.figures["samples"] == 5 and manifest.left_out == {"synth_0001": ("smile",)}
 
 
 def test_other_folders_and_other_models_are_refused(own, model_file, model, tmp_path):  # noqa: F811

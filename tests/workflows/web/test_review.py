@@ -114,7 +114,7 @@ def test_opening_a_review_again_keeps_the_decisions(page, run, model_file):  # n
     decided = stabilize_run(run, model_path=model_file, decisions=run / "decisions.jsonl")
     written = disk.read_manifest(decided.out)
     review(run, model_path=model_file, port=0).close()
-    assert disk.read_manifest(decided.out) == written and len(written["decisions"]) == 1
+    assert disk.read_manifest(decided.out) == written and len(written.decisions) == 1
 
 
 def test_a_port_in_use_is_refused(page, run, model_file):  # noqa: F811
