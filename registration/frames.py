@@ -1,6 +1,6 @@
-"""All frames, units, pixel and colour conventions, and every conversion between them.
+"""Conventions of frames, units, pixels and colours, and the conversions between them.
 
-- Lengths are metres, angles radians; figures for people are millimetres.
+- Lengths are metres, angles radians; metrics are in millimetres.
 - World and model frames are right-handed; the model's is +Y up, +Z out of the face, +X the subject's left.
 - The camera frame is OpenCV's: x right, y down, z forward. `T_dst_src` maps points: p_dst = T_dst_src @ p_src.
 - Pixel (0, 0)'s *centre* is at (0.5, 0.5), as in COLMAP. OpenCV's own functions put it at (0, 0): convert K first.
@@ -16,7 +16,7 @@ MM_PER_M = 1e3
 
 
 def axis_angle_to_matrix(axis_angle: Float[Tensor, "... 3"]) -> Float[Tensor, "... 3 3"]:
-    """Rodrigues' formula. Differentiable everywhere, also at zero rotation; radians in."""
+    """Convert axis-angle (radians) to a matrix (Rodrigues' formula); differentiable everywhere, also at zero."""
     squared = (axis_angle * axis_angle).sum(-1)[..., None, None]
     small = squared < 1e-8
     # The double `where` keeps the unused branch finite, so that its zero gradient is not 0 * inf.
@@ -31,7 +31,7 @@ def axis_angle_to_matrix(axis_angle: Float[Tensor, "... 3"]) -> Float[Tensor, ".
 
 
 def matrix_to_axis_angle(rotation: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "3"]:
-    """Inverse of `axis_angle_to_matrix` for one matrix; the angle is in [0, pi]."""
+    """Convert one rotation matrix to axis-angle (radians); the angle is in [0, pi]."""
     from scipy.spatial.transform import Rotation
 
     return Rotation.from_matrix(np.asarray(rotation, np.float64)).as_rotvec()
@@ -45,14 +45,14 @@ def transform_points(
 
 
 def opencv_intrinsics(intrinsics: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "3 3"]:
-    """K for OpenCV's functions, which put the centre of pixel (0, 0) at (0, 0) instead of (0.5, 0.5)."""
+    """Return K for OpenCV's functions, which put the centre of pixel (0, 0) at (0, 0) instead of (0.5, 0.5)."""
     shifted = np.array(intrinsics, np.float64)
     shifted[:2, 2] -= 0.5
     return shifted
 
 
 def srgb_to_linear(value: np.ndarray) -> np.ndarray:
-    """sRGB in [0, 1] to linear light (IEC 61966-2-1)."""
+    """Convert sRGB in [0, 1] to linear light (IEC 61966-2-1)."""
     value = np.asarray(value)
     return np.where(value <= 0.04045, value / 12.92, ((np.maximum(value, 0.04045) + 0.055) / 1.055) ** 2.4).astype(
         value.dtype
@@ -60,7 +60,7 @@ def srgb_to_linear(value: np.ndarray) -> np.ndarray:
 
 
 def linear_to_srgb(value: np.ndarray) -> np.ndarray:
-    """Linear light to sRGB in [0, 1]; clips to [0, 1] first."""
+    """Convert linear light, clipped to [0, 1], to sRGB in [0, 1]."""
     value = np.clip(value, 0.0, 1.0)
     return np.where(value <= 0.0031308, value * 12.92, 1.055 * np.maximum(value, 1e-9) ** (1 / 2.4) - 0.055).astype(
         value.dtype

@@ -1,4 +1,4 @@
-"""The folder in which models, and proofs about this machine, are kept between runs."""
+"""The cache folder: downloaded and built models, and the libLLVM that was tested on this machine."""
 
 from pathlib import Path
 

@@ -1,4 +1,4 @@
-"""Digests that tell whether two inputs, or two results, are the same: sha256, hexadecimal, blind to names and dates."""
+"""Digests of inputs and results: sha256, hexadecimal, independent of paths and dates."""
 
 import hashlib
 import json
@@ -27,7 +27,7 @@ PACKAGES = (
 
 
 def hash_file(path: Path) -> str:
-    """sha256 of a file's bytes, hexadecimal."""
+    """Return the sha256 of a file's bytes."""
     with open(path, "rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
@@ -83,14 +83,14 @@ def _field_digests(value: Any) -> Any:
 
 
 def input_hash(inputs: Mapping[str, str], config: Mapping[str, Any]) -> str:
-    """One digest of all that decides a result: input digests, resolved configuration and our own version."""
+    """Return one digest of everything that determines a result: input digests, configuration, the project's version."""
     digest = hashlib.sha256()
     _feed(digest, [dict(inputs), dict(config), _version("gnm-registration")])
     return digest.hexdigest()
 
 
 def content_id(arrays: Mapping[str, np.ndarray], texture: np.ndarray) -> str:
-    """sha256 over names, types, shapes and values of the arrays and of the 16 bit texture."""
+    """Return the sha256 over names, types, shapes and values of the arrays and of the 16 bit texture."""
     digest = hashlib.sha256()
     for name, array in sorted({**arrays, "texture": texture}.items()):
         digest.update(f"{name} {array.dtype.str} {array.shape}\n".encode())
@@ -99,14 +99,14 @@ def content_id(arrays: Mapping[str, np.ndarray], texture: np.ndarray) -> str:
 
 
 def hash_arrays(*arrays: np.ndarray) -> str:
-    """sha256 over the types, shapes and values of some arrays, in order."""
+    """Return the sha256 over the types, shapes and values of arrays, in order."""
     digest = hashlib.sha256()
     _feed(digest, list(arrays))
     return digest.hexdigest()
 
 
 def versions() -> dict[str, str]:
-    """Versions of Python and of the packages that a result depends on."""
+    """Return the versions of Python and of the packages that a result depends on."""
     return {"python": platform.python_version(), **{name: _version(name) for name in PACKAGES}}
 
 

@@ -1,4 +1,4 @@
-"""Meshes for people's tools: binary PLY and Wavefront OBJ, vertices in the model's order."""
+"""Write meshes for other programs: binary PLY and Wavefront OBJ, vertices in the model's order."""
 
 from pathlib import Path
 
@@ -7,7 +7,7 @@ from jaxtyping import Float, Int
 
 
 def write_ply(file: Path, vertices: Float[np.ndarray, "V 3"], triangles: Int[np.ndarray, "F 3"]) -> None:
-    """Binary little-endian PLY with exactly these vertices, float32, in this order; no uvs, so nothing is split."""
+    """Write a binary little-endian PLY with exactly these vertices, float32, in this order; without uvs."""
     header = (
         "ply\nformat binary_little_endian 1.0\n"
         f"element vertex {len(vertices)}\nproperty float x\nproperty float y\nproperty float z\n"
@@ -25,7 +25,15 @@ def write_obj(
     corner_uvs: Float[np.ndarray, "F 3 2"],
     texture: str,
 ) -> None:
-    """OBJ with uvs (v = 0 at the texture's bottom) and, beside it, an MTL that names the texture file."""
+    """Write an OBJ file and an MTL file of the same name.
+
+    Args:
+        file: the OBJ file.
+        vertices: written as they are.
+        triangles: indices of vertices.
+        corner_uvs: of the triangles' corners; v = 0 at the bottom of the texture.
+        texture: name of the texture's file, for the MTL file.
+    """
     uvs, index = np.unique(corner_uvs.reshape(-1, 2), axis=0, return_inverse=True)
     corners = np.stack([triangles, index.reshape(-1, 3)], -1).reshape(-1, 6) + 1
     material = file.with_suffix(".mtl")
