@@ -20,8 +20,7 @@ from pathlib import Path
 import numpy as np
 
 from bench.support import performances, stabilization_measures
-from coregister.first_model import assembly as anatomy_of
-from coregister.first_model import build, makehuman, population
+from coregister.first_model import assembly, build, makehuman, population
 from registration.geometry.rigid import align
 from registration.model import gnm_npz
 from registration.model.gnm_npz import GNMData
@@ -44,8 +43,8 @@ MOTIONS = 50
 def measure_population(subjects: int) -> None:
     """Print all metrics for synthetic subjects, the headline ones last."""
     data = gnm_npz.read(build.bootstrap())
-    anatomy = anatomy_of.build_assembly(makehuman.read(makehuman.fetch()), population.mean_person())
-    truths = [performances.true_subject(anatomy, 1000 + number) for number in range(subjects)]
+    head_assembly = assembly.build_assembly(makehuman.read(makehuman.fetch()), population.mean_person())
+    truths = [performances.true_subject(head_assembly, 1000 + number) for number in range(subjects)]
     results = [stabilization_measures.remove_injected_motion(truths, data, seed) for seed in range(DRAWS)]
     print(f"spurious_energy_reduced {min(result.reduced for result in results):.3f}")
     print(f"spurious_expression_lost {max(result.lost for result in results):.4f}")

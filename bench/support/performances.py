@@ -48,12 +48,12 @@ class ObservedSubject:
     T_expression_neutral: np.ndarray  # S 4 4: the added motions
 
 
-def true_subject(anatomy: HeadAssembly, seed: int, names: tuple[str, ...] = NAMES) -> TrueSubject:
+def true_subject(head_assembly: HeadAssembly, seed: int, names: tuple[str, ...] = NAMES) -> TrueSubject:
     """Return a random subject outside the first model's span with expressions of random strength."""
     rng = np.random.default_rng(seed)
-    person = population.sample_unspanned_person(anatomy.source, rng)
-    moves = {name: anatomy.source.target(name) for name in person.weights}
-    neutral, joints = anatomy.assemble(person, moves)
+    person = population.sample_unspanned_person(head_assembly.source, rng)
+    moves = {name: head_assembly.source.target(name) for name in person.weights}
+    neutral, joints = head_assembly.assemble(person, moves)
     heads = []
     for name in names:
         expression = EXPRESSIONS[name]
@@ -61,7 +61,7 @@ def true_subject(anatomy: HeadAssembly, seed: int, names: tuple[str, ...] = NAME
         varied = Expression(
             category=expression.category, units=units, gaze_deg=expression.gaze_deg, tongue=expression.tongue
         )
-        heads.append(expressions.apply_expression(anatomy, varied, neutral, joints))
+        heads.append(expressions.apply_expression(head_assembly, varied, neutral, joints))
     return TrueSubject(name=f"synth_{seed:04d}", neutral=neutral, labels=names, vertices=np.stack(heads))
 
 

@@ -4,8 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from coregister.first_model import assembly as anatomy_of
-from coregister.first_model import build, makehuman, population
+from coregister.first_model import assembly, build, makehuman, population
 from coregister.first_model.assembly import HeadAssembly
 from coregister.first_model.makehuman import MakeHuman
 from registration.errors import InputError
@@ -27,8 +26,8 @@ def source(wheel) -> MakeHuman:
 
 
 @pytest.fixture(scope="session")
-def anatomy(source) -> HeadAssembly:
-    return anatomy_of.build_assembly(source, population.mean_person())
+def head_assembly(source) -> HeadAssembly:
+    return assembly.build_assembly(source, population.mean_person())
 
 
 @pytest.fixture(scope="session")

@@ -247,15 +247,15 @@ def test_a_model_of_the_official_size_on_its_own_samples():
 
 
 @pytest.mark.slow
-def test_subjects_outside_the_first_models_span(anatomy, model, model_file):
-    data, source = gnm_npz.read(model_file), anatomy.source
+def test_subjects_outside_the_first_models_span(head_assembly, model, model_file):
+    data, source = gnm_npz.read(model_file), head_assembly.source
     rng = np.random.default_rng(12345)
     performed = [expressions.expression_by_name(name) for name in ("smile", "jaw_open", "brows_up")]
 
     def subject(number, draw):
         person = draw(source, rng)
-        neutral, joints = anatomy.assemble(person, {name: source.target(name) for name in person.weights})
-        meshes = np.stack([expressions.apply_expression(anatomy, each, neutral, joints) for each in performed])
+        neutral, joints = head_assembly.assemble(person, {name: source.target(name) for name in person.weights})
+        meshes = np.stack([expressions.apply_expression(head_assembly, each, neutral, joints) for each in performed])
         return HeldOutSubject(
             subject=f"{draw.__name__}_{number}",
             neutral=neutral,

@@ -26,13 +26,13 @@ def template(model):
 
 
 @pytest.fixture(scope="module")
-def expressed(model, source, anatomy):
+def expressed(model, source, head_assembly):
     """Unit name -> the displacement that the expression basis has nearest to MakeHuman's face unit, and the unit's."""
     basis = model.expression_basis.reshape(len(model.expression_basis), -1).astype(np.float64)
     q, _ = np.linalg.qr(basis.T)
 
     def nearest(name):
-        unit = anatomy.expression_displacement(source.target(f"faceunits/{name}"))
+        unit = head_assembly.expression_displacement(source.target(f"faceunits/{name}"))
         return (q @ (q.T @ unit.ravel())).reshape(unit.shape), unit
 
     return nearest
@@ -91,12 +91,12 @@ def test_lids_stay_out_of_eyeballs_from_identity_to_identity(model, template):
     assert min(heights) > -0.4e-3
 
 
-def test_a_person_s_lids_rest_on_the_eyeballs(source, anatomy):
+def test_a_person_s_lids_rest_on_the_eyeballs(source, head_assembly):
     rng = np.random.default_rng(3)
     for _ in range(3):
         person = sample_unspanned_person(source, rng)
-        vertices, joints = anatomy.assemble(person, {name: source.target(name) for name in person.weights})
-        height = above_eyes(vertices[anatomy.slices["skin"]], joints[2:])
+        vertices, joints = head_assembly.assemble(person, {name: source.target(name) for name in person.weights})
+        height = above_eyes(vertices[head_assembly.slices["skin"]], joints[2:])
         assert height.min() > -0.1e-3  # alignment turns the eyes a little against the axis that clears them
         assert (np.abs(height) < 0.4e-3).sum() > 40
 
@@ -225,23 +225,23 @@ def test_the_tongue_s_basis_moves_the_tongue_alone(model):
     assert not model.expression_basis[rows][:, ~members(model, "tongue")].any()
 
 
-def test_identity_of_a_person_is_linear_and_symmetric(source, anatomy):
+def test_identity_of_a_person_is_linear_and_symmetric(source, head_assembly):
     nose, ears = source.target("nose/nose-hump-incr"), source.target("head/head-oval")
-    apart = [np.concatenate(anatomy.identity_displacement(d)) for d in (nose, ears)]
-    together = np.concatenate(anatomy.identity_displacement(nose + 2 * ears))
+    apart = [np.concatenate(head_assembly.identity_displacement(d)) for d in (nose, ears)]
+    together = np.concatenate(head_assembly.identity_displacement(nose + 2 * ears))
     np.testing.assert_allclose(together, apart[0] + 2 * apart[1], atol=1e-9)
-    vertices, joints = anatomy.identity_displacement(ears)
-    symmetric = vertices[anatomy.mirror] * (-1, 1, 1)
+    vertices, joints = head_assembly.identity_displacement(ears)
+    symmetric = vertices[head_assembly.mirror] * (-1, 1, 1)
     np.testing.assert_allclose(symmetric, vertices, atol=0.3e-3)  # as far as MakeHuman's targets are
     np.testing.assert_allclose(joints[[0, 1, 3, 2]] * (-1, 1, 1), joints, atol=0.3e-3)
 
 
-def test_alignment_undoes_a_rigid_motion(anatomy):
+def test_alignment_undoes_a_rigid_motion(head_assembly):
     turn = axis_angle_to_matrix(torch.tensor([0.1, -0.3, 0.2], dtype=torch.float64)).numpy()
-    moved = anatomy.template @ turn.T + (0.1, 0.2, -0.3)
-    vertices, joints = anatomy.align(moved, anatomy.joints @ turn.T + (0.1, 0.2, -0.3))
-    np.testing.assert_allclose(vertices, anatomy.template, atol=1e-12)
-    np.testing.assert_allclose(joints, anatomy.joints, atol=1e-12)
+    moved = head_assembly.template @ turn.T + (0.1, 0.2, -0.3)
+    vertices, joints = head_assembly.align(moved, head_assembly.joints @ turn.T + (0.1, 0.2, -0.3))
+    np.testing.assert_allclose(vertices, head_assembly.template, atol=1e-12)
+    np.testing.assert_allclose(joints, head_assembly.joints, atol=1e-12)
 
 
 def test_ten_parameter_vectors_come_back_from_their_vertices(model):

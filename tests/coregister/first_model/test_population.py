@@ -72,10 +72,10 @@ def test_sliders_hold_both_sides_and_no_target_twice(source):
     assert not any(name.startswith(("head/head-trans", "mouth/mouth-trans-in")) for name in names)
 
 
-def test_model_people_are_symmetric_and_others_are_not(source, anatomy):
+def test_model_people_are_symmetric_and_others_are_not(source, head_assembly):
     def asymmetry(person):
         moved = sum(weight * source.target(name) for name, weight in person.weights.items())
-        return np.linalg.norm((moved - moved[source.mirror] * (-1, 1, 1))[anatomy.skin.base], axis=1).max()
+        return np.linalg.norm((moved - moved[source.mirror] * (-1, 1, 1))[head_assembly.skin.base], axis=1).max()
 
     model, other = (several(source, draw, 1)[0] for draw in (sample_spanned_person, sample_unspanned_person))
     assert asymmetry(model) < 1e-3 < 2e-3 < asymmetry(other)
@@ -91,7 +91,7 @@ class Projected:
 
 
 @pytest.fixture(scope="module")
-def projected(source, anatomy, model):
+def projected(source, head_assembly, model):
     people = {"model": several(source, sample_spanned_person), "any": several(source, sample_unspanned_person)}
     names = sorted({name for heads in people.values() for head in heads for name in head.weights})
     moves = {name: source.target(name) for name in names}
@@ -101,7 +101,7 @@ def projected(source, anatomy, model):
     template = model.template_vertex_positions.astype(np.float64)
 
     def project(heads):
-        delta = np.stack([anatomy.assemble(head, moves)[0] - template for head in heads]).reshape(len(heads), -1)
+        delta = np.stack([head_assembly.assemble(head, moves)[0] - template for head in heads]).reshape(len(heads), -1)
         coefficients = np.linalg.solve(r, q.T @ delta.T).T
         left = (delta - coefficients @ basis).reshape(len(heads), -1, 3)
         size = np.linalg.norm(delta.reshape(left.shape), axis=2)

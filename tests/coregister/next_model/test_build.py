@@ -36,8 +36,8 @@ def own_recipe() -> ModelRecipe:
 
 
 @pytest.fixture(scope="module")
-def subjects(anatomy, model) -> list[TrainingSubject]:
-    return samples.subjects(anatomy, model, range(500, 508), EXPRESSIONS)
+def subjects(head_assembly, model) -> list[TrainingSubject]:
+    return samples.subjects(head_assembly, model, range(500, 508), EXPRESSIONS)
 
 
 @pytest.fixture(scope="module")

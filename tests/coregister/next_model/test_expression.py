@@ -16,8 +16,8 @@ EXPRESSIONS = ("stretch", "smile", "jaw_open", "jaw_left", "wink_left", "wink_ri
 
 
 @pytest.fixture(scope="module")
-def displacements(anatomy, model) -> list[np.ndarray]:
-    subjects = samples.subjects(anatomy, model, range(400, 405), EXPRESSIONS)
+def displacements(head_assembly, model) -> list[np.ndarray]:
+    subjects = samples.subjects(head_assembly, model, range(400, 405), EXPRESSIONS)
     return [mesh.vertices - subject.neutral.vertices for subject in subjects for mesh in subject.expressions]
 
 
@@ -127,7 +127,7 @@ def test_the_jaw_moves_rigidly_to_first_order(model):
     )
 
 
-def test_an_open_jaw_moves_the_lower_teeth(displacements, bases, anatomy, model):
+def test_an_open_jaw_moves_the_lower_teeth(displacements, bases, head_assembly, model):
     """Ground truth: the motion of MakeHuman's own teeth."""
     number = EXPRESSIONS.index("jaw_open")
     skin, parts = regions.skin(model), regions.jaw_parts(model)

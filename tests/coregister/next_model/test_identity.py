@@ -138,9 +138,9 @@ def test_teeth_and_tongue_follow_the_skin_as_in_the_heads(model):
 
 
 @pytest.fixture(scope="module")
-def subjects_basis(anatomy, model) -> tuple[GNMData, IdentityBasis, IdentityBasis]:
+def subjects_basis(head_assembly, model) -> tuple[GNMData, IdentityBasis, IdentityBasis]:
     """The model with the template of subjects outside its span, their basis, and one without correction of the lids."""
-    subjects = samples.subjects(anatomy, model, range(300, 324), ("smile",))
+    subjects = samples.subjects(head_assembly, model, range(300, 324), ("smile",))
     heads = np.stack([subject.neutral.vertices for subject in subjects])
     aligned = align_neutrals(heads, np.ones(heads.shape[:2], np.float32), [s.name for s in subjects], model)
     settings = IdentitySettings(variance_ratio=0.99, shrinkage=0.2, by_area=False)

@@ -7,7 +7,7 @@ from bench.support.performances import ObservedSubject, TrueSubject
 from registration.model.gnm_npz import GNMData
 from registration.stabilize.components import Head
 from registration.stabilize.subject_meshes import SkullSkin
-from tests.coregister.conftest import anatomy, model, model_file, source, wheel  # noqa: F401  fixtures
+from tests.coregister.conftest import head_assembly, model, model_file, source, wheel  # noqa: F401  fixtures
 
 
 @pytest.fixture(scope="session")
@@ -21,8 +21,8 @@ def skin(model: GNMData) -> SkullSkin:  # noqa: F811
 
 
 @pytest.fixture(scope="session")
-def truths(anatomy) -> list[TrueSubject]:  # noqa: F811
-    return [performances.true_subject(anatomy, 1000 + number) for number in range(3)]
+def truths(head_assembly) -> list[TrueSubject]:  # noqa: F811
+    return [performances.true_subject(head_assembly, 1000 + number) for number in range(3)]
 
 
 @pytest.fixture(scope="session")

@@ -23,8 +23,8 @@ def test_most_of_a_spurious_motion_goes_and_expressions_stay(injected):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", range(3))
-def test_in_a_third_of_400_samples(anatomy, model, seed):
-    truths = [performances.true_subject(anatomy, 1000 + number) for number in range(20)]
+def test_in_a_third_of_400_samples(head_assembly, model, seed):
+    truths = [performances.true_subject(head_assembly, 1000 + number) for number in range(20)]
     found = stabilization_measures.remove_injected_motion(truths, model, seed)
     assert found.reduced >= 0.8 and found.lost < 0.02
 

@@ -13,7 +13,7 @@ from registration.model import gnm_npz
 from registration.stabilize import stabilized_folder as disk
 from registration.stabilize.decisions import Decision
 from registration.stabilize.pipeline import stabilize
-from tests.coregister.conftest import anatomy, model, model_file, source, wheel  # noqa: F401  fixtures
+from tests.coregister.conftest import head_assembly, model, model_file, source, wheel  # noqa: F401  fixtures
 from tests.registration.stabilize import runs
 from workflows.cli.app import main
 from workflows.records.decisions import append_decisions, read_decisions
@@ -24,8 +24,8 @@ NAMES = ("smile", "jaw_open", "brows_up")
 
 
 @pytest.fixture(scope="module")
-def run(anatomy, model, tmp_path_factory) -> Path:  # noqa: F811
-    truths = [performances.true_subject(anatomy, number, NAMES) for number in range(2)]
+def run(head_assembly, model, tmp_path_factory) -> Path:  # noqa: F811
+    truths = [performances.true_subject(head_assembly, number, NAMES) for number in range(2)]
     seens = [performances.observe(truth, number, unobserved=0.02) for number, truth in enumerate(truths)]
     return runs.write_run(tmp_path_factory.mktemp("run"), model, truths, seens)
 
