@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from registration.frames import MM_PER_M
-from registration.geometry.closest_point import Searched, barycentric_points
+from registration.geometry.closest_point import ClosestPointQuery, barycentric_points
 from registration.geometry.extrapolation import continued
 from registration.model import regions
 from registration.model.gnm_npz import GNMData
@@ -31,8 +31,8 @@ class EyelidRim:
     gap: Float[np.ndarray, "R"]  # signed distance of the rim from the shell in the template, positive outside
 
     @cached_property
-    def _query(self) -> Searched:
-        return Searched(self.shell, self.triangles)
+    def _query(self) -> ClosestPointQuery:
+        return ClosestPointQuery(self.shell, self.triangles)
 
     def gaps(
         self, rim: Float[np.ndarray, "R 3"], translation: Float[np.ndarray, "3"]

@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float, Int
 
 from registration.capture.triangulation import triangulate
 from registration.errors import InputError
-from registration.geometry.rasterizer import visible
+from registration.geometry.rasterizer import RayCaster
 from registration.types import Camera, Capture, Registration
 
 SCHEME = "68"
@@ -58,6 +58,7 @@ def seen(
 ) -> Bool[np.ndarray, "P"]:
     """Which points at least two cameras see past a mesh; world frame, metres."""
     count = np.zeros(len(points), int)
+    mesh = RayCaster(vertices, triangles)
     for camera in cameras:
-        count += visible(points, vertices, triangles, camera, tolerance)
+        count += mesh.visible(points, camera, tolerance)
     return count >= 2

@@ -6,7 +6,7 @@ import numpy as np
 import torch
 from jaxtyping import Float, Int
 
-from registration.geometry.rasterizer import visible
+from registration.geometry.rasterizer import RayCaster
 from registration.geometry.topology import vertex_normals
 from registration.types import Rendered, Targets
 
@@ -33,10 +33,11 @@ def vertex_confidence(
     """
     normals = vertex_normals(torch.as_tensor(vertices), torch.as_tensor(triangles.astype(np.int64))).numpy()
     visible_sum, agreed_sum = np.zeros(len(vertices)), np.zeros(len(vertices))
+    mesh = RayCaster(vertices, triangles)
     for targets, rendered in rendered_views:
         agreement, compared = _agreement(targets, rendered)
         for number, camera in enumerate(targets.pixels.cameras):
-            rows = np.flatnonzero(visible(vertices, vertices, triangles, camera))
+            rows = np.flatnonzero(mesh.visible(vertices, camera))
             x, y = np.floor(camera.project(vertices[rows].astype(np.float64))[0]).astype(np.int64).T
             x, y = np.minimum(x, camera.width_px - 1), np.minimum(y, camera.height_px - 1)
             pixel = targets.pixels.index[number].cpu().numpy()[y, x]

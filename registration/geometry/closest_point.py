@@ -1,64 +1,68 @@
-"""Exact closest points on a triangle mesh.
+"""Closest points on a triangle mesh, in float64.
 
-Centroid trees give candidates, an exact point-triangle distance decides (Ericson, Real-Time Collision Detection,
-2005, section 5.1.5). A triangle whose centroid is d away can come no nearer than d minus its radius, so the search
-widens until that bound excludes all the rest. Triangles are sorted into trees by size: one big triangle would
-otherwise widen the search for all.
+An AABB tree (Adobe Lagrange) selects the face; distance and barycentrics are computed here, for one triangle per point
+[Ericson 2005, section 5.1.5].
 """
 
+import lagrange
 import numpy as np
 from jaxtyping import Float, Int
-from scipy.spatial import cKDTree
 
-_BATCH = 1 << 18  # point-triangle pairs examined together: about 100 MB of temporaries
-_FEW = 2000  # points for which starting threads takes longer than the search
-_FIRST = 8  # candidates of a point in the first round; each further round has four times as many
+
+class ClosestPointQuery:
+    """A mesh prepared for repeated closest-point queries; F triangles."""
+
+    def __init__(self, vertices: Float[np.ndarray, "V 3"], triangles: Int[np.ndarray, "F 3"]):
+        """Build the tree.
+
+        Args:
+            vertices: in any unit and frame; those that no triangle uses are ignored.
+            triangles: vertex indices. Degenerate triangles count as the segment or point that they are.
+
+        Raises:
+            ValueError: there are no triangles, or a corner is not finite.
+        """
+        if not len(triangles):
+            raise ValueError("a mesh without triangles has no closest point")
+        self._corners = np.asarray(vertices, np.float64)[triangles]
+        _require_finite(self._corners)
+        self._tree = lagrange.bvh.TriangleAABBTree3D(surface_mesh(vertices, triangles))
+
+    def closest(
+        self, points: Float[np.ndarray, "P 3"]
+    ) -> tuple[Float[np.ndarray, "P"], Int[np.ndarray, "P"], Float[np.ndarray, "P 3"]]:
+        """Find the closest surface point of each point.
+
+        Args:
+            points: in the mesh's unit and frame.
+
+        Returns:
+            Unsigned distance, face and barycentrics. Of faces at exactly equal distance any may be returned.
+
+        Raises:
+            ValueError: a coordinate is not finite.
+        """
+        points = np.ascontiguousarray(points, np.float64)
+        _require_finite(points)
+        closest = self._tree.get_closest_point
+        face = np.fromiter((closest(point)[0] for point in points), np.int64, len(points))
+        distance, barycentric = on_triangles(points, self._corners[face])
+        return distance, face, barycentric
 
 
 def closest_points(
     points: Float[np.ndarray, "P 3"], vertices: Float[np.ndarray, "V 3"], triangles: Int[np.ndarray, "F 3"]
 ) -> tuple[Float[np.ndarray, "P"], Int[np.ndarray, "P"], Float[np.ndarray, "P 3"]]:
-    """Distance, face and barycentrics of the closest surface point of each point, in float64.
-
-    Points and vertices share any unit and frame; the distance is unsigned. Degenerate triangles count as the segment
-    or point that they are.
-
-    Raises:
-        ValueError: there are no triangles, or a coordinate is not finite.
-    """
-    return Searched(vertices, triangles).closest(points)
+    """Query a mesh once: arguments, result and errors as `ClosestPointQuery` and its method `closest`."""
+    return ClosestPointQuery(vertices, triangles).closest(points)
 
 
-class Searched:
-    """A mesh made ready to be searched again and again."""
-
-    def __init__(self, vertices: Float[np.ndarray, "V 3"], triangles: Int[np.ndarray, "F 3"]):
-        """Raises ValueError as `closest_points`."""
-        if not len(triangles):
-            raise ValueError("a mesh without triangles has no closest point")
-        self._corners = np.asarray(vertices, np.float64)[triangles]
-        _require_finite(self._corners)
-        centroids = self._corners.mean(1)
-        radii = np.linalg.norm(self._corners - centroids[:, None], axis=-1).max(1)
-        self._classes = [_SizeClass(members, centroids, radii) for members in _by_size(radii)]
-
-    def closest(
-        self, points: Float[np.ndarray, "P 3"]
-    ) -> tuple[Float[np.ndarray, "P"], Int[np.ndarray, "P"], Float[np.ndarray, "P 3"]]:
-        """As `closest_points`."""
-        points = np.asarray(points, np.float64)
-        _require_finite(points)
-        best = _Best(len(points))
-        for size_class in self._classes:  # a good bound from every class first, so that no class is searched in vain
-            size_class.search(points, np.arange(len(points)), self._corners, best, count=1)
-        for size_class in self._classes:
-            size_class.search_all(points, self._corners, best)
-        return best.distance, best.face, best.barycentric
-
-
-def _require_finite(coordinates: np.ndarray) -> None:
-    if not np.isfinite(coordinates).all():
-        raise ValueError("points and vertices must be finite")
+def surface_mesh(vertices: Float[np.ndarray, "V 3"], triangles: Int[np.ndarray, "F 3"]) -> lagrange.SurfaceMesh:
+    """Copy a triangle mesh (any unit and frame) into the type that Lagrange's queries take."""
+    mesh = lagrange.SurfaceMesh()
+    mesh.add_vertices(np.ascontiguousarray(vertices, np.float64))
+    mesh.add_triangles(np.ascontiguousarray(triangles, np.uint32))
+    return mesh
 
 
 def barycentric_points(
@@ -67,79 +71,17 @@ def barycentric_points(
     face: Int[np.ndarray, "P"],
     barycentric: Float[np.ndarray, "P 3"],
 ) -> Float[np.ndarray, "P 3"]:
-    """The surface points with these faces and barycentrics, in the vertices' unit and frame."""
+    """Compute the surface points with these faces and barycentrics, in the vertices' unit and frame."""
     return np.einsum("pk,pkc->pc", barycentric, np.asarray(vertices)[np.asarray(triangles)[face]])
-
-
-class _Best:
-    """The nearest surface point of each query point so far."""
-
-    def __init__(self, count: int):
-        self.distance = np.full(count, np.inf)
-        self.face = np.full(count, -1)
-        self.barycentric = np.zeros((count, 3))
-
-    def offer(self, rows: np.ndarray, faces: np.ndarray, distance: np.ndarray, barycentric: np.ndarray) -> None:
-        """Take candidates where they are nearer; a row may be offered several faces."""
-        order = np.lexsort((distance, rows))
-        rows, first = np.unique(rows[order], return_index=True)
-        chosen = order[first]
-        nearer = distance[chosen] < self.distance[rows]
-        rows, chosen = rows[nearer], chosen[nearer]
-        self.distance[rows], self.face[rows] = distance[chosen], faces[chosen]
-        self.barycentric[rows] = barycentric[chosen]
-
-
-class _SizeClass:
-    """Triangles of about one radius and a tree of their centroids."""
-
-    def __init__(self, members: np.ndarray, centroids: np.ndarray, radii: np.ndarray):
-        self.members, self.radii = members, radii[members]
-        self.radius = self.radii.max()
-        self.tree = cKDTree(centroids[members])
-
-    def search_all(self, points: np.ndarray, corners: np.ndarray, best: _Best) -> None:
-        """Widen the search of each point until the class holds nothing nearer."""
-        open_rows, count = np.arange(len(points)), _FIRST
-        while len(open_rows):
-            reached = self.search(points, open_rows, corners, best, count)
-            if count >= len(self.members):
-                return
-            open_rows = open_rows[reached - self.radius < best.distance[open_rows]]
-            count *= 4
-
-    def search(self, points: np.ndarray, rows: np.ndarray, corners: np.ndarray, best: _Best, count: int) -> np.ndarray:
-        """Offer each point its `count` nearest centroids' triangles; how far away the last centroid was."""
-        count = min(count, len(self.members))
-        reached = np.empty(len(rows))
-        size = max(1, _BATCH // count)
-        for start in range(0, len(rows), size):
-            part = rows[start : start + size]
-            workers = -1 if len(part) > _FEW else 1
-            away, index = self.tree.query(points[part], k=range(1, count + 1), workers=workers)
-            reached[start : start + size] = away[:, -1]
-            hopeful = away - self.radii[index] < best.distance[part, None]
-            row, column = np.nonzero(hopeful)
-            faces = self.members[index[row, column]]
-            distance, barycentric = on_triangles(points[part[row]], corners[faces])
-            best.offer(part[row], faces, distance, barycentric)
-        return reached
-
-
-def _by_size(radii: np.ndarray) -> list[np.ndarray]:
-    """Triangle indices in classes whose radii differ by at most a factor of two; the smallest ones share a class."""
-    typical = np.median(radii) or radii.max() or 1.0
-    octave = np.maximum(np.ceil(np.log2(np.maximum(radii, 1e-300) / typical)), 0).astype(int)
-    return [np.flatnonzero(octave == k) for k in np.unique(octave)]
 
 
 def on_triangles(
     points: Float[np.ndarray, "M 3"], corners: Float[np.ndarray, "M 3 3"]
 ) -> tuple[Float[np.ndarray, "M"], Float[np.ndarray, "M 3"]]:
-    """Distance and barycentrics of the closest point of one triangle per point.
+    """Compute distance and barycentrics of the closest point of one triangle per point.
 
-    The best of the three edges and, where it lies inside, the foot on the plane: every candidate is a point of the
-    triangle, so slivers and degenerate triangles can do no harm.
+    The best of the closest points of the three edges and, where it lies inside, the foot of the perpendicular on the
+    plane. Every candidate is a point of the triangle, so the result stays valid for slivers and degenerate triangles.
     """
     a, b, c = corners[:, 0], corners[:, 1], corners[:, 2]
     ab, ac, ap = b - a, c - a, points - a
@@ -150,7 +92,7 @@ def on_triangles(
         inside = (v >= 0) & (w >= 0) & (v + w <= 1)  # false where the area is zero
         best = np.where(inside[:, None], np.stack([1 - v - w, v, w], 1), 0.0)
     squared = np.where(inside, _squared(points, corners, best), np.inf)
-    outside = np.flatnonzero(~inside | (area < 1e-8 * d1 * d3))  # a sliver's foot is a guess: ask its edges too
+    outside = np.flatnonzero(~inside | (area < 1e-8 * d1 * d3))  # the foot on a sliver is inaccurate
     for i, j in ((0, 1), (1, 2), (2, 0)):
         start, edge = corners[outside, i], corners[outside, j] - corners[outside, i]
         length = np.einsum("mc,mc->m", edge, edge)
@@ -166,5 +108,10 @@ def on_triangles(
 
 
 def _squared(points: np.ndarray, corners: np.ndarray, barycentric: np.ndarray) -> np.ndarray:
-    away = points - np.einsum("mk,mkc->mc", barycentric, corners)
-    return np.einsum("mc,mc->m", away, away)
+    offset = points - np.einsum("mk,mkc->mc", barycentric, corners)
+    return np.einsum("mc,mc->m", offset, offset)
+
+
+def _require_finite(coordinates: np.ndarray) -> None:
+    if not np.isfinite(coordinates).all():
+        raise ValueError("points and vertices must be finite")

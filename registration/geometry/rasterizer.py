@@ -1,50 +1,90 @@
-"""Triangles on a pixel grid, in NumPy: which face a pixel shows, and which points a camera sees.
+"""Triangle meshes as pinhole cameras see them: the face at each pixel, and which points are visible.
 
-For figures and pictures, where neither gradients nor a GPU are wanted. Cameras are pinholes here: distortion is
-ignored. Triangles that reach closer than `NEAR` to the camera are left out, not clipped.
+For metrics and pictures, where no gradients are needed. Rays are cast by Embree (through Adobe Lagrange) in float32,
+with coordinates relative to the mesh's centre; barycentrics are computed in float64. A ray that passes a silhouette
+within 1e-7 of its length may hit or miss; these are some in a million. Lens distortion is ignored.
 """
 
-from collections.abc import Iterator
-
+import lagrange
 import numpy as np
+import torch
 from jaxtyping import Bool, Float, Int
 
+from registration.geometry.closest_point import surface_mesh
 from registration.types import Camera
 
-NEAR = 0.01  # metres
-_BATCH = 1 << 21  # box cells examined together: about 200 MB of temporaries
+NEAR = 0.01  # metres; surfaces closer to the camera are not hit
+_BATCH = 1 << 19  # rays cast together: about 100 MB of temporaries
 
 
-def rasterize(
-    vertices: Float[np.ndarray, "V 3"], triangles: Int[np.ndarray, "F 3"], camera: Camera
-) -> tuple[Int[np.ndarray, "H W"], Float[np.ndarray, "H W 3"]]:
-    """The front-most face at each pixel's centre (-1 on a miss) and the surface point's barycentrics there.
+class RayCaster:
+    """A mesh prepared for queries from several cameras; world frame, metres."""
 
-    World frame, metres; barycentrics are perspective-correct and 0 on a miss. Both sides of a triangle count.
-    """
-    width, height = camera.width_px, camera.height_px
-    corners, depth, kept = _projected(vertices, triangles, camera)
-    planes = _weight_planes(corners)
-    low = np.ceil(corners.min(1) - 0.5).astype(np.int64)
-    high = np.floor(corners.max(1) - 0.5).astype(np.int64)
-    nearness = np.zeros(width * height)
-    front = np.full(width * height, -1)
-    for item, x, y in _box_cells(low, high, width, height):
-        weight = _weights(planes, item, x + 0.5, y + 0.5)
-        inside = np.flatnonzero(weight.min(0) >= 0)
-        item, pixel = item[inside], (y * width + x)[inside]
-        near = (weight[:, inside].T / depth[item]).sum(1)
-        np.maximum.at(nearness, pixel, near)
-        first = near == nearness[pixel]
-        front[pixel[first]] = item[first]
-    pixel = np.flatnonzero(front >= 0)
-    item = front[pixel]
-    weight = _weights(planes, item, pixel % width + 0.5, pixel // width + 0.5).T / depth[item]
-    face = np.full(width * height, -1)
-    barycentric = np.zeros((width * height, 3))
-    face[pixel] = kept[item]
-    barycentric[pixel] = weight / weight.sum(1, keepdims=True)
-    return face.reshape(height, width), barycentric.reshape(height, width, 3)
+    def __init__(self, vertices: Float[np.ndarray, "V 3"], triangles: Int[np.ndarray, "F 3"]):
+        """Build the tree. There may be no triangles; the corners must be finite."""
+        vertices, triangles = np.asarray(vertices, np.float64), np.asarray(triangles)
+        self._corners = vertices[triangles]
+        self._centre = self._corners.mean((0, 1)) if len(triangles) else np.zeros(3)
+        self._caster = _committed(vertices - self._centre, triangles) if len(triangles) else None
+
+    def visible(
+        self, points: Float[np.ndarray, "P 3"], camera: Camera, tolerance: float = 5e-4
+    ) -> Bool[np.ndarray, "P"]:
+        """Test which points a camera sees.
+
+        Args:
+            points: in the mesh's frame; those on the mesh itself need the tolerance.
+            camera: a pinhole; its distortion is ignored.
+            tolerance: depth in metres by which the mesh may be in front of a visible point.
+
+        Returns:
+            Whether the point projects into the image and nothing is in front of it.
+        """
+        points = np.asarray(points, np.float64)
+        with np.errstate(divide="ignore", invalid="ignore"):  # points in the plane of the camera's centre
+            xy, depth = camera.project(points)
+            seen = (depth > NEAR) & (xy >= 0).all(1) & (xy <= (camera.width_px, camera.height_px)).all(1)
+        rows = np.flatnonzero(seen)
+        if self._caster is None or not len(rows):
+            return seen
+        # The ray's parameter is 0 at the camera and 1 at the point, so depth over the point's depth.
+        rays = self._origins(camera, len(rows)), (points[rows] - camera.centre).astype(np.float32)
+        near, far = NEAR / depth[rows], 1 - tolerance / depth[rows]
+        seen[rows] = ~self._caster.occluded(*rays, near.astype(np.float32), far.astype(np.float32))
+        return seen
+
+    def rasterize(self, camera: Camera) -> tuple[Int[np.ndarray, "H W"], Float[np.ndarray, "H W 3"]]:
+        """Find what a camera sees at the centre of each pixel.
+
+        Args:
+            camera: a pinhole; its distortion is ignored.
+
+        Returns:
+            The front-most face, -1 where there is none, and the barycentrics of its surface point (float64, perspective
+            correct, 0 where there is no face). Faces are visible from both sides.
+        """
+        width, height = camera.width_px, camera.height_px
+        face = np.full((height, width), -1)
+        barycentric = np.zeros((height, width, 3))
+        lines = max(1, _BATCH // width)
+        for top in range(0, height if self._caster is not None else 0, lines):
+            ray = _rays(camera, top, min(top + lines, height))
+            hits = self._cast(camera, ray.reshape(-1, 3))
+            line, column = np.divmod(np.flatnonzero(hits.hit), width)
+            hit_face = hits.facet_index[hits.hit]
+            face[top + line, column] = hit_face
+            corners = self._corners[hit_face] - camera.centre
+            barycentric[top + line, column] = _on_ray(ray[line, column], corners)
+        return face, barycentric
+
+    def _cast(self, camera: Camera, ray: Float[np.ndarray, "N 3"]) -> lagrange.raycasting.RayHits:
+        assert self._caster is not None
+        hits = self._caster.cast(self._origins(camera, len(ray)), ray.astype(np.float32), NEAR, np.inf)
+        assert isinstance(hits, lagrange.raycasting.RayHits)  # of one ray alone it is another type
+        return hits
+
+    def _origins(self, camera: Camera, count: int) -> Float[np.ndarray, "N 3"]:
+        return np.tile((camera.centre - self._centre).astype(np.float32), (count, 1))
 
 
 def visible(
@@ -54,89 +94,40 @@ def visible(
     camera: Camera,
     tolerance: float = 5e-4,
 ) -> Bool[np.ndarray, "P"]:
-    """Whether each point falls inside the image and no triangle lies before it by more than `tolerance` (metres).
-
-    Exact in the image plane: the ray of each point is tested, not that of a pixel nearby.
-    """
-    with np.errstate(divide="ignore", invalid="ignore"):  # points in the camera's own plane
-        xy, z = camera.project(np.asarray(points, np.float64))
-        seen = (z > NEAR) & (xy >= 0).all(1) & (xy <= (camera.width_px, camera.height_px)).all(1)
-    rows = np.flatnonzero(seen)
-    if not len(rows):
-        return seen
-    corners, depth, _ = _projected(vertices, triangles, camera)
-    planes, nearest = _weight_planes(corners), depth.min(1)
-    xy, z = xy[rows], z[rows]
-    origin = xy.min(0)
-    side = max(1e-3, float(np.sqrt(np.ptp(xy, 0).prod() / len(rows))) / 2)  # px; about four cells a point
-    columns, lines = ((np.ptp(xy, 0) // side).astype(np.int64) + 1).tolist()
-    cell = ((xy - origin) // side).astype(np.int64) @ (1, columns)
-    order = np.argsort(cell, kind="stable")
-    count = np.bincount(cell, minlength=columns * lines)
-    start = np.cumsum(count) - count
-    low = np.floor((corners.min(1) - origin) / side).astype(np.int64)
-    high = np.floor((corners.max(1) - origin) / side).astype(np.int64)
-    for item, x, y in _box_cells(low, high, columns, lines):
-        here = y * columns + x
-        pair, rank = _expand(count[here])
-        item, point = item[pair], order[start[here[pair]] + rank]
-        could = nearest[item] < z[point] - tolerance
-        item, point = item[could], point[could]
-        weight = _weights(planes, item, xy[point, 0], xy[point, 1])
-        hit = np.flatnonzero(weight.min(0) >= 0)
-        before = 1 / (weight[:, hit].T / depth[item[hit]]).sum(1) < z[point[hit]] - tolerance
-        seen[rows[point[hit][before]]] = False
-    return seen
+    """Test the points of one camera, as `RayCaster.visible`, which serves several cameras of one mesh."""
+    return RayCaster(vertices, triangles).visible(points, camera, tolerance)
 
 
-def _projected(
-    vertices: np.ndarray, triangles: np.ndarray, camera: Camera
-) -> tuple[Float[np.ndarray, "T 3 2"], Float[np.ndarray, "T 3"], Int[np.ndarray, "T"]]:
-    """Corner pixels, corner depths and face index of the triangles wholly in front of the camera and not edge-on."""
-    with np.errstate(divide="ignore", invalid="ignore"):
-        xy, z = camera.project(np.asarray(vertices, np.float64))
-    kept = np.flatnonzero((z > NEAR)[triangles].all(1))
-    corners, depth = xy[triangles[kept]], z[triangles[kept]]
-    solid = _cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]) != 0
-    return corners[solid], depth[solid], kept[solid]
+def rasterize(
+    vertices: Float[np.ndarray, "V 3"], triangles: Int[np.ndarray, "F 3"], camera: Camera
+) -> tuple[Int[np.ndarray, "H W"], Float[np.ndarray, "H W 3"]]:
+    """Rasterize for one camera, as `RayCaster.rasterize`, which serves several cameras of one mesh."""
+    return RayCaster(vertices, triangles).rasterize(camera)
 
 
-def _weight_planes(corners: Float[np.ndarray, "T 3 2"]) -> Float[np.ndarray, "3 T 3"]:
-    """Barycentrics in the image plane as linear functions (a, b, c) of a pixel: weight k = a x + b y + c."""
-    planes = np.empty((3, len(corners), 3))
-    for k in range(3):
-        p, q = corners[:, (k + 1) % 3], corners[:, (k + 2) % 3]
-        planes[k] = np.stack([p[:, 1] - q[:, 1], q[:, 0] - p[:, 0], _cross(p, q)], 1)
-    return planes / _cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])[:, None]
+def _committed(
+    vertices: Float[np.ndarray, "V 3"], triangles: Int[np.ndarray, "F 3"]
+) -> lagrange.raycasting.RayCaster:
+    caster = lagrange.raycasting.RayCaster()
+    # Its constructor makes the thread flush subnormal numbers to zero, which would change later computations.
+    torch.set_flush_denormal(False)
+    caster.add_mesh(surface_mesh(vertices, triangles))
+    caster.commit_updates()
+    return caster
 
 
-def _weights(
-    planes: Float[np.ndarray, "3 T 3"], item: Int[np.ndarray, "M"], x: np.ndarray, y: np.ndarray
-) -> Float[np.ndarray, "3 M"]:
-    """All three are >= 0 inside, whichever way the triangle winds."""
-    a, b, c = (planes[:, :, n][:, item] for n in range(3))
-    return a * x + b * y + c
+def _rays(camera: Camera, top: int, bottom: int) -> Float[np.ndarray, "L W 3"]:
+    """World directions, of depth 1, through the pixel centres of some lines of the image."""
+    direction = camera.T_cam_world[:3, :3].T @ np.linalg.inv(camera.intrinsics)
+    across = (np.arange(camera.width_px) + 0.5)[:, None] * direction[:, 0]
+    down = (np.arange(top, bottom) + 0.5)[:, None] * direction[:, 1] + direction[:, 2]
+    return down[:, None] + across
 
 
-def _cross(p: np.ndarray, q: np.ndarray) -> np.ndarray:
-    return p[:, 0] * q[:, 1] - p[:, 1] * q[:, 0]
-
-
-def _box_cells(
-    low: Int[np.ndarray, "T 2"], high: Int[np.ndarray, "T 2"], width: int, height: int
-) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
-    """(item, x, y) of every grid cell in the boxes low..high (inclusive), in batches."""
-    low, high = np.maximum(low, 0), np.minimum(high, (width - 1, height - 1))
-    size = np.maximum(high - low + 1, 0)
-    filled = np.flatnonzero(size.prod(1))
-    batch = np.cumsum(size[filled].prod(1)) // _BATCH
-    for items in np.split(filled, np.flatnonzero(np.diff(batch)) + 1):
-        row, rank = _expand(size[items].prod(1))
-        item = items[row]
-        yield item, low[item, 0] + rank % size[item, 0], low[item, 1] + rank // size[item, 0]
-
-
-def _expand(count: Int[np.ndarray, "N"]) -> tuple[Int[np.ndarray, "S"], Int[np.ndarray, "S"]]:
-    """Each index n repeated count[n] times, and 0 .. count[n] - 1 beside it."""
-    index = np.repeat(np.arange(len(count)), count)
-    return index, np.arange(len(index)) - np.repeat(np.cumsum(count) - count, count)
+def _on_ray(ray: Float[np.ndarray, "N 3"], corners: Float[np.ndarray, "N 3 3"]) -> Float[np.ndarray, "N 3"]:
+    """Barycentrics of the point in which a ray from the origin meets a triangle, or of the closest one to it."""
+    a, b, c = corners[:, 0], corners[:, 1], corners[:, 2]
+    weight = np.stack([np.einsum("nc,nc->n", ray, np.cross(p, q)) for p, q in ((b, c), (c, a), (a, b))], 1)
+    total = weight.sum(1, keepdims=True)
+    weight = np.divide(weight, total, out=np.full_like(weight, 1 / 3), where=total != 0).clip(0)
+    return weight / weight.sum(1, keepdims=True)

@@ -19,7 +19,7 @@ from scipy.spatial.transform import Rotation
 from registration.capture.pixels import read_view
 from registration.capture.scan import Scan, read_scan
 from registration.frames import MM_PER_M, linear_to_srgb
-from registration.geometry.closest_point import Searched
+from registration.geometry.closest_point import ClosestPointQuery
 from registration.report.heat_map import scale_limit_mm
 from registration.report.pictures import scale_colours
 from registration.types import Camera, Capture
@@ -167,7 +167,7 @@ class FitPage(PageServer):
         """Distances of points from the scan, metres; from its points if it is a point cloud."""
         assert self._scan is not None  # otherwise the choice is not offered
         if len(self._scan.triangles):
-            surface = Searched(self._scan.vertices, self._scan.triangles)
+            surface = ClosestPointQuery(self._scan.vertices, self._scan.triangles)
             return lambda points: surface.closest(points)[0]
         tree = cKDTree(self._scan.vertices)
         return lambda points: np.asarray(tree.query(points)[0])

@@ -2,10 +2,11 @@
 
 import numpy as np
 import pytest
+import torch
 import trimesh
 
-from registration.geometry import closest_point
-from registration.geometry.closest_point import barycentric_points, closest_points
+from registration.geometry import contacts
+from registration.geometry.closest_point import ClosestPointQuery, barycentric_points, closest_points, on_triangles
 
 
 def ericson(p, a, b, c):
@@ -59,16 +60,19 @@ def test_equals_brute_force(seed):
     check_against_brute_force(rng.random((60, 3)) * 2 - 0.5, vertices, np.arange(len(vertices)).reshape(-1, 3))
 
 
-@pytest.mark.parametrize("batch", [1, 7])
-def test_batches_do_not_matter(monkeypatch, batch):
+def test_a_prepared_query_equals_single_queries():
     rng = np.random.default_rng(0)
-    vertices = soup(rng, 100, 0.1)
-    triangles = np.arange(300).reshape(-1, 3)
+    vertices, triangles = soup(rng, 100, 0.1), np.arange(300).reshape(-1, 3)
     points = rng.random((40, 3))
-    whole = closest_points(points, vertices, triangles)
-    monkeypatch.setattr(closest_point, "_BATCH", batch)
-    for a, b in zip(whole, closest_points(points, vertices, triangles), strict=True):
-        np.testing.assert_array_equal(a, b)
+    query = ClosestPointQuery(vertices, triangles)
+    for _ in range(2):
+        for a, b in zip(query.closest(points), closest_points(points, vertices, triangles), strict=True):
+            np.testing.assert_array_equal(a, b)
+
+
+def test_vertices_that_no_triangle_uses_are_ignored():
+    vertices = np.concatenate([np.eye(3), [[np.nan] * 3, [0, 0, 0]]])
+    assert closest_points(np.zeros((1, 3)), vertices, np.array([[0, 1, 2]]))[0] == pytest.approx(1 / np.sqrt(3))
 
 
 def test_plane_at_a_known_distance():
@@ -103,6 +107,9 @@ def test_degenerate_triangles_are_segments_and_points():
     distance, face, barycentric = closest_points(points, vertices, triangles)
     np.testing.assert_allclose(distance, [0.3, 0.4, 1, 1, np.hypot(1, 4)], atol=2e-9)
     assert np.isfinite(barycentric).all() and face[2] == 2
+    coincident = np.array([[1.0, 0, 0], [0, 1, 0], [1, 0, 0], [0, 0, 0]])
+    needle = closest_points(np.ones((1, 3)), coincident, np.array([[0, 1, 2], [3, 3, 3]]))[0]
+    np.testing.assert_allclose(needle, np.sqrt(1.5))
     only_points = closest_points(points, vertices, np.array([[3, 3, 3]]))[0]
     np.testing.assert_allclose(only_points, np.linalg.norm(points - 5, axis=1), atol=1e-12)
 
@@ -139,3 +146,15 @@ def test_refuses_what_has_no_answer():
         closest_points(np.zeros((1, 3)), np.eye(3), np.zeros((0, 3), int))
     with pytest.raises(ValueError, match="finite"):
         closest_points(np.full((1, 3), np.nan), np.eye(3), np.array([[0, 1, 2]]))
+
+
+def test_tensors_and_arrays_have_the_same_closest_points():
+    """The fit computes them in PyTorch, without the special treatment of slivers."""
+    rng = np.random.default_rng(7)
+    corners, points = rng.normal(size=(4000, 3, 3)), 2 * rng.normal(size=(4000, 3))
+    expected, barycentric = on_triangles(points, corners)
+    a, b, c, p = (torch.from_numpy(x)[:, None] for x in (*corners.swapaxes(0, 1), points))
+    weights = contacts._closest(b - a, c - a, p - a)[:, 0].numpy()
+    np.testing.assert_allclose(weights, barycentric, atol=1e-9)
+    feet = np.einsum("mk,mkc->mc", weights, corners)
+    np.testing.assert_allclose(np.linalg.norm(points - feet, axis=1), expected, rtol=1e-12)

@@ -1,12 +1,15 @@
-"""Z-buffer and visibility against ray casting by brute force and against spheres, where the answer is a formula."""
+"""Rasterization and visibility against exact ray casting and against spheres, where the answer is a formula."""
+
+from dataclasses import replace
 
 import numpy as np
 import pytest
+import torch
 import trimesh
 
 from registration.geometry import rasterizer
 from registration.geometry.closest_point import barycentric_points
-from registration.geometry.rasterizer import rasterize, visible
+from registration.geometry.rasterizer import RayCaster, rasterize, visible
 from registration.types import Camera
 
 
@@ -105,3 +108,29 @@ def test_batches_do_not_matter(monkeypatch):
 def test_nothing_to_draw():
     face, barycentric = rasterize(np.zeros((3, 3)), np.array([[0, 1, 2]]), a_camera())
     assert (face == -1).all() and (barycentric == 0).all()
+
+
+def test_the_distance_to_the_origin_of_the_frame_does_not_matter():
+    """Single precision would not resolve the tolerance a kilometre away."""
+    rng = np.random.default_rng(4)
+    vertices, triangles = soup(rng)
+    camera, offset = a_camera(), np.array([900.0, -500, 2000])
+    pose = camera.T_cam_world.copy()
+    pose[:3, 3] -= pose[:3, :3] @ offset
+    moved = replace(camera, T_cam_world=pose)
+    near, far = RayCaster(vertices, triangles), RayCaster(vertices + offset, triangles)
+    np.testing.assert_array_equal(far.rasterize(moved)[0], near.rasterize(camera)[0])
+    np.testing.assert_allclose(far.rasterize(moved)[1], near.rasterize(camera)[1], atol=1e-6)
+    np.testing.assert_array_equal(far.visible(vertices + offset, moved), near.visible(vertices, camera))
+
+
+def test_no_gaps_between_the_faces_of_a_closed_surface():
+    ball = trimesh.creation.icosphere(subdivisions=4, radius=0.4)  # the camera is inside
+    camera = a_camera(width=600, height=500, distance=0.05)
+    assert (rasterize(np.asarray(ball.vertices), np.asarray(ball.faces), camera)[0] >= 0).all()
+
+
+def test_subnormal_numbers_survive():
+    """A ray caster makes its thread flush them to zero if nothing is done about it."""
+    RayCaster(np.eye(3), np.array([[0, 1, 2]]))
+    assert (np.full(4, 1e-310) * 0.5 > 0).all() and (torch.full((4,), 1e-40) * 0.5 > 0).all()
