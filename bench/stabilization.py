@@ -25,12 +25,12 @@ from registration.geometry.rigid import align
 from registration.model import gnm_npz
 from registration.model.gnm_npz import GNMData
 from registration.stabilize.automatic import stabilize_subject
-from registration.stabilize.components import Head
+from registration.stabilize.components import HeadGeometry
 from registration.stabilize.pipeline import (
     Stabilization,
     StabilizedSubject,
+    apply_corrections,
     automatic_stage,
-    corrected,
     regional_stage,
 )
 from registration.stabilize.subject_meshes import SkullSkin, SubjectMeshes
@@ -48,7 +48,7 @@ def measure_population(subjects: int) -> None:
     results = [stabilization_measures.remove_injected_motion(truths, data, seed) for seed in range(DRAWS)]
     print(f"spurious_energy_reduced {min(result.reduced for result in results):.3f}")
     print(f"spurious_expression_lost {max(result.lost for result in results):.4f}")
-    skin, head, settings = SkullSkin.of(data), Head.of(data), Stabilization()
+    skin, head, settings = SkullSkin.from_model(data), HeadGeometry.from_model(data), Stabilization()
     stabilized: list[StabilizedSubject] = []
     remaining, procrustes_mm, neck_mm, seconds = [], [], [], 0.0
     for number, truth in enumerate(truths):
@@ -69,8 +69,8 @@ def measure_population(subjects: int) -> None:
     samples = sum(len(subject.names) for subject in stabilized)
     print(f"automatic_seconds {seconds:.1f}  # {samples} samples of {len(head.points):,} vertices")
     start = time.perf_counter()
-    _, correction = regional_stage(lambda: iter(stabilized), head, settings)
-    final = [corrected(subject, correction, performances.COUNT * k) for k, subject in enumerate(stabilized)]
+    _, corrections = regional_stage(lambda: iter(stabilized), head, settings)
+    final = [apply_corrections(subject, corrections, performances.COUNT * k) for k, subject in enumerate(stabilized)]
     print(f"regional_seconds {time.perf_counter() - start:.1f}")
     print(f"peak_gb {resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20:.2f}")
     deg, mm = np.concatenate(remaining, 1)
@@ -85,7 +85,7 @@ def measure_population(subjects: int) -> None:
 
 def measure_run(run: Path, data: GNMData) -> None:
     """Print the remaining motion for registrations of one pose, to which known motions are added."""
-    skin, rng = SkullSkin.of(data), np.random.default_rng(0)
+    skin, rng = SkullSkin.from_model(data), np.random.default_rng(0)
     remaining = []
     for meshes in read_run(run, data).meshes():
         face = meshes.neutral[stabilization_measures.face_mask(data)].astype(np.float64)

@@ -10,8 +10,8 @@ from registration.frames import MM_PER_M, transform_points
 from registration.geometry.rigid import angle_deg, motion_fields
 from registration.model.gnm_npz import GNMData
 from registration.model.regions import group
-from registration.stabilize.components import Components, Head, regional_components
-from registration.stabilize.decisions import corrections, default_actions
+from registration.stabilize.components import HeadGeometry, RegionalComponents, regional_components
+from registration.stabilize.decisions import compute_corrections, default_actions
 from registration.stabilize.pipeline import StabilizedSubject
 
 
@@ -36,7 +36,7 @@ def motion_size(motions: np.ndarray, points: np.ndarray) -> np.ndarray:
 def energy_lost(
     subjects: Sequence[StabilizedSubject],
     truths: Sequence[TrueSubject],
-    head: Head,
+    head: HeadGeometry,
     labels: tuple[str, ...] = JAW + BROWS,
 ) -> dict[str, float]:
     """Return 1 - <d', d> / <d, d> by label over all exterior skin: d true, d' stabilized displacements."""
@@ -55,7 +55,7 @@ def energy_lost(
 class InjectedMotionResult:
     """The regional stage's effect on motions that were added to a third of the samples."""
 
-    components: list[Components]
+    components: list[RegionalComponents]
     reduced: float  # fraction of the motions' energy
     lost: float  # of the true expressions' energy, 1 - <d', d> / <d, d> over all samples
 
@@ -70,7 +70,7 @@ def remove_injected_motion(
     translation_mm: float = 2.0,
 ) -> InjectedMotionResult:
     """Add rigid motions of some kinds (standard deviations as given) with random strengths, and apply the stage."""
-    head, rng = Head.of(data), np.random.default_rng(seed)
+    head, rng = HeadGeometry.from_model(data), np.random.default_rng(seed)
     true = np.concatenate([truth.vertices - truth.neutral for truth in truths])
     labels = [label for truth in truths for label in truth.labels]
     twists = rng.normal(size=(kinds, 2, 3))
@@ -86,9 +86,9 @@ def remove_injected_motion(
         labels,
         head,
     )
-    correction = corrections(components, default_actions(components), labels, head)
+    corrections = compute_corrections(components, default_actions(components), labels, head)
     gram = np.einsum("ivc,v,jvc->ij", fields, head.area, fields)
-    remaining = spurious - correction.twists
+    remaining = spurious - corrections.twists
 
     def energy(motions: np.ndarray) -> float:
         return float(np.einsum("si,ij,sj->", motions, gram, motions))

@@ -84,7 +84,7 @@ def align_neutrals(
     """
     settings = settings or AlignmentSettings()
     template = data.template_vertex_positions.astype(np.float64)
-    stable = SkullSkin.of(data).area
+    stable = SkullSkin.from_model(data).area
     statistics = OutlierStatistics(data)
     mirror = data.mirror_indices if mirrored else None
     kept, rejected = np.arange(len(vertices)), list[RejectedSubject]()

@@ -120,7 +120,7 @@ def _check_rank(training: TrainingSet, previous: GNMData, recipe: ModelRecipe) -
 
 def _align(training: TrainingSet, previous: GNMData, recipe: ModelRecipe) -> tuple[AlignedNeutrals, int]:
     """Completed and aligned neutrals, and the number of those with missing data."""
-    stable, template = SkullSkin.of(previous).area, previous.template_vertex_positions.astype(np.float64)
+    stable, template = SkullSkin.from_model(previous).area, previous.template_vertex_positions.astype(np.float64)
     T_model_head = align(training.neutrals, template, training.confidence * stable)
     complete = MissingDataCompletion(previous, previous.vertex_identity_basis, recipe.completion)
     heads, completed = np.empty_like(training.neutrals), 0

@@ -149,7 +149,7 @@ def _previous_components(data: GNMData, rows: Int[np.ndarray, "R"], both_parts: 
     """The previous model's components of the head in these rows, each without the rigid motion of the stable skin;
     with `both_parts` their symmetric and antisymmetric parts."""
     basis = data.vertex_identity_basis[_moves_skin(data)].astype(np.float64)
-    stable = SkullSkin.of(data).area
+    stable = SkullSkin.from_model(data).area
     points = data.template_vertex_positions.astype(np.float64)
     points = points - stable @ points / stable.sum()
     basis -= np.tensordot(fit_twists(basis, points, stable), motion_fields(points), 1)

@@ -110,7 +110,7 @@ def write(
 
 def drift_mm(previous: GNMData, data: GNMData) -> float:
     """Return the rms distance between two models' templates over the stable skin, mm, without alignment."""
-    stable = SkullSkin.of(previous).area
+    stable = SkullSkin.from_model(previous).area
     difference = data.template_vertex_positions.astype(np.float64) - previous.template_vertex_positions
     return float(MM_PER_M * np.sqrt((difference**2).sum(1) @ stable / stable.sum()))
 

@@ -18,10 +18,10 @@ from coregister.first_model import assembly as anatomy_of
 from coregister.first_model import build, makehuman, population
 from registration.geometry.rigid import motion_fields
 from registration.model import gnm_npz
-from registration.stabilize.components import Head, regional_components
+from registration.stabilize.components import HeadGeometry, regional_components
 from registration.stabilize.stabilized_folder import StoredComponents
 from tests.workflows.web.test_review import CHROMIUM, FLAGS
-from workflows.steps.stabilize import along
+from workflows.steps.stabilize import mean_displacements
 from workflows.web.review import ReviewPage
 from workflows.web.review_state import ReviewState
 
@@ -30,7 +30,7 @@ SIZE = {"width": 1500, "height": 960}
 WAIT_MS = 6000  # until the animation has started
 
 
-def stored(head: Head) -> StoredComponents:
+def stored(head: HeadGeometry) -> StoredComponents:
     """Return the components of true expressions with added head motion."""
     anatomy = anatomy_of.build_assembly(makehuman.read(makehuman.fetch()), population.mean_person())
     truths = [performances.true_subject(anatomy, 1000 + number) for number in range(16)]
@@ -48,12 +48,12 @@ def stored(head: Head) -> StoredComponents:
         subjects=tuple(truth.name for truth in truths for _ in truth.labels),
         names=labels,
         labels=labels,
-        along=along(displacements, components),
+        mean_displacement=mean_displacements(displacements, components),
     )
 
 
 def main() -> None:
-    head = Head.of(gnm_npz.read(build.bootstrap()))
+    head = HeadGeometry.from_model(gnm_npz.read(build.bootstrap()))
     with tempfile.TemporaryDirectory() as folder, sync_playwright() as playwright:
         page = ReviewPage(ReviewState(stored(head), head, Path(folder) / "log.jsonl", "picture"), port=0)
         browser = playwright.chromium.launch(executable_path=CHROMIUM or shutil.which("chromium"), args=list(FLAGS))

@@ -1,5 +1,5 @@
-"""The regional stage's view of a dataset: principal components per region, and how much each looks like motion of the
-whole head [GNM, Head Expression]; docs/algorithms.md, "Stabilization"."""
+"""The regional stage of stabilization: principal components per region over all samples, and scores of how similar each
+is to a motion of the whole head [GNM, Head Expression]; docs/algorithms.md, "Stabilization"."""
 
 import math
 from collections.abc import Iterable, Iterator, Sequence
@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from registration.errors import InputError
+from registration.frames import MM_PER_M
 from registration.geometry.pca import principal_components
 from registration.geometry.rigid import align, fit_twists, motion_fields
 from registration.geometry.topology import vertex_areas
@@ -17,32 +18,42 @@ from registration.model import regions
 from registration.model.gnm_npz import GNMData
 from registration.stabilize.subject_meshes import SkullSkin
 
-LEAST_SAMPLES = 2
+MIN_SAMPLES = 2
 
 
 @dataclass(frozen=True, kw_only=True)
-class Regional:
-    """How the stage goes about it (docs/algorithms.md, "Stabilization")."""
+class RegionalSettings:
+    """Settings of the regional stage (docs/algorithms.md, "Stabilization")."""
 
-    share: float = 0.99  # of a region's energy, held by the components that are looked at
-    rigid: float = 0.5  # flagged: `score` above this,
-    free: float = 0.7  # `free_of_label` above this,
-    shared: float = 0.5  # and `shared` of at least this
+    variance_ratio: float = 0.99  # fraction of a region's energy in the components that are computed
+    rigidity: float = 0.5  # a flagged component has more than this,
+    label_independence: float = 0.7  # more than this,
+    shared_motion: float = 0.5  # and at least this
 
 
 @dataclass(frozen=True, kw_only=True)
-class Head:
-    """The regions of one model, in whose frame displacements are: metres, the origin amid the skin."""
+class HeadGeometry:
+    """Template, skin areas and regions of a model in the head frame: metres, axes of the model, origin at `centre`."""
 
     data: GNMData
-    points: Float[np.ndarray, "V 3"]  # of the template, about `centre`
-    centre: Float[np.ndarray, "3"]
+    points: Float[np.ndarray, "V 3"]  # the template
+    centre: Float[np.ndarray, "3"]  # mean of the exterior skin's vertices, in the model's frame
     area: Float[np.ndarray, "V"]  # m^2, of the exterior skin; 0 elsewhere
-    regions: dict[str, Int[np.ndarray, "_"]]  # rows
+    regions: dict[str, Int[np.ndarray, "_"]]  # vertex rows
 
     @classmethod
-    def of(cls, data: GNMData) -> "Head":
-        """Raises InputError, naming it, if a source group of a region is missing."""
+    def from_model(cls, data: GNMData) -> "HeadGeometry":
+        """Compute areas and regions of a model.
+
+        Args:
+            data: a model in this project's format.
+
+        Returns:
+            The geometry of its template.
+
+        Raises:
+            InputError: a vertex group of a region is missing; the message names it.
+        """
         masks = regions.stabilization_regions(data)
         exterior = regions.exterior(data)
         template = data.template_vertex_positions.astype(np.float64)
@@ -52,103 +63,132 @@ class Head:
         return cls(data=data, points=template - centre, centre=centre, area=area, regions=rows)
 
     def T_head_world(self, neutral: Float[np.ndarray, "V 3"], skin: SkullSkin) -> Float[np.ndarray, "4 4"]:
-        """Lays a neutral (its capture's world) onto the template, by the skin on the skull: never scaled."""
+        """Align a neutral with the template by the skin on the skull; rigid, without scale.
+
+        Args:
+            neutral: metres, its capture's world.
+            skin: weights of the vertices.
+
+        Returns:
+            p_head = T_head_world @ p_world.
+        """
         return align(neutral[None], self.points, skin.area[None])[0]
 
 
 @dataclass(frozen=True, kw_only=True)
-class Components:
-    """K components of one region's displacements over S samples, the strongest first.
+class RegionalComponents:
+    """K principal components of the displacements in one region (R vertices) over S samples, the strongest first.
 
-    A sample's displacement there is nearly `coefficients @ modes`. The weights are areas alone, and not the automatic
-    stage's: what its weights overlook, these may see. With the same weights in both, S2 is the root of S1.
+    A sample's displacement in the region is approximately `coefficients @ modes`. The vertex weights are areas only,
+    without those of the automatic stage: motion that its weights hide must be visible here. With equal weights in
+    decomposition and rigid fit, `rigid_size_ratio` is the square root of `rigid_fit_r2`.
     """
 
     region: str
     rows: Int[np.ndarray, "R"]
-    modes: Float[np.ndarray, "K R 3"]  # metres, for a coefficient of one, which is one standard deviation
+    modes: Float[np.ndarray, "K R 3"]  # metres per unit coefficient, which is one standard deviation
     coefficients: Float[np.ndarray, "S K"]
-    energy: Float[np.ndarray, "K"]  # share of the region's
-    twists: Float[np.ndarray, "K 6"]  # of the rigid part of each mode about the head's centre, radians and metres
-    rigid_share: Float[np.ndarray, "K"]  # S1: of the mode's energy, in its rigid part
-    rigid_size: Float[np.ndarray, "K"]  # S2: the rigid part's length over the mode's
-    free_of_label: Float[np.ndarray, "K"]  # S3: of the coefficients' variance, what labels do not explain
-    shared: Float[np.ndarray, "K"]  # S5: likeness to how nose and neck move along, the lesser; 1: the same, <= 0: none
+    energy: Float[np.ndarray, "K"]  # fraction of the region's
+    twists: Float[np.ndarray, "K 6"]  # rigid part of each mode about the head's centre, radians and metres
+    rigid_fit_r2: Float[np.ndarray, "K"]  # fraction of the mode's energy in its rigid part
+    rigid_size_ratio: Float[np.ndarray, "K"]  # length of the rigid part over the length of the mode
+    label_independence: Float[np.ndarray, "K"]  # fraction of the coefficients' variance that labels do not explain
+    shared_motion: Float[np.ndarray, "K"]  # similarity to the motions of nose and neck, the lesser; 1: equal
     flagged: Bool[np.ndarray, "K"]
-    steady_twists: Float[np.ndarray, "2 K 6"]  # how nose, neck move along with a coefficient of one
+    reference_twists: Float[np.ndarray, "2 K 6"]  # motions of nose and neck per unit coefficient
 
     @cached_property
-    def score(self) -> Float[np.ndarray, "K"]:
-        """S = S1 min(1, S2)."""
-        return self.rigid_share * np.minimum(1, self.rigid_size)
+    def rigidity(self) -> Float[np.ndarray, "K"]:
+        """Return the rigid fit times the rigid size, which counts at most 1."""
+        return self.rigid_fit_r2 * np.minimum(1, self.rigid_size_ratio)
 
-    def rigid_rms_mm(self, head: Head) -> Float[np.ndarray, "K"]:
-        """How far the rigid part of one standard deviation moves the region, rms."""
+    def rigid_rms_mm(self, head: HeadGeometry) -> Float[np.ndarray, "K"]:
+        """Return the rms displacement of the region by the rigid part of one standard deviation, mm."""
         area = head.area[self.rows]
-        moved = np.einsum("kj,jrc->krc", self.twists, motion_fields(head.points[self.rows]))
-        return 1e3 * np.sqrt(_energy(moved, area) / area.sum())
+        rigid = np.einsum("kj,jrc->krc", self.twists, motion_fields(head.points[self.rows]))
+        return MM_PER_M * np.sqrt(_energy(rigid, area) / area.sum())
 
 
 def regional_components(
     displacements: Iterable[Float[np.ndarray, "V 3"]],
     labels: Sequence[str],
-    head: Head,
-    settings: Regional | None = None,
-) -> list[Components]:
-    """Uncentred principal components of every region, and their scores.
+    head: HeadGeometry,
+    settings: RegionalSettings | None = None,
+) -> list[RegionalComponents]:
+    """Compute uncentred principal components of every region, and their scores.
 
     Args:
-        displacements: of all subjects' stabilized expressions from their neutrals, in the head's frame, metres, one
-            array a sample. Read several times; a region's part is held in memory, at most its square.
-        labels: what was performed in each sample.
+        displacements: of all subjects' stabilized expressions from their neutrals, in the head frame, metres, one
+            array per sample. Iterated several times; a matrix as large as one region's part of all samples is held
+            in memory, at most its square.
+        labels: the expression of each sample.
+        head: regions of the model.
+        settings: None: the defaults.
+
+    Returns:
+        The components of each region of `head`.
 
     Raises:
         InputError: fewer than two samples, or numbers that are not finite.
     """
-    settings = settings or Regional()
+    settings = settings or RegionalSettings()
     _check(displacements, labels)
-    steady = [_twists(displacements, head.regions[name], head) for name in regions.REFERENCE_REGIONS]
-    return [_components(displacements, labels, name, steady, head, settings) for name in head.regions]
+    references = [_region_twists(displacements, head.regions[name], head) for name in regions.REFERENCE_REGIONS]
+    return [_components(displacements, labels, name, references, head, settings) for name in head.regions]
 
 
-def label_part(coefficients: Float[np.ndarray, "S K"], labels: Sequence[str]) -> Float[np.ndarray, "S K"]:
-    """What the label explains of each coefficient: each label's mean, shrunk by how far chance would take it.
+def label_effects(coefficients: Float[np.ndarray, "S K"], labels: Sequence[str]) -> Float[np.ndarray, "S K"]:
+    """Estimate the part of each coefficient that the label explains: the label's mean, shrunk by its sampling error.
 
-    One-way random effects (empirical Bayes): variances between and within labels are taken from the mean squares. A
-    coefficient that does not depend on the label has no such part; with one sample a label it is all of it.
+    One-way random effects (empirical Bayes): the variances between and within labels are estimated from the mean
+    squares. For a coefficient that does not depend on the label the part is small; with one sample per label it is the
+    whole coefficient.
+
+    Args:
+        coefficients: of K components in S samples.
+        labels: of the samples.
+
+    Returns:
+        For each sample the effect of its label; zeros if all labels are equal.
     """
     group, means, counts, within = _by_label(coefficients, labels)
-    samples, kinds = len(group), len(counts)
-    if kinds < 2:
+    sample_count, label_count = len(group), len(counts)
+    if label_count < 2:
         return np.zeros_like(coefficients)
-    between = (counts[:, None] * (means - coefficients.mean(0)) ** 2).sum(0) / (kinds - 1)
-    chance = within / max(samples - kinds, 1)
-    typical = (samples - (counts**2).sum() / samples) / (kinds - 1)
-    own = np.maximum(between - chance, 0) / typical
-    spread = own + chance / counts[:, None]
-    return (means * np.divide(own, spread, out=np.zeros_like(means), where=spread > 0))[group]
+    mean_square = (counts[:, None] * (means - coefficients.mean(0)) ** 2).sum(0) / (label_count - 1)
+    within_variance = within / max(sample_count - label_count, 1)
+    typical_count = (sample_count - (counts**2).sum() / sample_count) / (label_count - 1)
+    between_variance = np.maximum(mean_square - within_variance, 0) / typical_count
+    variance = between_variance + within_variance / counts[:, None]  # of each label's mean
+    return (means * np.divide(between_variance, variance, out=np.zeros_like(means), where=variance > 0))[group]
 
 
-def free_of_label(coefficients: Float[np.ndarray, "S K"], labels: Sequence[str]) -> Float[np.ndarray, "K"]:
-    """S3: one minus the share of variance that labels explain, corrected for what chance lets them explain.
+def label_independence(coefficients: Float[np.ndarray, "S K"], labels: Sequence[str]) -> Float[np.ndarray, "K"]:
+    """Return the fraction of variance that labels do not explain: 1 - epsilon^2 [Kelley 1935].
 
-    1 - eta^2 falls with the number of labels though nothing depends on them: here it is
-    1 - epsilon^2 (Kelley 1935), 1 on average then. With one sample a label nothing can be told: 0.
+    Unlike 1 - eta^2, which falls with the number of labels even if nothing depends on them, it is then 1 on average.
+
+    Args:
+        coefficients: of K components in S samples.
+        labels: of the samples.
+
+    Returns:
+        At most 1; 0 with one sample per label, where it is undefined.
     """
     group, _, counts, within = _by_label(coefficients, labels)
-    samples, kinds = len(group), len(counts)
+    sample_count, label_count = len(group), len(counts)
     total = ((coefficients - coefficients.mean(0)) ** 2).sum(0)
-    if samples == kinds:
+    if sample_count == label_count:
         return np.zeros(coefficients.shape[1])
-    return np.minimum(1, within / np.where(total > 0, total, 1) * (samples - 1) / (samples - kinds))
+    return np.minimum(1, within / np.where(total > 0, total, 1) * (sample_count - 1) / (sample_count - label_count))
 
 
 def _check(displacements: Iterable[Float[np.ndarray, "V 3"]], labels: Sequence[str]) -> None:
-    if len(labels) < LEAST_SAMPLES:
+    if len(labels) < MIN_SAMPLES:
         raise InputError(
             "There are too few samples for principal components",
             where="expressions of all subjects",
-            expected=f"at least {LEAST_SAMPLES}, better some for each label",
+            expected=f"at least {MIN_SAMPLES}, better several per label",
             got=len(labels),
             fix="add expressions, or use the automatic stage alone (`stabilize_subject`)",
         )
@@ -159,7 +199,7 @@ def _check(displacements: Iterable[Float[np.ndarray, "V 3"]], labels: Sequence[s
                 where=f"displacement {number}, {labels[number]}",
                 expected="finite numbers",
                 got=f"{np.count_nonzero(~np.isfinite(displacement))} NaN or infinite",
-                fix="register it again, or leave it out",
+                fix="register it again, or exclude it",
             )
 
 
@@ -167,60 +207,66 @@ def _components(
     displacements: Iterable[Float[np.ndarray, "V 3"]],
     labels: Sequence[str],
     region: str,
-    steady: list[Float[np.ndarray, "S 6"]],
-    head: Head,
-    settings: Regional,
-) -> Components:
+    reference_motions: list[Float[np.ndarray, "S 6"]],
+    head: HeadGeometry,
+    settings: RegionalSettings,
+) -> RegionalComponents:
     rows = head.regions[region]
     area, points = head.area[rows], head.points[rows]
-    root = np.sqrt(area)[:, None]
-    parts = _Parts(displacements, rows, root)
-    principal = principal_components(parts, centred=False, variance_ratio=settings.share, memory_gb=math.inf)
-    flat, coefficients = principal.components, principal.coefficients(parts)
+    root_area = np.sqrt(area)[:, None]
+    weighted = _RegionData(displacements, rows, root_area)
+    principal = principal_components(
+        weighted, centred=False, variance_ratio=settings.variance_ratio, memory_gb=math.inf
+    )
+    flat, coefficients = principal.components, principal.coefficients(weighted)
     energy = principal.variance / (principal.total or 1)
-    modes = flat.reshape(len(flat), len(rows), 3) / root
+    modes = flat.reshape(len(flat), len(rows), 3) / root_area
     twists = fit_twists(modes, points, area)
-    # Coefficients of one component do not go with another's: their regressions are independent.
-    along = np.stack([coefficients.T @ motion / len(labels) for motion in steady])
+    # Coefficients of different components are uncorrelated: each regression is a product with its own coefficients.
+    reference_twists = np.stack([coefficients.T @ motion / len(labels) for motion in reference_motions])
     fields = motion_fields(points)
-    rigid, others = (np.tensordot(twist, fields, 1) for twist in (twists, along))
-    size, left = _energy(modes, area), _energy(modes - rigid, area)
-    size = np.where(size > 0, size, 1)
-    both = _energy(rigid, area) + _energy(others, area)
-    likeness = 2 * np.einsum("krc,nkrc,r->nk", rigid, others, area) / np.where(both > 0, both, 1)
-    free = free_of_label(coefficients, labels)
-    share, length, shared = 1 - left / size, np.sqrt(_energy(rigid, area) / size), likeness.min(0)
-    score = share * np.minimum(1, length)
-    return Components(
+    rigid, reference = (np.tensordot(twist, fields, 1) for twist in (twists, reference_twists))
+    mode_energy, residual_energy = _energy(modes, area), _energy(modes - rigid, area)
+    mode_energy = np.where(mode_energy > 0, mode_energy, 1)
+    energy_sum = _energy(rigid, area) + _energy(reference, area)
+    products = np.einsum("krc,nkrc,r->nk", rigid, reference, area)
+    similarity = 2 * products / np.where(energy_sum > 0, energy_sum, 1)
+    independence, shared_motion = label_independence(coefficients, labels), similarity.min(0)
+    fit_r2, size_ratio = 1 - residual_energy / mode_energy, np.sqrt(_energy(rigid, area) / mode_energy)
+    flagged = fit_r2 * np.minimum(1, size_ratio) > settings.rigidity
+    flagged &= (independence > settings.label_independence) & (shared_motion >= settings.shared_motion)
+    return RegionalComponents(
         region=region,
         rows=rows,
         modes=modes,
         coefficients=coefficients,
         energy=energy,
         twists=twists,
-        rigid_share=share,
-        rigid_size=length,
-        free_of_label=free,
-        shared=shared,
-        flagged=(score > settings.rigid) & (free > settings.free) & (shared >= settings.shared),
-        steady_twists=along,
+        rigid_fit_r2=fit_r2,
+        rigid_size_ratio=size_ratio,
+        label_independence=independence,
+        shared_motion=shared_motion,
+        flagged=flagged,
+        reference_twists=reference_twists,
     )
 
 
-class _Parts:
-    """The part of every displacement that lies in a region, times the root of the area: to be read again and again."""
+class _RegionData:
+    """The displacements in a region times the root of the vertex area, flat; iterable several times."""
 
-    def __init__(self, displacements: Iterable[np.ndarray], rows: np.ndarray, root: np.ndarray):
-        self._displacements, self._rows, self._root = displacements, rows, root
+    def __init__(self, displacements: Iterable[np.ndarray], rows: np.ndarray, root_area: np.ndarray):
+        self._displacements, self._rows, self._root_area = displacements, rows, root_area
 
     def __iter__(self) -> Iterator[np.ndarray]:
-        return ((displacement[self._rows] * self._root).ravel() for displacement in self._displacements)
+        return ((displacement[self._rows] * self._root_area).ravel() for displacement in self._displacements)
 
 
-def _twists(displacements: Iterable[np.ndarray], rows: Int[np.ndarray, "R"], head: Head) -> Float[np.ndarray, "S 6"]:
-    """The rigid motion of a region in every sample."""
-    parts = np.stack([np.asarray(displacement[rows], np.float32) for displacement in displacements])
-    return fit_twists(parts, head.points[rows], head.area[rows])
+def _region_twists(
+    displacements: Iterable[np.ndarray], rows: Int[np.ndarray, "R"], head: HeadGeometry
+) -> Float[np.ndarray, "S 6"]:
+    """Return the rigid motion of a region in every sample, radians and metres."""
+    in_region = np.stack([np.asarray(displacement[rows], np.float32) for displacement in displacements])
+    return fit_twists(in_region, head.points[rows], head.area[rows])
 
 
 def _energy(field: Float[np.ndarray, "*K R 3"], area: Float[np.ndarray, "R"]) -> Float[np.ndarray, "*K"]:
@@ -230,7 +276,7 @@ def _energy(field: Float[np.ndarray, "*K R 3"], area: Float[np.ndarray, "R"]) ->
 def _by_label(
     coefficients: Float[np.ndarray, "S K"], labels: Sequence[str]
 ) -> tuple[Int[np.ndarray, "S"], Float[np.ndarray, "L K"], Int[np.ndarray, "L"], Float[np.ndarray, "K"]]:
-    """Each sample's label as a number, means and counts of labels, and the sum of squares about the means."""
+    """Return each sample's label index, the labels' means and counts, and the sum of squares about the means."""
     _, group, counts = np.unique(np.asarray(labels), return_inverse=True, return_counts=True)
     means = np.zeros((len(counts), coefficients.shape[1]))
     np.add.at(means, group, coefficients)

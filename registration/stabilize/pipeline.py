@@ -1,4 +1,4 @@
-"""Both stages over the registrations of many subjects, as plain functions: the command does the same, on disk."""
+"""Both stages of stabilization over many subjects in memory; `gnmreg stabilize` does the same with subjects on disk."""
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
@@ -8,41 +8,46 @@ from jaxtyping import Float
 
 from registration.frames import transform_points
 from registration.model.gnm_npz import GNMData
-from registration.stabilize.automatic import Automatic, Stabilized, stabilize_subject
-from registration.stabilize.components import Components, Head, Regional, regional_components
-from registration.stabilize.decisions import Corrections, Decision, corrections, decided_actions
+from registration.stabilize.automatic import AutomaticSettings, stabilize_subject
+from registration.stabilize.components import (
+    HeadGeometry,
+    RegionalComponents,
+    RegionalSettings,
+    regional_components,
+)
+from registration.stabilize.decisions import Corrections, Decision, compute_corrections, decided_actions
 from registration.stabilize.subject_meshes import SkullSkin, SubjectMeshes
 
 
 @dataclass(frozen=True, kw_only=True)
 class Stabilization:
-    """The resolved configuration of both stages."""
+    """Settings of both stages."""
 
-    automatic: Automatic = field(default_factory=Automatic)
-    regional: Regional = field(default_factory=Regional)
+    automatic: AutomaticSettings = field(default_factory=AutomaticSettings)
+    regional: RegionalSettings = field(default_factory=RegionalSettings)
 
 
 @dataclass(frozen=True, kw_only=True)
 class StabilizedSubject:
-    """A subject after the automatic stage, or after both: metres, the world of its neutral."""
+    """A subject after the automatic stage or after both: S expressions, metres, the neutral's world."""
 
     subject: str
-    names: tuple[str, ...]
-    labels: tuple[str, ...]
+    names: tuple[str, ...]  # of the expressions' registrations
+    labels: tuple[str, ...]  # the performed expressions
     neutral: Float[np.ndarray, "V 3"]
-    T_neutral_expression: Float[np.ndarray, "S 4 4"]
-    vertices: Float[np.ndarray, "S V 3"]  # the expressions, stabilized
-    confidence_map: Float[np.ndarray, "V"]  # as `Stabilized` has it
-    residual_mm: Float[np.ndarray, "S R"]
-    T_head_world: Float[np.ndarray, "4 4"]  # lays the neutral onto the model's template, about the head's centre
+    T_neutral_expression: Float[np.ndarray, "S 4 4"]  # p_neutral = T_neutral_expression @ p_expression
+    vertices: Float[np.ndarray, "S V 3"]  # the stabilized expressions
+    confidence_map: Float[np.ndarray, "V"]  # as in `AlignedExpressions`
+    residual_mm: Float[np.ndarray, "S R"]  # as in `AlignedExpressions`
+    T_head_world: Float[np.ndarray, "4 4"]  # from the neutral's world to the head frame
 
 
 @dataclass(frozen=True, kw_only=True)
 class StabilizedSet:
-    """What `stabilize` returns."""
+    """The result of `stabilize`."""
 
     subjects: tuple[StabilizedSubject, ...]
-    components: tuple[Components, ...]
+    components: tuple[RegionalComponents, ...]
     corrections: Corrections
 
 
@@ -52,65 +57,108 @@ def stabilize(
     settings: Stabilization | None = None,
     decisions: Sequence[Decision] = (),
 ) -> StabilizedSet:
-    """Both stages: every subject by itself, then regional components over all, corrected by default or as decided.
+    """Run both stages: each subject alone, then regional components over all subjects.
 
-    Everything is held in memory: for larger sets call `automatic_stage`, `regional_stage` and `corrected` as
-    `workflows/steps/stabilize.py` does, which keeps subjects on disk. Raises InputError as these do.
+    Everything is in memory. For larger sets call `automatic_stage`, `regional_stage` and `apply_corrections` as
+    `workflows/steps/stabilize.py` does, which keeps subjects on disk.
+
+    Args:
+        subjects: registrations of each subject.
+        data: the model that the captures were registered with.
+        settings: None: the defaults.
+        decisions: an operator's, which replace the default actions.
+
+    Returns:
+        The subjects after both stages, in the given order.
+
+    Raises:
+        InputError: as `HeadGeometry.from_model` and `regional_stage`.
     """
     settings = settings or Stabilization()
-    head, skin = Head.of(data), SkullSkin.of(data)
-    steady = [automatic_stage(meshes, head, skin, settings) for meshes in subjects]
-    components, correction = regional_stage(lambda: iter(steady), head, settings, decisions)
-    first, final = 0, []
-    for subject in steady:
-        final.append(corrected(subject, correction, first))
-        first += len(subject.names)
-    return StabilizedSet(subjects=tuple(final), components=tuple(components), corrections=correction)
+    head, skin = HeadGeometry.from_model(data), SkullSkin.from_model(data)
+    aligned = [automatic_stage(meshes, head, skin, settings) for meshes in subjects]
+    components, corrections = regional_stage(lambda: iter(aligned), head, settings, decisions)
+    first_sample, corrected = 0, []
+    for subject in aligned:
+        corrected.append(apply_corrections(subject, corrections, first_sample))
+        first_sample += len(subject.names)
+    return StabilizedSet(subjects=tuple(corrected), components=tuple(components), corrections=corrections)
 
 
-def automatic_stage(meshes: SubjectMeshes, head: Head, skin: SkullSkin, settings: Stabilization) -> StabilizedSubject:
-    """One subject."""
-    found: Stabilized = stabilize_subject(meshes, skin, settings.automatic)
+def automatic_stage(
+    meshes: SubjectMeshes, head: HeadGeometry, skin: SkullSkin, settings: Stabilization
+) -> StabilizedSubject:
+    """Run the automatic stage on one subject.
+
+    Args:
+        meshes: its registrations.
+        head: geometry of the model.
+        skin: areas of the model's skin on the skull.
+        settings: of both stages.
+
+    Returns:
+        The subject's aligned expressions, as `stabilize_subject` computes them.
+    """
+    aligned = stabilize_subject(meshes, skin, settings.automatic)
     return StabilizedSubject(
         subject=meshes.subject,
         names=meshes.names,
         labels=meshes.labels,
         neutral=meshes.neutral,
-        T_neutral_expression=found.T_neutral_expression,
-        vertices=found.vertices,
-        confidence_map=found.confidence_map,
-        residual_mm=found.residual_mm,
+        T_neutral_expression=aligned.T_neutral_expression,
+        vertices=aligned.vertices,
+        confidence_map=aligned.confidence_map,
+        residual_mm=aligned.residual_mm,
         T_head_world=head.T_head_world(meshes.neutral, skin),
     )
 
 
 def regional_stage(
     subjects: Callable[[], Iterator[StabilizedSubject]],
-    head: Head,
+    head: HeadGeometry,
     settings: Stabilization,
     decisions: Sequence[Decision] = (),
-) -> tuple[list[Components], Corrections]:
-    """All subjects, read several times: components, and what is taken from every sample, in the subjects' order.
+) -> tuple[list[RegionalComponents], Corrections]:
+    """Compute the components over all subjects, and the corrections of all samples.
 
-    Raises InputError as `regional_components` and `decided_actions`.
+    Args:
+        subjects: returns a new iterator over the subjects after the automatic stage; called several times.
+        head: geometry of the model.
+        settings: of both stages.
+        decisions: an operator's, which replace the default actions.
+
+    Returns:
+        Components of all regions; corrections of all samples, in the subjects' order.
+
+    Raises:
+        InputError: as `regional_components` and `decided_actions`.
     """
     labels = [label for subject in subjects() for label in subject.labels]
     components = regional_components(Displacements(subjects), labels, head, settings.regional)
     actions = decided_actions(components, decisions)
-    return components, corrections(components, actions, labels, head)
+    return components, compute_corrections(components, actions, labels, head)
 
 
-def corrected(subject: StabilizedSubject, correction: Corrections, first: int) -> StabilizedSubject:
-    """A subject after the regional stage; `first` is the number of its first sample in the whole set."""
+def apply_corrections(subject: StabilizedSubject, corrections: Corrections, first_sample: int) -> StabilizedSubject:
+    """Apply the regional stage's corrections to a subject.
+
+    Args:
+        subject: after the automatic stage.
+        corrections: of all subjects' samples.
+        first_sample: index of the subject's first sample among all.
+
+    Returns:
+        The subject after both stages. Its transforms include the head motion, but not dropped components.
+    """
     T_head_world = subject.T_head_world
     T_world_head = np.linalg.inv(T_head_world)
     vertices, transforms = [], []
-    for number, (head, T_neutral_expression) in enumerate(
-        zip(subject.vertices, subject.T_neutral_expression, strict=True), first
+    for sample, (expression, T_neutral_expression) in enumerate(
+        zip(subject.vertices, subject.T_neutral_expression, strict=True), first_sample
     ):
-        points = correction.corrected(transform_points(T_head_world, head.astype(np.float64)), number)
+        points = corrections.apply(transform_points(T_head_world, expression.astype(np.float64)), sample)
         vertices.append(transform_points(T_world_head, points).astype(np.float32))
-        transforms.append(T_world_head @ correction.T_head_head(number) @ T_head_world @ T_neutral_expression)
+        transforms.append(T_world_head @ corrections.T_corrected_head(sample) @ T_head_world @ T_neutral_expression)
     return StabilizedSubject(
         subject=subject.subject,
         names=subject.names,
@@ -125,13 +173,19 @@ def corrected(subject: StabilizedSubject, correction: Corrections, first: int) -
 
 
 class Displacements:
-    """Every sample's displacement from its neutral in the head's frame, metres, float32: to be read again and again."""
+    """The displacement of every sample from its neutral in the head frame, metres, float32; iterable several times."""
 
     def __init__(self, subjects: Callable[[], Iterator[StabilizedSubject]]):
+        """Wrap the subjects.
+
+        Args:
+            subjects: returns a new iterator over them.
+        """
         self._subjects = subjects
 
     def __iter__(self) -> Iterator[Float[np.ndarray, "V 3"]]:
+        """Yield the displacements in the subjects' order."""
         for subject in self._subjects():
-            turn = subject.T_head_world[:3, :3].T.astype(np.float32)
+            R_world_head = subject.T_head_world[:3, :3].T.astype(np.float32)
             for vertices in subject.vertices:
-                yield (vertices - subject.neutral) @ turn
+                yield (vertices - subject.neutral) @ R_world_head  # row vectors

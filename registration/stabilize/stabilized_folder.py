@@ -1,4 +1,4 @@
-"""Read and write a stabilized set as a folder on disk. Files and fields are described in docs/formats.md."""
+"""Read and write a stabilized set as a folder on disk (docs/formats.md, "Stabilized set")."""
 
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from registration.stabilize.components import Components
+from registration.stabilize.components import RegionalComponents
 from registration.stabilize.pipeline import StabilizedSubject
 from registration.storage.files import atomic_directory, refuse_foreign
 from registration.storage.hashing import hash_arrays
@@ -42,20 +42,21 @@ _COMPONENTS = NpzSchema(
     fix=_FIX,
     fields={"regions": ("text", "N"), "subjects": ("text", "S"), "names": ("text", "S"), "labels": ("text", "S")},
 )
-_COMPONENT_ARRAYS: dict[str, tuple[Kind, str]] = {  # of each region: fields of `Components`
-    "rows": ("integer", "R"),
-    "modes": ("float", "K R 3"),
-    "coefficients": ("float", "S K"),
-    "energy": ("float", "K"),
-    "twists": ("float", "K 6"),
-    "rigid_share": ("float", "K"),
-    "rigid_size": ("float", "K"),
-    "free_of_label": ("float", "K"),
-    "shared": ("float", "K"),
-    "flagged": ("bool", "K"),
-    "steady_twists": ("float", "2 K 6"),
+# Of each region, in the order in which they are hashed: field of `RegionalComponents` -> array name, kind, axes.
+_COMPONENT_ARRAYS: dict[str, tuple[str, Kind, str]] = {
+    "rows": ("rows", "integer", "R"),
+    "modes": ("modes", "float", "K R 3"),
+    "coefficients": ("coefficients", "float", "S K"),
+    "energy": ("energy", "float", "K"),
+    "twists": ("twists", "float", "K 6"),
+    "rigid_fit_r2": ("rigid_share", "float", "K"),
+    "rigid_size_ratio": ("rigid_size", "float", "K"),
+    "label_independence": ("free_of_label", "float", "K"),
+    "shared_motion": ("shared", "float", "K"),
+    "flagged": ("flagged", "bool", "K"),
+    "reference_twists": ("steady_twists", "float", "2 K 6"),
 }
-_ALONG = "along"  # array of each region: a field of `StoredComponents`
+_MEAN_DISPLACEMENT: tuple[str, Kind, str] = ("along", "float", "K V 3")  # of each region, in `StoredComponents`
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -76,45 +77,74 @@ class StabilizedManifest(Record, kind=KIND, schema=1, title=_TITLE, fix=_FIX):
 
 @dataclass(frozen=True, kw_only=True)
 class StoredComponents:
-    """The components that an operator reviews: `components.npz`."""
+    """The contents of `components.npz`, which an operator reviews: S samples of all subjects."""
 
-    components: tuple[Components, ...]
-    subjects: tuple[str, ...]  # of every sample, as the next two
+    components: tuple[RegionalComponents, ...]
+    subjects: tuple[str, ...]  # of each sample, as names and labels
     names: tuple[str, ...]
     labels: tuple[str, ...]
-    along: Mapping[str, Float[np.ndarray, "K V 3"]]  # region -> displacement of the whole head for a coefficient of 1
+    # Region -> mean displacement of the whole head per unit coefficient of each component, metres, the head frame.
+    mean_displacement: Mapping[str, Float[np.ndarray, "K V 3"]]
 
 
-def check_out(out: Path) -> None:
-    """Refuse, before any work, a folder that is not ours to replace. Raises InputError."""
+def check_output_folder(out: Path) -> None:
+    """Refuse an output folder that `gnmreg stabilize` did not write.
+
+    Args:
+        out: where a stabilized set is to be written. A missing or an empty folder is accepted.
+
+    Raises:
+        InputError: the folder holds anything else.
+    """
     refuse_foreign(Path(out), kind=KIND, command="stabilize", files=_FILES)
 
 
 def is_stabilized(out: Path) -> bool:
-    """Return whether the folder holds a manifest that we wrote, of any schema version."""
+    """Return whether a folder holds the manifest of a stabilized set, of any schema version."""
     return StabilizedManifest.is_ours(Path(out) / MANIFEST)
 
 
 def read_manifest(out: Path) -> StabilizedManifest:
     """Read the manifest of a stabilized set.
 
+    Args:
+        out: the set's folder.
+
+    Returns:
+        Its record.
+
     Raises:
-        InputError: no manifest, not ours, another schema version, or a field that is missing or of a wrong type.
+        InputError: no manifest, one of another kind or schema version, or a field that is missing or of a wrong type.
     """
     return StabilizedManifest.read(Path(out) / MANIFEST)
 
 
 @contextmanager
 def new_stabilized_set(out: Path) -> Iterator[Path]:
-    """Yield a new folder for a set, as `atomic_directory`. Raises InputError as `check_out`."""
-    check_out(out)
+    """Yield a temporary folder that becomes the stabilized set when the block ends without an error.
+
+    Args:
+        out: the set's folder; an existing set is replaced in one step.
+
+    Yields:
+        The temporary folder, with an empty folder for the subjects.
+
+    Raises:
+        InputError: as `check_output_folder`.
+    """
+    check_output_folder(out)
     with atomic_directory(out) as temporary:
         (temporary / SUBJECTS).mkdir()
         yield temporary
 
 
 def write_subject(subject: StabilizedSubject, folder: Path, number: int) -> str:
-    """Write `subjects/NNNN.npz`, numbered because a subject's name may be no file name.
+    """Write a subject to `subjects/NNNN.npz`: numbered, since its name may not be a valid file name.
+
+    Args:
+        subject: after either stage.
+        folder: of the set.
+        number: index of the subject in the set.
 
     Returns:
         The content id of its arrays.
@@ -128,7 +158,18 @@ def write_subject(subject: StabilizedSubject, folder: Path, number: int) -> str:
 
 
 def read_subject(folder: Path, number: int) -> StabilizedSubject:
-    """Read what `write_subject` wrote. Raises InputError for a file that is missing or damaged."""
+    """Read what `write_subject` wrote.
+
+    Args:
+        folder: of the set.
+        number: index of the subject in the set.
+
+    Returns:
+        The subject.
+
+    Raises:
+        InputError: its file is missing or damaged.
+    """
     arrays = _SUBJECT.read(folder / SUBJECTS / f"{number:04d}.npz")
     return StabilizedSubject(
         subject=str(arrays["subject"]),
@@ -139,13 +180,21 @@ def read_subject(folder: Path, number: int) -> StabilizedSubject:
 
 
 def write_components(stored: StoredComponents, folder: Path) -> str:
-    """Write `components.npz`. Returns the content id of its arrays."""
+    """Write `components.npz`.
+
+    Args:
+        stored: components and samples.
+        folder: of the set.
+
+    Returns:
+        The content id of its arrays.
+    """
     arrays: dict[str, np.ndarray] = {}
     for part in stored.components:
-        for name in _COMPONENT_ARRAYS:
+        for name, (key, _, _) in _COMPONENT_ARRAYS.items():
             value = getattr(part, name)
-            arrays[f"{part.region}_{name}"] = value.astype(np.float32) if name == "modes" else value
-        arrays[f"{part.region}_{_ALONG}"] = stored.along[part.region].astype(np.float32)
+            arrays[f"{part.region}_{key}"] = value.astype(np.float32) if name == "modes" else value
+        arrays[f"{part.region}_{_MEAN_DISPLACEMENT[0]}"] = stored.mean_displacement[part.region].astype(np.float32)
     texts = {name: np.array(getattr(stored, name)) for name in ("subjects", "names", "labels")}
     regions = np.array([part.region for part in stored.components])
     np.savez(folder / COMPONENTS, allow_pickle=False, regions=regions, **texts, **arrays)
@@ -153,21 +202,35 @@ def write_components(stored: StoredComponents, folder: Path) -> str:
 
 
 def read_components(folder: Path) -> StoredComponents:
-    """Read what `write_components` wrote. Raises InputError for a file that is missing or damaged."""
+    """Read what `write_components` wrote.
+
+    Args:
+        folder: of the set.
+
+    Returns:
+        Components and samples.
+
+    Raises:
+        InputError: the file is missing or damaged.
+    """
     file = folder / COMPONENTS
     arrays = _COMPONENTS.read(file)
     regions = arrays["regions"].tolist()
     for region in regions:
-        fields = {f"{region}_{n}": kind for n, kind in {**_COMPONENT_ARRAYS, _ALONG: ("float", "K V 3")}.items()}
+        expected = (*_COMPONENT_ARRAYS.values(), _MEAN_DISPLACEMENT)
+        fields = {f"{region}_{key}": (kind, axes) for key, kind, axes in expected}
         schema = NpzSchema(title=_TITLE, fix=_FIX, fields=fields, finite=False)
         if (defect := schema.find_defect(arrays)) is not None:
             raise schema.error(defect, file)
     return StoredComponents(
         components=tuple(
-            Components(region=r, **{name: arrays[f"{r}_{name}"] for name in _COMPONENT_ARRAYS}) for r in regions
+            RegionalComponents(
+                region=region, **{name: arrays[f"{region}_{key}"] for name, (key, _, _) in _COMPONENT_ARRAYS.items()}
+            )
+            for region in regions
         ),
         subjects=tuple(arrays["subjects"].tolist()),
         names=tuple(arrays["names"].tolist()),
         labels=tuple(arrays["labels"].tolist()),
-        along={r: arrays[f"{r}_{_ALONG}"] for r in regions},
+        mean_displacement={region: arrays[f"{region}_{_MEAN_DISPLACEMENT[0]}"] for region in regions},
     )

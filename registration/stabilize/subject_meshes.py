@@ -1,4 +1,4 @@
-"""One subject's registrations as arrays, checked: what stabilization works on."""
+"""The registrations of one subject as checked arrays: the input of stabilization."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -12,32 +12,42 @@ from registration.model import regions
 from registration.model.gnm_npz import GNMData, topology_hash
 from registration.types import Registration
 
-_LEAST_SEEN = 0.2  # of the skull's skin, for an alignment that means something
+_MIN_OBSERVED = 0.2  # fraction of the skin on the skull that an alignment needs
 
 
 @dataclass(frozen=True, kw_only=True)
 class SubjectMeshes:
-    """A neutral and S expressions in the model's topology; vertices float32, metres, confidence in [0, 1]."""
+    """A neutral and S expressions in the model's topology: vertices float32, metres; confidence in [0, 1]."""
 
     subject: str
-    neutral: Float[np.ndarray, "V 3"]
+    neutral: Float[np.ndarray, "V 3"]  # in its capture's world
     neutral_confidence: Float[np.ndarray, "V"]
     names: tuple[str, ...]  # of the expressions' registrations
-    labels: tuple[str, ...]  # what was performed; several may be the same
+    labels: tuple[str, ...]  # the performed expressions; several may be equal
     vertices: Float[np.ndarray, "S V 3"]  # each in its capture's world
-    confidence: Float[np.ndarray, "S V"]  # 0: seen by no camera
+    confidence: Float[np.ndarray, "S V"]  # 0: no camera observed the vertex
 
 
 @dataclass(frozen=True, kw_only=True)
 class SkullSkin:
-    """Where the skull's motion may be read off: each vertex' area on the template, m^2; 0 on what is no such skin."""
+    """The skin that follows the skull: vertex areas on the template, m^2; 0 elsewhere."""
 
     triangles: Int[np.ndarray, "F 3"]
     area: Float[np.ndarray, "V"]
 
     @classmethod
-    def of(cls, data: GNMData) -> "SkullSkin":
-        """Raises InputError for a model without the vertex groups."""
+    def from_model(cls, data: GNMData) -> "SkullSkin":
+        """Compute the areas of a model.
+
+        Args:
+            data: a model in this project's format.
+
+        Returns:
+            The areas of `regions.skull_skin`.
+
+        Raises:
+            InputError: the model lacks a vertex group of that region.
+        """
         area = vertex_areas(data.template_vertex_positions, data.triangles)
         return cls(triangles=data.triangles, area=area * regions.skull_skin(data))
 
@@ -45,13 +55,21 @@ class SkullSkin:
 def subject_meshes(
     subject: str, neutral: Registration, expressions: Iterable[tuple[str, str, Registration]], skin: SkullSkin
 ) -> SubjectMeshes:
-    """A subject's registrations, taken one after the other: (name, label, registration) of each expression.
+    """Collect the vertices and the confidence of a subject's registrations.
 
-    Only vertices and confidence are kept.
+    Args:
+        subject: its name.
+        neutral: registration of the neutral.
+        expressions: (name, label, registration) of each expression. Read one after the other: only vertices and
+            confidence stay in memory.
+        skin: of the model that the captures were registered with.
+
+    Returns:
+        The arrays, in the order of `expressions`.
 
     Raises:
-        InputError: no expression; a registration that failed, is of another topology than the model, holds numbers
-            that are not finite, or in which hardly any of the skull's skin was seen.
+        InputError: there is no expression; a registration failed, has another topology than the model, is not finite,
+            or less than a fifth of the skin on the skull was observed in it.
     """
     _check(f"{subject}, neutral", neutral, skin)
     names, labels, vertices, confidence = [], [], [], []
@@ -67,7 +85,7 @@ def subject_meshes(
             where=subject,
             expected="a neutral and at least one expression",
             got="the neutral only",
-            fix="register the subject's expressions, or leave it out",
+            fix="register the subject's expressions, or exclude the subject",
         )
     return SubjectMeshes(
         subject=subject,
@@ -87,7 +105,7 @@ def _check(where: str, registration: Registration, skin: SkullSkin) -> None:
             where=where,
             expected="converged or stopped",
             got=registration.reason,
-            fix="register it again, or leave it out",
+            fix="register it again, or exclude it",
         )
     if topology_hash(registration.triangles) != topology_hash(skin.triangles):
         raise InputError(
@@ -98,21 +116,21 @@ def _check(where: str, registration: Registration, skin: SkullSkin) -> None:
             fix="register all subjects with one model, and give that model",
         )
     for name in ("vertices", "confidence"):
-        bad = np.count_nonzero(~np.isfinite(getattr(registration, name)))
-        if bad:
+        invalid = np.count_nonzero(~np.isfinite(getattr(registration, name)))
+        if invalid:
             raise InputError(
                 f"A registration's {name} are not finite",
                 where=where,
                 expected="finite numbers",
-                got=f"{bad} NaN or infinite",
+                got=f"{invalid} NaN or infinite",
                 fix="register it again",
             )
-    seen = skin.area[registration.confidence > 0].sum() / skin.area.sum()
-    if seen < _LEAST_SEEN:
+    observed = skin.area[registration.confidence > 0].sum() / skin.area.sum()
+    if observed < _MIN_OBSERVED:
         raise InputError(
-            "Hardly any skin was seen",
+            "Hardly any skin was observed",
             where=f"{where}, confidence",
-            expected=f"at least {100 * _LEAST_SEEN:.0f} % of the skin on the skull seen by a camera",
-            got=f"{100 * seen:.1f} %",
+            expected=f"at least {100 * _MIN_OBSERVED:.0f} % of the skin on the skull observed by a camera",
+            got=f"{100 * observed:.1f} %",
             fix="register with views of the face and the sides of the head",
         )

@@ -9,7 +9,7 @@ from markupsafe import Markup
 
 from registration.report.charts import loss_curves
 from registration.report.inputs import HeatMap
-from registration.stabilize.components import Components, Head
+from registration.stabilize.components import HeadGeometry, RegionalComponents
 from registration.stabilize.pipeline import StabilizedSubject
 from registration.stabilize.stabilized_folder import StabilizedManifest
 from workflows.pages.base import heat_images, render
@@ -19,7 +19,10 @@ _MAX_SUBJECTS = 12  # with maps; a page of hundreds would be too large to open
 
 
 def write_stabilize_page(
-    manifest: StabilizedManifest, components: Sequence[Components], subjects: Iterable[StabilizedSubject], head: Head
+    manifest: StabilizedManifest,
+    components: Sequence[RegionalComponents],
+    subjects: Iterable[StabilizedSubject],
+    head: HeadGeometry,
 ) -> str:
     """Return the page: maps and residuals of the first subjects, and all components with their scores."""
     figures = manifest.figures
@@ -29,8 +32,8 @@ def write_stabilize_page(
         (f"{figures['regional_turn_deg']:.2f}", "°", "rotation by the second stage, rms"),
         (f"{figures['regional_rms_mm']:.2f}", "mm", "displacement by the second stage, rms"),
     )
-    still_mm = manifest.config["automatic"]["still_mm"]
-    shown = [_subject(subject, head, still_mm) for subject in islice(subjects, _MAX_SUBJECTS)]
+    half_weight_mm = manifest.config["automatic"]["half_weight_mm"]
+    shown = [_subject(subject, head, half_weight_mm) for subject in islice(subjects, _MAX_SUBJECTS)]
     return render(
         "stabilization.html",
         dataset=manifest.dataset,
@@ -42,9 +45,9 @@ def write_stabilize_page(
     )
 
 
-def _subject(subject: StabilizedSubject, head: Head, still_mm: float) -> dict[str, Any]:
+def _subject(subject: StabilizedSubject, head: HeadGeometry, half_weight_mm: float) -> dict[str, Any]:
     weight = subject.confidence_map.astype(np.float64)
-    distance = np.where(weight > 0, still_mm * np.sqrt(1 / np.maximum(weight, 1e-9) - 1), np.nan)
+    distance = np.where(weight > 0, half_weight_mm * np.sqrt(1 / np.maximum(weight, 1e-9) - 1), np.nan)
     heat = HeatMap(
         vertices=subject.neutral, triangles=head.data.triangles, distance_mm=distance, T_head_world=subject.T_head_world
     )
@@ -58,7 +61,7 @@ def _subject(subject: StabilizedSubject, head: Head, still_mm: float) -> dict[st
     }
 
 
-def _rows(part: Components, head: Head) -> Iterator[dict[str, Any]]:
+def _rows(part: RegionalComponents, head: HeadGeometry) -> Iterator[dict[str, Any]]:
     moves = part.rigid_rms_mm(head)
     turns = np.degrees(np.linalg.norm(part.twists[:, :3], axis=1))
     for k in range(len(part.energy)):
@@ -67,5 +70,12 @@ def _rows(part: Components, head: Head) -> Iterator[dict[str, Any]]:
             "number": k + 1,
             "flagged": bool(part.flagged[k]),
             "energy": part.energy[k],
-            "values": (part.score[k], part.rigid_share[k], part.free_of_label[k], part.shared[k], turns[k], moves[k]),
+            "values": (
+                part.rigidity[k],
+                part.rigid_fit_r2[k],
+                part.label_independence[k],
+                part.shared_motion[k],
+                turns[k],
+                moves[k],
+            ),
         }

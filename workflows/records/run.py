@@ -67,7 +67,7 @@ def read_run(folder: Path, data: GNMData, selection: Selection = Selection()) ->
             expression; two have one name; a registration failed or is missing, has another topology than the model, or
             is not finite.
     """
-    skin, topology = SkullSkin.of(data), gnm_npz.topology_hash(data.triangles)
+    skin, topology = SkullSkin.from_model(data), gnm_npz.topology_hash(data.triangles)
     folders = [path for path in _subject_folders(folder) if selection.only is None or path.name in selection.only]
     subjects = tuple(_subject(path, selection.skip_failed) for path in folders)
     inputs = {"model": gnm_npz.content_hash(data)}

@@ -54,7 +54,7 @@ class RegisteredSubjects:
         return ids | ({"stabilized": stabilized.read_manifest(self.steady).content_id} if self.steady else {})
 
     def __iter__(self) -> Iterator[TrainingSubject]:
-        model, weights = GNM(self.model), SkullSkin.of(self.model).area
+        model, weights = GNM(self.model), SkullSkin.from_model(self.model).area
         numbers = _subject_numbers(self.steady)
         for name, usable in self.usable.items():
             neutral = load_registration(self.run / name / usable.neutral)
@@ -132,7 +132,7 @@ def registered_meshes(folder: Path, model: GNMData) -> SubjectMeshes | None:
     neutral = load_registration(folder / usable.neutral)
     if usable.expressions:
         rows = ((name, label, load_registration(folder / name)) for name, label in usable.expressions.items())
-        return subject_meshes(usable.subject, neutral, rows, SkullSkin.of(model))
+        return subject_meshes(usable.subject, neutral, rows, SkullSkin.from_model(model))
     return SubjectMeshes(
         subject=usable.subject,
         neutral=neutral.vertices,

@@ -53,7 +53,7 @@ def hold_out(
     product = Product(Path(out), input_hash(digests, {"categories": source.categories}), HoldOutResult)
     if (existing := product.find()) is not None and file.is_file():
         return replace(existing, people=str(file)).to_json()
-    subjects, lost, skin = [], list[str](), SkullSkin.of(data)
+    subjects, lost, skin = [], list[str](), SkullSkin.from_model(data)
     for name in names:
         meshes = true_meshes(source.subjects[name], data) if name in with_truths else None
         meshes = meshes or registered_meshes(Path(registrations) / name, data)

@@ -12,14 +12,14 @@ from registration.model import gnm_npz
 from registration.model.gnm_npz import GNMData
 from registration.progress import NullProgress, Progress
 from registration.stabilize import stabilized_folder as disk
-from registration.stabilize.components import LEAST_SAMPLES, Components, Head
-from registration.stabilize.decisions import Change, Decision, change
+from registration.stabilize.components import MIN_SAMPLES, HeadGeometry, RegionalComponents
+from registration.stabilize.decisions import CorrectionEffect, Decision, correction_effect
 from registration.stabilize.pipeline import (
     Displacements,
     Stabilization,
     StabilizedSubject,
+    apply_corrections,
     automatic_stage,
-    corrected,
     regional_stage,
 )
 from registration.stabilize.stabilized_folder import StoredComponents
@@ -68,14 +68,15 @@ def stabilize_run(
         progress: where to report to.
 
     Raises:
-        InputError: as `read_run`, `read_decisions`, `check_out`; fewer than two expressions. Nothing is written then.
+        InputError: as `read_run`, `read_decisions`, `check_output_folder`; fewer than two expressions. Nothing is
+            written then.
     """
     progress, settings = progress or NullProgress(), settings or Stabilization()
     out = Path(run) / STABILIZED if out is None else Path(out)
     data = gnm_npz.read(model_path)
-    head = Head.of(data)
+    head = HeadGeometry.from_model(data)
     inputs = read_run(run, data, selection)
-    disk.check_out(out)
+    disk.check_output_folder(out)
     _check_count(inputs, run)
     dataset = input_hash(inputs.inputs, to_jsonable(settings))
     decided = [] if decisions is None else read_decisions(decisions, dataset)
@@ -127,7 +128,7 @@ def stabilize_subjects(
     usable = {name: read_usable(Path(run) / name) for name in names}
     counts = {name: len(subject.expressions) for name, subject in usable.items() if subject and subject.expressions}
     total = sum(counts.values())
-    if total < LEAST_SAMPLES:
+    if total < MIN_SAMPLES:
         return StabilizeResult(out=None, reason=f"{total} expressions of {len(names)} subjects").to_json()
     result = stabilize_run(
         Path(run),
@@ -149,11 +150,11 @@ def _write_subjects(
     folder: Path,
     run: StabilizationInputs,
     data: GNMData,
-    head: Head,
+    head: HeadGeometry,
     settings: Stabilization,
     decisions: Sequence[Decision],
     progress: Progress,
-) -> tuple[dict[str, str], list[Components], Change]:
+) -> tuple[dict[str, str], list[RegionalComponents], CorrectionEffect]:
     """Compute both stages; return content ids by file, the components, and the effect of the second stage."""
     count = len(run.subjects)
     for number, meshes in enumerate(run.meshes()):
@@ -164,23 +165,25 @@ def _write_subjects(
         return (disk.read_subject(folder, k) for k in range(count))
 
     progress.update(count, count, "components of all subjects")
-    components, correction = regional_stage(stabilized, head, settings, decisions)
+    components, corrections = regional_stage(stabilized, head, settings, decisions)
     names = [(s.subject, name, label) for s in stabilized() for name, label in zip(s.names, s.labels, strict=True)]
     subjects, files, labels = (tuple(row[k] for row in names) for k in range(3))
-    mean_displacements = along(Displacements(stabilized), components)
+    mean_displacement = mean_displacements(Displacements(stabilized), components)
     stored = StoredComponents(
-        components=tuple(components), subjects=subjects, names=files, labels=labels, along=mean_displacements
+        components=tuple(components), subjects=subjects, names=files, labels=labels, mean_displacement=mean_displacement
     )
     ids = {disk.COMPONENTS: disk.write_components(stored, folder)}
-    first = 0
+    first_sample = 0
     for number in range(count):
         subject = disk.read_subject(folder, number)
-        ids[f"{number:04d}"] = disk.write_subject(corrected(subject, correction, first), folder, number)
-        first += len(subject.names)
-    return ids, components, change(correction, head)
+        ids[f"{number:04d}"] = disk.write_subject(apply_corrections(subject, corrections, first_sample), folder, number)
+        first_sample += len(subject.names)
+    return ids, components, correction_effect(corrections, head)
 
 
-def along(displacements: Iterable[np.ndarray], components: Sequence[Components]) -> dict[str, np.ndarray]:
+def mean_displacements(
+    displacements: Iterable[np.ndarray], components: Sequence[RegionalComponents]
+) -> dict[str, np.ndarray]:
     """Return the head's mean displacement per unit coefficient, by region; coefficients have a mean square of one.
 
     Args:
@@ -196,7 +199,9 @@ def along(displacements: Iterable[np.ndarray], components: Sequence[Components])
     return {region: total / count for region, total in sums.items()}
 
 
-def _figures(components: Sequence[Components], effect: Change, folder: Path, count: int) -> dict[str, Any]:
+def _figures(
+    components: Sequence[RegionalComponents], effect: CorrectionEffect, folder: Path, count: int
+) -> dict[str, Any]:
     residual = np.concatenate([disk.read_subject(folder, k).residual_mm for k in range(count)])
     return {
         "samples": len(residual),
@@ -206,18 +211,18 @@ def _figures(components: Sequence[Components], effect: Change, folder: Path, cou
         "components": {part.region: len(part.energy) for part in components},
         "flagged": {part.region: np.flatnonzero(part.flagged).tolist() for part in components},
         "regional_rms_mm": effect.rms_mm,
-        "regional_most_mm": effect.most_mm,
-        "regional_turn_deg": effect.turn_deg,
+        "regional_most_mm": effect.max_mm,
+        "regional_turn_deg": effect.rotation_deg,
     }
 
 
 def _check_count(run: StabilizationInputs, where: Path) -> None:
     count = sum(len(subject.expressions) for subject in run.subjects)
-    if count < LEAST_SAMPLES:
+    if count < MIN_SAMPLES:
         raise InputError(
             "There is only one expression to stabilize",
             where=where,
-            expected=f"at least {LEAST_SAMPLES} expressions of all subjects together",
+            expected=f"at least {MIN_SAMPLES} expressions of all subjects together",
             got=count,
             fix="register more expressions; `stabilize_subject` alone aligns a single one",
         )

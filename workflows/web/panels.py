@@ -7,8 +7,8 @@ import numpy as np
 from jaxtyping import Float
 
 from registration.report.templates import environment
-from registration.stabilize.components import Components, Head
-from registration.stabilize.decisions import Change
+from registration.stabilize.components import HeadGeometry, RegionalComponents
+from registration.stabilize.decisions import CorrectionEffect
 from registration.stabilize.stabilized_folder import StoredComponents
 
 _BINS, _MAX_SIGMAS = 24, 3.0  # of a histogram: bars, and its range to either side
@@ -16,17 +16,17 @@ _MAX_LABELS = 24
 _TOP = 10
 
 
-def about(part: Components, k: int, action: str, head: Head) -> str:
+def about(part: RegionalComponents, k: int, action: str, head: HeadGeometry) -> str:
     """Scores of a component, and its rigid part in degrees and mm."""
     turn = np.degrees(np.linalg.norm(part.twists[k, :3]))
     moves = part.rigid_rms_mm(head)[k]
     rows = (
         ("energy of the region", f"{100 * part.energy[k]:.1f} %"),
-        ("rigid score", f"{part.score[k]:.2f}"),
-        ("rigid fit, R²", f"{part.rigid_share[k]:.2f}"),
-        ("size of the rigid motion", f"{part.rigid_size[k]:.2f}"),
-        ("label independence", f"{part.free_of_label[k]:.2f}"),
-        ("motion shared by nose and neck", f"{part.shared[k]:.2f}"),
+        ("rigid score", f"{part.rigidity[k]:.2f}"),
+        ("rigid fit, R²", f"{part.rigid_fit_r2[k]:.2f}"),
+        ("size of the rigid motion", f"{part.rigid_size_ratio[k]:.2f}"),
+        ("label independence", f"{part.label_independence[k]:.2f}"),
+        ("motion shared by nose and neck", f"{part.shared_motion[k]:.2f}"),
         ("rigid motion, one σ", f"{turn:.2f}° \N{NO-BREAK SPACE} {moves:.2f} mm"),
     )
     return _panel("about", rows=rows, flagged=bool(part.flagged[k]), action=action)
@@ -37,12 +37,12 @@ def colour_bar(limit_mm: float, title: str) -> str:
     return _panel("colour_bar", limit_mm=limit_mm, title=title)
 
 
-def error(change: Change, undecided: int) -> str:
+def error(effect: CorrectionEffect, undecided: int) -> str:
     """How the rebuilt set differs from the one that it was built from, with the current decisions."""
     rows = (
-        ("difference after reconstruction, rms", f"{change.rms_mm:.3f} mm"),
-        ("largest difference of a sample", f"{change.most_mm:.2f} mm"),
-        ("rotation of heads, rms", f"{change.turn_deg:.3f}°"),
+        ("difference after reconstruction, rms", f"{effect.rms_mm:.3f} mm"),
+        ("largest difference of a sample", f"{effect.max_mm:.2f} mm"),
+        ("rotation of heads, rms", f"{effect.rotation_deg:.3f}°"),
         ("decisions not saved", f"{undecided}"),
     )
     return _panel("error", rows=rows)
@@ -60,7 +60,7 @@ def histogram(coefficients: Float[np.ndarray, "S"], labels: Sequence[str]) -> st
     return _panel("histogram", lines=lines, more=len(names) - len(lines), bins=_BINS, sigmas=2 * _MAX_SIGMAS)
 
 
-def strongest(part: Components, k: int, stored: StoredComponents) -> str:
+def strongest(part: RegionalComponents, k: int, stored: StoredComponents) -> str:
     """The ten samples with the largest coefficients of a component."""
     coefficients = part.coefficients[:, k]
     rows = [

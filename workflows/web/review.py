@@ -12,7 +12,7 @@ from registration.progress import Progress
 from registration.report.heat_map import scale_limit_mm
 from registration.report.pictures import scale_colours
 from registration.stabilize import stabilized_folder as disk
-from registration.stabilize.components import Components, Head
+from registration.stabilize.components import HeadGeometry, RegionalComponents
 from registration.stabilize.decisions import ACTIONS
 from workflows.records.decisions import read_decisions
 from workflows.records.run import Selection
@@ -50,7 +50,7 @@ def review(
     )
     log = Path(run) / LOG if decisions is None else Path(decisions)
     saved = read_decisions(log, outcome.dataset) if log.is_file() else []
-    head = Head.of(gnm_npz.read(model_path))
+    head = HeadGeometry.from_model(gnm_npz.read(model_path))
     return ReviewPage(ReviewState(disk.read_components(outcome.out), head, log, outcome.dataset, saved), port)
 
 
@@ -81,7 +81,7 @@ class ReviewPage(PageServer):
         self._show()
 
     @property
-    def _part(self) -> Components:
+    def _part(self) -> RegionalComponents:
         return self._parts[self._region.value.replace(" ", "_")]
 
     @property
@@ -157,7 +157,7 @@ class ReviewPage(PageServer):
             part, k = self._part, min(self._component, len(self._part.energy) - 1)
             review = self.review
             self._about.content = panels.about(part, k, review.action(part.region, k), review.head)
-            self._error.content = panels.error(review.change, review.unsaved)
+            self._error.content = panels.error(review.effect, review.unsaved)
             self._histogram.content = panels.histogram(part.coefficients[:, k], review.stored.labels)
             self._strongest.content = panels.strongest(part, k, review.stored)
             before, after = (motion[self._vertices] for motion in review.motions(part.region, k))

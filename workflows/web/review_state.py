@@ -7,14 +7,14 @@ import numpy as np
 from jaxtyping import Float
 
 from registration.geometry.rigid import motion_fields
-from registration.stabilize.components import Head
+from registration.stabilize.components import HeadGeometry
 from registration.stabilize.decisions import (
     Action,
-    Change,
+    CorrectionEffect,
     Corrections,
     Decision,
-    change,
-    corrections,
+    compute_corrections,
+    correction_effect,
     decided_actions,
 )
 from registration.stabilize.stabilized_folder import StoredComponents
@@ -24,7 +24,9 @@ from workflows.records.decisions import append_decisions
 class ReviewState:
     """Decisions about a stabilized set's components, in order."""
 
-    def __init__(self, stored: StoredComponents, head: Head, log: Path, dataset: str, saved: Sequence[Decision] = ()):
+    def __init__(
+        self, stored: StoredComponents, head: HeadGeometry, log: Path, dataset: str, saved: Sequence[Decision] = ()
+    ):
         self.stored, self.head, self.log, self.dataset = stored, head, log, dataset
         self.decisions = list(saved)
         self._saved = len(self.decisions)
@@ -68,7 +70,7 @@ class ReviewState:
 
     def motions(self, region: str, component: int) -> tuple[Float[np.ndarray, "V 3"], Float[np.ndarray, "V 3"]]:
         """Return the head's displacement at one standard deviation, metres: before and after the current decisions."""
-        before = self.stored.along[region][component].astype(np.float64)
+        before = self.stored.mean_displacement[region][component].astype(np.float64)
         part = next(part for part in self.stored.components if part.region == region)
         weight = part.coefficients[:, component] / len(self.stored.labels)
         removed = np.tensordot(weight @ self.corrections.twists, motion_fields(self.head.points), 1)
@@ -78,7 +80,7 @@ class ReviewState:
 
     def _update(self) -> None:
         self._actions = decided_actions(self.stored.components, self.decisions)
-        self.corrections: Corrections = corrections(
+        self.corrections: Corrections = compute_corrections(
             self.stored.components, self._actions, self.stored.labels, self.head
         )
-        self.change: Change = change(self.corrections, self.head)
+        self.effect: CorrectionEffect = correction_effect(self.corrections, self.head)

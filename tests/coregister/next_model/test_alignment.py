@@ -30,7 +30,7 @@ def _observed(heads: np.ndarray) -> np.ndarray:
 def test_heads_are_aligned_with_their_mean_and_the_mean_with_the_template(model, scattered):
     aligned = align_neutrals(scattered, _observed(scattered), _names(), model)
     assert aligned.rejected == () and 2 <= aligned.iterations < 20
-    stable = SkullSkin.of(model).area
+    stable = SkullSkin.from_model(model).area
     for T, head, source in zip(aligned.T_model_head, aligned.vertices, scattered, strict=True):
         np.testing.assert_allclose(T[:3, :3] @ T[:3, :3].T, np.eye(3), atol=1e-12)
         assert np.linalg.det(T[:3, :3]) == pytest.approx(1)

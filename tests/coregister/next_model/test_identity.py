@@ -32,7 +32,7 @@ def _random_heads(model: GNMData, rng: np.random.Generator, count: int) -> np.nd
 
 def _without_rigid_motion(model: GNMData) -> np.ndarray:
     """The model's own_components components without the rigid motions of the stable skin: K V 3."""
-    basis, stable = samples.head_components(model), SkullSkin.of(model).area
+    basis, stable = samples.head_components(model), SkullSkin.from_model(model).area
     points = model.template_vertex_positions.astype(np.float64)
     points = points - stable @ points / stable.sum()
     return basis - np.tensordot(fit_twists(basis, points, stable), motion_fields(points), 1)

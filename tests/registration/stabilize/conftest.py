@@ -5,19 +5,19 @@ import pytest
 from bench.support import performances
 from bench.support.performances import ObservedSubject, TrueSubject
 from registration.model.gnm_npz import GNMData
-from registration.stabilize.components import Head
+from registration.stabilize.components import HeadGeometry
 from registration.stabilize.subject_meshes import SkullSkin
 from tests.coregister.conftest import head_assembly, model, model_file, source, wheel  # noqa: F401  fixtures
 
 
 @pytest.fixture(scope="session")
-def head(model: GNMData) -> Head:  # noqa: F811
-    return Head.of(model)
+def head(model: GNMData) -> HeadGeometry:  # noqa: F811
+    return HeadGeometry.from_model(model)
 
 
 @pytest.fixture(scope="session")
 def skin(model: GNMData) -> SkullSkin:  # noqa: F811
-    return SkullSkin.of(model)
+    return SkullSkin.from_model(model)
 
 
 @pytest.fixture(scope="session")
