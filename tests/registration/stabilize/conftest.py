@@ -1,4 +1,4 @@
-"""Truths and what a registration would make of them, made once."""
+"""True subjects and what a registration would observe of them, once per session."""
 
 import pytest
 
@@ -26,5 +26,5 @@ def truths(head_assembly) -> list[TrueSubject]:  # noqa: F811
 
 
 @pytest.fixture(scope="session")
-def seens(truths: list[TrueSubject]) -> list[ObservedSubject]:
+def observations(truths: list[TrueSubject]) -> list[ObservedSubject]:
     return [performances.observe(truth, number) for number, truth in enumerate(truths)]

@@ -1,4 +1,4 @@
-"""A run on disk, as `gnmreg subject` would leave it, of subjects whose truth is known."""
+"""Write the run of subjects with known truth, as `gnmreg subject` does."""
 
 import json
 from collections.abc import Sequence
@@ -14,7 +14,7 @@ from tests.registration.report.test_page import a_registration
 
 
 def write_subject(folder: Path, name: str, data: GNMData, heads: dict[str, tuple[str, np.ndarray, np.ndarray]]) -> Path:
-    """A subject folder; heads: registration -> (expression, vertices, confidence), the neutral first."""
+    """Write a subject folder; heads: registration -> (expression, vertices, confidence), the neutral first."""
     model = gnm_npz.content_hash(data)
     rows = []
     for row, (expression, vertices, confidence) in heads.items():
@@ -27,17 +27,21 @@ def write_subject(folder: Path, name: str, data: GNMData, heads: dict[str, tuple
             inputs={"model": model},
         )
         save_registration(result, folder / row, "<html></html>")
-        rows.append({"name": row, "expression": expression, "status": "converged", "reason": "it rests", "folder": row})
+        rows.append(
+            {"name": row, "expression": expression, "status": "converged", "reason": "tolerance reached", "folder": row}
+        )
     record = {"kind": "gnm-subject", "schema": 1, "subject": name, "model": model, "recipe": "draft", "captures": rows}
     (folder / "subject.json").write_text(json.dumps({**record, "neutral": next(iter(heads))}))
     return folder
 
 
-def write_run(folder: Path, data: GNMData, truths: Sequence[TrueSubject], seens: Sequence[ObservedSubject]) -> Path:
-    """One folder a subject."""
-    for truth, seen in zip(truths, seens, strict=True):
-        heads = {"rest": ("neutral", seen.neutral, seen.neutral_confidence)}
+def write_run(
+    folder: Path, data: GNMData, truths: Sequence[TrueSubject], observations: Sequence[ObservedSubject]
+) -> Path:
+    """Write one folder per subject."""
+    for truth, observed in zip(truths, observations, strict=True):
+        heads = {"rest": ("neutral", observed.neutral, observed.neutral_confidence)}
         for k, label in enumerate(truth.labels):
-            heads[label] = (label, seen.vertices[k], seen.confidence[k])
+            heads[label] = (label, observed.vertices[k], observed.confidence[k])
         write_subject(folder / truth.name, truth.name, data, heads)
     return folder
