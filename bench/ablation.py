@@ -18,8 +18,8 @@ from rich.console import Console
 from rich.table import Table
 
 from registration.capture.native import read_capture
-from registration.evaluate.audit import BEYOND
-from registration.evaluate.evaluation import evaluate
+from registration.evaluate.audit import BEYOND_KEY
+from registration.evaluate.evaluation import evaluate_registration
 from registration.fit.recipes import Recipe, Stage, draft
 from registration.options import RegisterOptions
 from registration.pipeline import register
@@ -72,7 +72,7 @@ def _row(registration: Registration, drift: Mapping[str, Any] | None) -> list[st
     if drift is not None:
         cells += [f"{drift['mean_mm']:.3f}", f"{drift['p95_mm']:.2f}"]
     stages = sum(seconds for name, seconds in registration.seconds.items() if name not in ("targets", "start"))
-    return [*cells, str(figures["intersections"][BEYOND]), f"{stages:.0f}"]
+    return [*cells, str(figures["intersections"][BEYOND_KEY]), f"{stages:.0f}"]
 
 
 def main() -> None:
@@ -92,18 +92,18 @@ def main() -> None:
             recipe = replace(recipe, name=f"draft without {name}" if name != "everything" else "draft")
             progress.message(f"without {name}" if name != "everything" else name)
             chosen = RegisterOptions(recipe=recipe)
-            made = register(options.neutral, options.model, folder / "neutral", chosen, progress=progress)
-            neutral_table.add_row(name, *_row(made, None))
-            made = register(
+            result = register(options.neutral, options.model, folder / "neutral", chosen, progress=progress)
+            neutral_table.add_row(name, *_row(result, None))
+            result = register(
                 options.expression, options.model, folder / "expression", chosen, neutral=whole, progress=progress
             )
-            found = evaluate(
-                made,
+            evaluation = evaluate_registration(
+                result,
                 read_capture(options.expression),
                 neutral=load_registration(whole),
                 neutral_capture=read_capture(options.neutral),
             )
-            expression_table.add_row(name, *_row(made, found.figures["drift"]["face"]))
+            expression_table.add_row(name, *_row(result, evaluation.metrics["drift"]["face"]))
     for table in (neutral_table, expression_table):
         Console(width=100).print(table)
 

@@ -37,7 +37,7 @@ from registration.capture.native import read_capture
 from registration.capture.scan import read_scan
 from registration.errors import InputError
 from registration.evaluate.evaluation import CLOUD_TOLERANCE
-from registration.evaluate.face import face_ball, seen
+from registration.evaluate.face import face_sphere, visible_in_two_views
 from registration.model import gnm_npz, regions
 from registration.model.gnm import GNM
 from registration.model.gnm_npz import GNMData
@@ -81,8 +81,9 @@ def face_points(capture: Capture, registration: Registration) -> Float[np.ndarra
     surface = scan if len(scan.triangles) else registration
     tolerance = () if len(scan.triangles) else (CLOUD_TOLERANCE,)
     cameras = [view.camera for view in capture.views]
-    inside = face_ball(capture, registration).holds(scan.vertices)
-    inside &= seen(scan.vertices, surface.vertices.astype(np.float64), surface.triangles, cameras, *tolerance)
+    inside = face_sphere(capture, registration).contains(scan.vertices)
+    occluder = surface.vertices.astype(np.float64), surface.triangles
+    inside &= visible_in_two_views(scan.vertices, *occluder, cameras, *tolerance)
     return scan.vertices[inside].astype(np.float64)
 
 

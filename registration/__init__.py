@@ -16,8 +16,7 @@ if TYPE_CHECKING:
     from registration.capture.doctor import CaptureReport, check_capture
     from registration.capture.native import read_capture
     from registration.errors import InputError
-    from registration.evaluate.evaluation import Evaluation as RegistrationEvaluation
-    from registration.evaluate.evaluation import evaluate as evaluate_registration
+    from registration.evaluate.evaluation import RegistrationEvaluation, evaluate_registration
     from registration.fit.recipes import Lengths, OffsetRegion, Rate, Recipe, Stage, Weights, load_recipe
     from registration.model.gnm import GNM
     from registration.model.gnm_npz import GNMData

@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from registration.evaluate.audit import audit
-from registration.evaluate.evaluation import Evaluation, evaluate
+from registration.evaluate.audit import audit_penetration
+from registration.evaluate.evaluation import RegistrationEvaluation, evaluate_registration
 from registration.fit.context import FitContext
 from registration.fit.initialization import (
     MIN_LANDMARKS,
@@ -279,16 +279,16 @@ def _evaluate(
     inputs: RegistrationInputs, problem: FitProblem, registration: Registration, progress: Progress
 ) -> tuple[Registration, str]:
     """The registration with its metrics, including those against a scan, and the report's page."""
-    evaluation: Evaluation | None = None
+    evaluation: RegistrationEvaluation | None = None
     finite = np.isfinite(registration.vertices).all()
     if finite:
         progress.message("auditing intersections between parts")
-        intersections = audit(registration.vertices, inputs.data, scale=float(registration.scale)).figures
-        registration = replace(registration, figures={**registration.figures, "intersections": intersections})
+        audit = audit_penetration(registration.vertices, inputs.data, scale=float(registration.scale))
+        registration = replace(registration, figures={**registration.figures, "intersections": audit.metrics})
     if inputs.capture.scan is not None and finite:
         progress.message("measuring against the scan")
-        evaluation = evaluate(registration, inputs.capture)
-        registration = replace(registration, figures={**registration.figures, **evaluation.figures})
+        evaluation = evaluate_registration(registration, inputs.capture)
+        registration = replace(registration, figures={**registration.figures, **evaluation.metrics})
     progress.message("writing the report")
     cameras = [view.camera for view in inputs.capture.views]
     batch, rendered = problem.render_views(select_spread_views(cameras, _REPORT_VIEWS))

@@ -13,7 +13,7 @@ from jaxtyping import Float
 
 from registration.capture import native
 from registration.capture.scan import read_scan
-from registration.evaluate.distances import Surface, distances_mm
+from registration.evaluate.distances import TriangleSurface, distances_mm
 from registration.frames import linear_to_srgb
 from registration.geometry.rasterizer import rasterize
 from registration.geometry.topology import vertex_normals
@@ -29,7 +29,7 @@ LIGHT = np.array([-0.45, -0.65, -0.61])  # from the camera's upper left
 Picture = Float[np.ndarray, "H W 3"]  # sRGB in [0, 255]
 
 
-def panels(view: View, registration: Registration, scan: Surface) -> list[Picture]:
+def panels(view: View, registration: Registration, scan: TriangleSurface) -> list[Picture]:
     """Return the captured image and four renderings of the registration from the same camera."""
     image = cv2.imread(str(view.image))[..., ::-1].astype(float)
     camera = view.camera.scaled(2 * view.camera.width_px, 2 * view.camera.height_px)
@@ -87,7 +87,7 @@ def main() -> None:
     capture, registration = native.read_capture(arguments.capture), load_registration(arguments.registration)
     view = next(v for v in capture.views if v.name == arguments.view)
     raw = read_scan(capture.scan)
-    drawn = panels(view, registration, Surface(vertices=raw.vertices, triangles=raw.triangles))
+    drawn = panels(view, registration, TriangleSurface(vertices=raw.vertices, triangles=raw.triangles))
     captions = [caption.format(len(capture.views)) for caption in CAPTIONS]
     picture = np.concatenate([labelled(panel, text) for panel, text in zip(drawn, captions, strict=True)], 1)
     cv2.imwrite(str(OUT), picture[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 88])

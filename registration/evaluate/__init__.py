@@ -1,1 +1,1 @@
-"""Measure registrations: distances from scan and ground truth, penetration of parts."""
+"""Evaluate registrations: distances from the scan and the ground truth, and penetration of parts."""

@@ -1,9 +1,10 @@
-"""Where the parts of a registered head run through one another, told by winding numbers (docs/formats.md, "Figures").
+"""Penetration audit: where parts of a registered head lie inside one another, by winding numbers [Jacobson 2013].
 
-It judges whatever a fit did to keep parts apart, so it shares nothing with a loss: parts are the mesh itself, not hulls
-or spheres. A vertex is inside a part where the part, with its openings closed, winds around it more than half a time,
-and as deep as the part's surface is away. The template's own parts overlap, which no registration can help: what counts
-is the excess over the template's depth, vertex by vertex and pair by pair.
+The audit assesses whatever a fit did to keep parts apart. It therefore shares nothing with a loss: the parts are the
+mesh itself, not hulls or spheres. A vertex is inside a part if the part, its openings closed, has a winding number
+above 0.5 at the vertex; its depth is the distance to the part's surface. The template's own parts overlap, which no
+registration can avoid. What counts is the excess over the depth in the template, vertex by vertex and pair by pair
+(docs/formats.md, "Figures").
 """
 
 from collections.abc import Mapping
@@ -26,64 +27,73 @@ from registration.model.gnm_npz import GNMData
 from registration.storage.registration_folder import load_registration, update_figures
 
 TOLERANCE_MM = 0.3
-BEYOND = f"vertices_beyond_{TOLERANCE_MM}mm"
+BEYOND_KEY = f"vertices_beyond_{TOLERANCE_MM}mm"
 _INSIDE = 0.5  # winding number
 
 
 @dataclass(frozen=True, kw_only=True)
-class Pair:
-    """One part in another: the vertices that are inside, here or in the template. 0 mm is outside."""
+class PartPair:
+    """One part in another: the vertices that are inside, in the mesh or in the template. A depth of 0 mm is outside."""
 
     name: str
     vertices: Int[np.ndarray, "N"]
     depth_mm: Float[np.ndarray, "N"]
-    baseline_mm: Float[np.ndarray, "N"]  # the same vertex' depth in the template, at the mesh's scale
+    baseline_mm: Float[np.ndarray, "N"]  # depth of the same vertex in the template, at the mesh's scale
 
     @property
     def excess_mm(self) -> Float[np.ndarray, "N"]:
+        """Return the depth minus the depth in the template."""
         return self.depth_mm - self.baseline_mm
 
     @property
     def beyond(self) -> Int[np.ndarray, "M"]:
-        """The vertices that are deeper than in the template by more than the tolerance."""
+        """Return the vertices whose excess is larger than the tolerance."""
         return self.vertices[self.excess_mm > TOLERANCE_MM]
 
     @property
-    def figures(self) -> dict[str, Any]:
+    def metrics(self) -> dict[str, Any]:
+        """Return the pair's entry of the manifest."""
         return {
             "template_vertices": int((self.baseline_mm > 0).sum()),
             "template_max_mm": float(self.baseline_mm.max(initial=0)),
-            BEYOND: len(self.beyond),
+            BEYOND_KEY: len(self.beyond),
             "max_excess_mm": float(self.excess_mm.max(initial=0)),
         }
 
 
 @dataclass(frozen=True, kw_only=True)
-class Audit:
-    """All pairs of parts, also those that do not meet."""
+class PenetrationAudit:
+    """All pairs of parts, including those that do not intersect."""
 
-    pairs: tuple[Pair, ...]
+    pairs: tuple[PartPair, ...]
 
     @property
     def beyond(self) -> Int[np.ndarray, "M"]:
-        """The vertices beyond the tolerance in any pair, each once."""
+        """Return the vertices whose excess is larger than the tolerance in any pair, each once."""
         return np.unique(np.concatenate([pair.beyond for pair in self.pairs]))
 
     @property
-    def figures(self) -> dict[str, Any]:
-        """For a manifest: the number of vertices beyond the tolerance, and each pair's figures."""
-        return {BEYOND: len(self.beyond), "pairs": {pair.name: pair.figures for pair in self.pairs}}
+    def metrics(self) -> dict[str, Any]:
+        """Return the entry of the manifest: the number of vertices beyond the tolerance, and each pair's metrics."""
+        return {BEYOND_KEY: len(self.beyond), "pairs": {pair.name: pair.metrics for pair in self.pairs}}
 
 
-def audit(vertices: Float[np.ndarray, "V 3"], data: GNMData, scale: float = 1.0) -> Audit:
-    """Find what of a posed mesh of this model lies inside what it should not.
+def audit_penetration(vertices: Float[np.ndarray, "V 3"], data: GNMData, scale: float = 1.0) -> PenetrationAudit:
+    """Measure how deep parts of a posed mesh lie inside one another, beyond the depth in the template.
 
-    `vertices`: metres, any frame, model order; `scale`: the registration's, for the template is compared at the same
-    size. Tested are the outer skin and the tongue; eye sockets, gums and the mouth's lining are not. A process'
-    first audit with a model audits its template too.
+    The vertices of the outer skin and of the tongue are tested; eye sockets, gums and the oral lining are not. The
+    first audit of a process with a model also audits its template.
+
+    Args:
+        vertices: metres, any frame, in the model's topology.
+        data: the model.
+        scale: of the registration; the template is compared at the same size.
+
+    Returns:
+        Depths and excesses in millimetres.
 
     Raises:
-        InputError: the vertices are not this model's, or not finite.
+        InputError: the vertices are not in the model's topology, or not finite.
     """
     template = np.asarray(data.template_vertex_positions)
     if vertices.shape != template.shape or not np.isfinite(vertices).all():
@@ -92,20 +102,26 @@ def audit(vertices: Float[np.ndarray, "V 3"], data: GNMData, scale: float = 1.0)
             where="vertices",
             expected=f"finite numbers, {template.shape} as the model's template",
             got=f"{vertices.shape}, {int((~np.isfinite(vertices)).any(-1).sum())} not finite",
-            fix="give a registration that did not fail, with the model it was made with",
+            fix="give a registration that did not fail, and the model it was computed with",
         )
-    parts, baseline = _template(data)
-    found = parts.depths(np.asarray(vertices, np.float64))
+    parts, template_depths = _template_parts(data)
     pairs = []
-    for name, depth in found.items():
-        own = scale * baseline[name]
-        members = np.flatnonzero((depth > 0) | (own > 0))
-        pairs.append(Pair(name=name, vertices=members, depth_mm=depth[members], baseline_mm=own[members]))
-    return Audit(pairs=tuple(pairs))
+    for name, depth in parts.depths(np.asarray(vertices, np.float64)).items():
+        baseline = scale * template_depths[name]
+        members = np.flatnonzero((depth > 0) | (baseline > 0))
+        pairs.append(PartPair(name=name, vertices=members, depth_mm=depth[members], baseline_mm=baseline[members]))
+    return PenetrationAudit(pairs=tuple(pairs))
 
 
-def audit_folder(registration_dir: Path, model: Path) -> Audit:
-    """Audit a registration folder with the model it was made with, print the table, add the figures to its manifest.
+def audit_folder(registration_dir: Path, model: Path) -> PenetrationAudit:
+    """Audit a registration folder, print the table and add the metrics to its manifest.
+
+    Args:
+        registration_dir: the registration folder.
+        model: the model that the registration was computed with.
+
+    Returns:
+        The audit.
 
     Raises:
         InputError: the folder or the model cannot be read, or the model has another topology.
@@ -117,111 +133,116 @@ def audit_folder(registration_dir: Path, model: Path) -> Audit:
             where=model,
             expected=f"the triangles of {registration_dir}",
             got="others",
-            fix="give the model that the registration was made with",
+            fix="give the model that the registration was computed with",
         )
-    result = audit(registration.vertices, data, float(registration.scale))
-    update_figures(registration_dir, {"intersections": result.figures})
-    print_audit(result.figures, title=f"{registration_dir}: {registration.status}")
-    return result
+    audit = audit_penetration(registration.vertices, data, float(registration.scale))
+    update_figures(registration_dir, {"intersections": audit.metrics})
+    print_audit(audit.metrics, title=f"{registration_dir}: {registration.status}")
+    return audit
 
 
-_audited: dict[str, tuple["_Parts", Mapping[str, Float[np.ndarray, "V"]]]] = {}  # the last model alone, by content
+# By the model's content hash; only the last model, which all captures of a process usually share.
+_audited_template: dict[str, tuple["_PartSurfaces", Mapping[str, Float[np.ndarray, "V"]]]] = {}
 
 
-def _template(data: GNMData) -> tuple["_Parts", Mapping[str, Float[np.ndarray, "V"]]]:
-    """A model's parts, and the depths in its template by pair: the same for all captures that a process registers."""
+def _template_parts(data: GNMData) -> tuple["_PartSurfaces", Mapping[str, Float[np.ndarray, "V"]]]:
+    """Return a model's parts, and the depths in its template by pair, in millimetres."""
     content = gnm_npz.content_hash(data)
-    if content not in _audited:
-        parts = _Parts(data)
-        _audited.clear()
-        _audited[content] = parts, parts.depths(parts.rest)
-    return _audited[content]
+    if content not in _audited_template:
+        parts = _PartSurfaces(data)
+        _audited_template.clear()
+        _audited_template[content] = parts, parts.depths(parts.rest)
+    return _audited_template[content]
 
 
-class _Parts:
-    """What of a model is tested, and in what. F triangles of the skin."""
+class _PartSurfaces:
+    """The parts of a model: the vertices that are tested, and the closed surfaces in which they are tested."""
 
     def __init__(self, data: GNMData):
         self.rest = np.asarray(data.template_vertex_positions, np.float64)
         self.exterior, self.tongue = regions.exterior(data), regions.tongue(data)
         self.teeth, self.ears = regions.teeth(data), regions.ears(data)
-        names, shares = regions.vertex_classes(data)
-        self.upper, self.lower = (shares[:, names.index(name)] > 0.5 for name in ("upper_lip", "lower_lip"))
+        names, coverage = regions.vertex_classes(data)
+        self.upper_lip, self.lower_lip = (coverage[:, names.index(name)] > 0.5 for name in ("upper_lip", "lower_lip"))
         solids = regions.solids(data)
         self.skin = solids.pop("skin")
         self.overlap = SelfOverlap(self.rest, self.skin)
-        self.outer = self.exterior[self.skin].all(1)
-        # Eyeballs have their iris in a shell of its own, jaws are two.
+        self.exterior_faces = self.exterior[self.skin].all(1)  # of the skin's triangles
+        # Several shells: an eyeball's iris is a separate shell, and there are two jaws.
         self.shells = {name: _connected(triangles) for name, triangles in solids.items()}
 
     def depths(self, vertices: Float[np.ndarray, "V 3"]) -> dict[str, Float[np.ndarray, "V"]]:
-        """Millimetres by pair, 0 outside."""
-        found = {}
+        """Return the depth of each vertex in millimetres, by pair; 0 outside."""
+        depths = {}
         for side in ("left eye", "right eye"):
-            found[f"lids in {side}"] = self._in_solid(vertices, self.exterior, side)[0]
-        found["lips in tongue"] = self._in_solid(vertices, self.exterior, "tongue")[0]
+            depths[f"lids in {side}"] = self._depth_in_solid(vertices, self.exterior, side)[0]
+        depths["lips in tongue"] = self._depth_in_solid(vertices, self.exterior, "tongue")[0]
         for name, tested in (("lips", self.exterior), ("tongue", self.tongue)):
-            depth, in_tooth = self._in_solid(vertices, tested, "teeth")
-            found[f"{name} in teeth"] = np.where(in_tooth, depth, 0.0)
-            found[f"{name} in gums"] = np.where(in_tooth, 0.0, depth)
+            depth, in_tooth = self._depth_in_solid(vertices, tested, "teeth")
+            depths[f"{name} in teeth"] = np.where(in_tooth, depth, 0.0)
+            depths[f"{name} in gums"] = np.where(in_tooth, 0.0, depth)
         inside = self.overlap.inside(vertices, np.flatnonzero(self.exterior | self.tongue))
-        found["tongue in skin"] = self._tongue_in_skin(vertices, inside[self.tongue[inside]])
-        return found | self._skin_in_skin(vertices, inside[self.exterior[inside]])
+        depths["tongue in skin"] = self._tongue_in_skin(vertices, inside[self.tongue[inside]])
+        return depths | self._skin_in_skin(vertices, inside[self.exterior[inside]])
 
-    def _in_solid(
+    def _depth_in_solid(
         self, vertices: Float[np.ndarray, "V 3"], tested: Bool[np.ndarray, "V"], solid: str
     ) -> tuple[Float[np.ndarray, "V"], Bool[np.ndarray, "V"]]:
-        """Depth in the shell that holds the vertex deepest, and whether its surface is a tooth's there."""
+        """Return the largest depth in any shell of the solid, and whether the surface nearest there is a tooth's."""
         depth, in_tooth = np.zeros(len(vertices)), np.zeros(len(vertices), bool)
         for shell in self.shells[solid]:
             inside = _inside(vertices, tested, shell)
             if not len(inside):
                 continue
-            away, face, _ = closest_points(vertices[inside], vertices, shell)
-            deeper = away * MM_PER_M > depth[inside]
-            depth[inside[deeper]] = away[deeper] * MM_PER_M
+            distance, face, _ = closest_points(vertices[inside], vertices, shell)
+            deeper = distance * MM_PER_M > depth[inside]
+            depth[inside[deeper]] = distance[deeper] * MM_PER_M
             in_tooth[inside[deeper]] = self.teeth[shell[face[deeper]]].any(1)
         return depth, in_tooth
 
     def _tongue_in_skin(
         self, vertices: Float[np.ndarray, "V 3"], inside: Int[np.ndarray, "N"]
     ) -> Float[np.ndarray, "V"]:
-        """The tongue's root lies behind the mouth's lining: only where the outer skin is nearer does it count."""
+        """Return the depth where the outer skin is nearer than the oral lining, behind which the tongue's root lies."""
         depth = np.zeros(len(vertices))
         if len(inside):
-            away, face, _ = closest_points(vertices[inside], vertices, self.skin)
-            depth[inside] = np.where(self.outer[face], away * MM_PER_M, 0.0)
+            distance, face, _ = closest_points(vertices[inside], vertices, self.skin)
+            depth[inside] = np.where(self.exterior_faces[face], distance * MM_PER_M, 0.0)
         return depth
 
     def _skin_in_skin(
         self, vertices: Float[np.ndarray, "V 3"], inside: Int[np.ndarray, "N"]
     ) -> dict[str, Float[np.ndarray, "V"]]:
-        """A lip's vertex is in the other lip unless it came in elsewhere: the lips overlap in the template too.
+        """Return the depths of the skin's self-intersections: lip in lip, ears, anything else.
 
-        An ear's row is every crossing that an ear takes part in, with itself too. What came in through a lining, as a
-        lid's rim through the eye's socket, is left out.
+        A lip's vertex counts as inside the other lip unless it entered the skin elsewhere, because the lips overlap in
+        the template too. "ears in skin" is any self-intersection that involves an ear. A vertex that entered through an
+        inner surface, such as an eyelid's rim through the eye socket, does not count.
         """
         names = ("upper lip in lower lip", "lower lip in upper lip", "ears in skin", "skin in itself")
-        found = {name: np.zeros(len(vertices)) for name in names}
+        depths = {name: np.zeros(len(vertices)) for name in names}
 
-        def enter(name: str, members: Int[np.ndarray, "N"], away: Float[np.ndarray, "N"]) -> None:
-            found[name][members] = away * MM_PER_M
+        def set_depths(name: str, members: Int[np.ndarray, "N"], distance: Float[np.ndarray, "N"]) -> None:
+            depths[name][members] = distance * MM_PER_M
 
-        of_lips = (self.upper | self.lower)[self.skin].any(1)
-        for name, lip, other in zip(names, (self.upper, self.lower), (self.lower, self.upper), strict=False):
+        lips = self.upper_lip | self.lower_lip
+        other_faces = np.flatnonzero(self.exterior_faces & ~lips[self.skin].any(1))
+        pairs = (self.upper_lip, self.lower_lip), (self.lower_lip, self.upper_lip)
+        for name, (lip, other_lip) in zip(names, pairs, strict=False):
             members = inside[lip[inside]]
-            across = _distance(vertices, members, self.skin[other[self.skin].all(1)])
-            away, _, sure = self.overlap.ways_out(vertices, members, np.flatnonzero(self.outer & ~of_lips), across)
-            elsewhere = sure & (away < across) | np.isinf(across)
-            enter(name, members[~elsewhere], across[~elsewhere])
-            enter(names[-1], members[elsewhere], away[elsewhere])
-        members = inside[~(self.upper | self.lower)[inside]]
+            to_lip = _distance(vertices, members, self.skin[other_lip[self.skin].all(1)])
+            distance, _, valid = self.overlap.ways_out(vertices, members, other_faces, to_lip)
+            elsewhere = valid & (distance < to_lip) | np.isinf(to_lip)
+            set_depths(name, members[~elsewhere], to_lip[~elsewhere])
+            set_depths(names[-1], members[elsewhere], distance[elsewhere])
+        members = inside[~lips[inside]]
         unbounded = np.full(len(members), np.inf)
-        away, face, _ = self.overlap.ways_out(vertices, members, np.arange(len(self.skin)), unbounded)
-        ear = self.ears[members] | self.ears[self.skin[face]].all(1)
-        for name, here in (("ears in skin", ear), ("skin in itself", ~ear)):
-            enter(name, members[here], np.where(self.outer[face], away, 0.0)[here])
-        return found
+        distance, face, _ = self.overlap.ways_out(vertices, members, np.arange(len(self.skin)), unbounded)
+        in_ear = self.ears[members] | self.ears[self.skin[face]].all(1)
+        distance = np.where(self.exterior_faces[face], distance, 0.0)
+        for name, rows in (("ears in skin", in_ear), ("skin in itself", ~in_ear)):
+            set_depths(name, members[rows], distance[rows])
+        return depths
 
 
 def _connected(triangles: Int[np.ndarray, "F 3"]) -> list[Int[np.ndarray, "_ 3"]]:
@@ -232,7 +253,7 @@ def _connected(triangles: Int[np.ndarray, "F 3"]) -> list[Int[np.ndarray, "_ 3"]
 def _inside(
     vertices: Float[np.ndarray, "V 3"], tested: Bool[np.ndarray, "V"], triangles: Int[np.ndarray, "_ 3"]
 ) -> Int[np.ndarray, "M"]:
-    """Which of the tested vertices lie inside the closed mesh of others."""
+    """Return the tested vertices that lie inside the triangles' surface, its openings closed."""
     members = np.flatnonzero(tested)
     return members[Winding(*closed(vertices, triangles)).numbers(vertices[members]) > _INSIDE]
 
@@ -240,6 +261,7 @@ def _inside(
 def _distance(
     vertices: Float[np.ndarray, "V 3"], members: Int[np.ndarray, "N"], surface: Int[np.ndarray, "_ 3"]
 ) -> Float[np.ndarray, "N"]:
+    """Return the distance of the members to the surface, in the vertices' unit; infinity without triangles."""
     if not len(members) or not len(surface):
         return np.full(len(members), np.inf)
     return closest_points(vertices[members], vertices, surface)[0]

@@ -1,4 +1,4 @@
-"""Distances between a scan and a registered surface, and how they are summed up. Millimetres, unsigned."""
+"""Unsigned distances between a scan and a registered surface, in millimetres, and their statistics."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -11,25 +11,26 @@ from registration.geometry.closest_point import barycentric_points, closest_poin
 from registration.geometry.surface_samples import sample_surface
 from registration.geometry.topology import edges
 
-SAMPLES = 100_000
-MAX_ANGLE = 60.0  # degrees between the normals of a sample and of its closest point
+SAMPLE_COUNT = 100_000
+MAX_NORMAL_ANGLE_DEG = 60.0  # between the normals of a sample and of its closest point
+_EPSILON = 1e-9  # barycentric; a point this close to an edge or a vertex lies on it
 
 
 @dataclass(frozen=True, kw_only=True)
-class Surface:
+class TriangleSurface:
     """A triangle mesh: of the scan or of the registration."""
 
     vertices: Float[np.ndarray, "V 3"]  # m, capture world
     triangles: Int[np.ndarray, "F 3"]
 
     def normals(self) -> Float[np.ndarray, "F 3"]:
-        """Of the faces, of length twice the area."""
+        """Return the normals of the faces, not normalized: their length is twice the face's area in m^2."""
         a, b, c = (self.vertices[self.triangles[:, k]] for k in range(3))
         return np.cross(b - a, c - a)
 
 
-def summary(distance_mm: Float[np.ndarray, "P"]) -> dict[str, Any]:
-    """Number, mean, median, standard deviation and 95th percentile; None without points."""
+def distance_statistics(distance_mm: Float[np.ndarray, "P"]) -> dict[str, Any]:
+    """Return the number of points, mean, median, standard deviation and 95th percentile; None without points."""
     if not len(distance_mm):
         return {"points": 0, "mean_mm": None, "median_mm": None, "std_mm": None, "p95_mm": None}
     return {
@@ -41,50 +42,72 @@ def summary(distance_mm: Float[np.ndarray, "P"]) -> dict[str, Any]:
     }
 
 
-def distances_mm(points: Float[np.ndarray, "P 3"], surface: Surface) -> Float[np.ndarray, "P"]:
-    """To the closest point of the surface; nothing is aligned and nothing dropped. Points in metres."""
+def distances_mm(points: Float[np.ndarray, "P 3"], surface: TriangleSurface) -> Float[np.ndarray, "P"]:
+    """Return the distance of each point to the closest point of the surface, without alignment or exclusions.
+
+    Args:
+        points: metres, in the surface's frame.
+        surface: with at least one triangle.
+
+    Returns:
+        Millimetres.
+    """
     return closest_points(points, surface.vertices, surface.triangles)[0] * MM_PER_M
 
 
-def spread(surface: Surface, count: int, seed: int = 0) -> tuple[Float[np.ndarray, "N 3"], Int[np.ndarray, "N"]]:
-    """Random points of a surface, as many on every square millimetre, and the face of each."""
-    face, weight = sample_surface(surface.vertices, surface.triangles, count, np.random.default_rng(seed))
-    return barycentric_points(surface.vertices, surface.triangles, face, weight), face
+def scan_to_mesh_area_uniform(
+    scan: TriangleSurface, within: Bool[np.ndarray, "V"], mesh: TriangleSurface, seed: int = 0
+) -> dict[str, Any]:
+    """Measure the distance of 100,000 points of the scan, sampled uniformly by area, to the mesh.
 
+    A point is excluded if the two surfaces' normals differ by more than 60 degrees, or if its closest point lies on the
+    mesh's boundary.
 
-def area_uniform(scan: Surface, within: Bool[np.ndarray, "V"], mesh: Surface, seed: int = 0) -> dict[str, Any]:
-    """Figures of area-uniform points of the scan's triangles whose corners are all `within`.
+    Args:
+        scan: the surface to sample.
+        within: scan vertices; triangles with all three corners among them are sampled.
+        mesh: the registered surface, in the scan's frame.
+        seed: of the random points.
 
-    Points are dropped where the two surfaces' normals differ by more than 60 degrees, and where the closest point
-    lies on the mesh's boundary; both shares are told.
+    Returns:
+        `distance_statistics` of the remaining points, and the excluded fractions `dropped_normals` and
+        `dropped_boundary` (None if there is no area to sample). A point with both defects counts for the normals.
     """
-    part = Surface(vertices=scan.vertices, triangles=scan.triangles[within[scan.triangles].all(1)])
-    if not part.normals().any():
-        return {**summary(np.zeros(0)), "dropped_normals": None, "dropped_boundary": None}
-    samples, face = spread(part, SAMPLES, seed)
-    distance, hit, barycentric = closest_points(samples, mesh.vertices, mesh.triangles)
-    there, here = mesh.normals()[hit], part.normals()[face]
-    length = np.linalg.norm(there, axis=1) * np.linalg.norm(here, axis=1)
-    turned = (there * here).sum(1) < np.cos(np.radians(MAX_ANGLE)) * length
-    rim = on_boundary(mesh.triangles, hit, barycentric)
+    region = TriangleSurface(vertices=scan.vertices, triangles=scan.triangles[within[scan.triangles].all(1)])
+    if not region.normals().any():
+        return {**distance_statistics(np.zeros(0)), "dropped_normals": None, "dropped_boundary": None}
+    rng = np.random.default_rng(seed)
+    scan_face, weight = sample_surface(region.vertices, region.triangles, SAMPLE_COUNT, rng)
+    samples = barycentric_points(region.vertices, region.triangles, scan_face, weight)
+    distance, mesh_face, barycentric = closest_points(samples, mesh.vertices, mesh.triangles)
+    mesh_normal, scan_normal = mesh.normals()[mesh_face], region.normals()[scan_face]
+    length = np.linalg.norm(mesh_normal, axis=1) * np.linalg.norm(scan_normal, axis=1)
+    opposed = (mesh_normal * scan_normal).sum(1) < np.cos(np.radians(MAX_NORMAL_ANGLE_DEG)) * length
+    boundary = on_boundary(mesh.triangles, mesh_face, barycentric)
     return {
-        **summary(distance[~turned & ~rim] * MM_PER_M),
-        "dropped_normals": float(turned.mean()),
-        "dropped_boundary": float((rim & ~turned).mean()),
+        **distance_statistics(distance[~opposed & ~boundary] * MM_PER_M),
+        "dropped_normals": float(opposed.mean()),
+        "dropped_boundary": float((boundary & ~opposed).mean()),
     }
 
 
 def on_boundary(
     triangles: Int[np.ndarray, "F 3"], face: Int[np.ndarray, "P"], barycentric: Float[np.ndarray, "P 3"]
 ) -> Bool[np.ndarray, "P"]:
-    """Which surface points lie on an edge that has one triangle only."""
+    """Return which surface points lie on the mesh's boundary: on an edge that only one triangle has.
+
+    Args:
+        triangles: vertex indices.
+        face: triangle of each point.
+        barycentric: coordinates of each point in its triangle.
+    """
     connectivity = edges(triangles)
-    rim = connectivity.faces[:, 1] < 0
-    open_vertex = np.zeros(triangles.max() + 1, bool)
-    open_vertex[connectivity.vertices[rim]] = True
-    open_edge = np.zeros((len(triangles), 3), bool)  # by the corner that the edge lies opposite of
-    start, end = (connectivity.corners[rim, 0, k] % 3 for k in (0, 1))
-    open_edge[connectivity.faces[rim, 0], 3 - start - end] = True
-    on_edge = (open_edge[face] & (barycentric < 1e-9)).any(1)
-    at_corner = triangles[face, barycentric.argmax(1)]
-    return on_edge | (open_vertex[at_corner] & (barycentric.max(1) > 1 - 1e-9))
+    boundary = connectivity.faces[:, 1] < 0
+    boundary_vertex = np.zeros(triangles.max() + 1, bool)
+    boundary_vertex[connectivity.vertices[boundary]] = True
+    boundary_edge = np.zeros((len(triangles), 3), bool)  # of a triangle, by the corner opposite to the edge
+    start, end = (connectivity.corners[boundary, 0, k] % 3 for k in (0, 1))
+    boundary_edge[connectivity.faces[boundary, 0], 3 - start - end] = True
+    on_edge = (boundary_edge[face] & (barycentric < _EPSILON)).any(1)
+    nearest_corner = triangles[face, barycentric.argmax(1)]
+    return on_edge | (boundary_vertex[nearest_corner] & (barycentric.max(1) > 1 - _EPSILON))

@@ -1,4 +1,4 @@
-"""Where figures are taken: the face ball, and what the cameras see (docs/formats.md, "Figures")."""
+"""Where a registration is measured: the face sphere, and what the cameras see (docs/formats.md, "Figures")."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -12,23 +12,31 @@ from registration.geometry.rasterizer import RayCaster
 from registration.types import Camera, Capture, Registration
 
 SCHEME = "68"
-NOSE_BRIDGE, NOSE_BASE, RIGHT_EYE, LEFT_EYE = 27, 33, 36, 45  # of the scheme; outer corners of the eyes
+NOSE_BRIDGE, NOSE_BASE, RIGHT_EYE, LEFT_EYE = 27, 33, 36, 45  # landmarks of the scheme; outer eye corners
 
 
 @dataclass(frozen=True, kw_only=True)
-class FaceBall:
-    """The ball that holds the face; metres, capture world."""
+class FaceSphere:
+    """The sphere that bounds the face; metres, capture world."""
 
     centre: Float[np.ndarray, "3"]
     radius: float
-    landmarks: str  # where the landmarks came from: "capture" or "registration"
+    landmarks: str  # their source: "capture" or "registration"
 
-    def holds(self, points: Float[np.ndarray, "P 3"]) -> Bool[np.ndarray, "P"]:
+    def contains(self, points: Float[np.ndarray, "P 3"]) -> Bool[np.ndarray, "P"]:
+        """Return which points lie in the sphere, its surface included."""
         return np.linalg.norm(points - self.centre, axis=1) <= self.radius
 
 
-def face_ball(capture: Capture, registration: Registration) -> FaceBall:
-    """The ball from the capture's triangulated landmarks, else from the registration's own.
+def face_sphere(capture: Capture, registration: Registration) -> FaceSphere:
+    """Return the face sphere, from the capture's triangulated landmarks or else from the registration's own.
+
+    Its centre lies on the line from the base to the bridge of the nose, at 0.3 of its length. Its radius is 1.4 times
+    the mean of this length and the distance between the outer eye corners.
+
+    Args:
+        capture: with landmarks of scheme 68, or without.
+        registration: of the capture.
 
     Raises:
         InputError: neither has the four landmarks that define it.
@@ -39,9 +47,9 @@ def face_ball(capture: Capture, registration: Registration) -> FaceBall:
             bridge, base, right, left = np.asarray(points[[NOSE_BRIDGE, NOSE_BASE, RIGHT_EYE, LEFT_EYE]], np.float64)
             radius = 1.4 * (np.linalg.norm(right - left) + np.linalg.norm(bridge - base)) / 2
             if np.isfinite(radius) and radius > 0:
-                return FaceBall(centre=base + 0.3 * (bridge - base), radius=float(radius), landmarks=source)
+                return FaceSphere(centre=base + 0.3 * (bridge - base), radius=float(radius), landmarks=source)
     raise InputError(
-        "The face cannot be found",
+        "The face cannot be located",
         where=f"{capture.root} and its registration",
         expected=f'landmarks {NOSE_BRIDGE}, {NOSE_BASE}, {RIGHT_EYE}, {LEFT_EYE} of scheme "{SCHEME}" in two views',
         got="too few, and none stored with the registration",
@@ -49,14 +57,22 @@ def face_ball(capture: Capture, registration: Registration) -> FaceBall:
     )
 
 
-def seen(
+def visible_in_two_views(
     points: Float[np.ndarray, "P 3"],
     vertices: Float[np.ndarray, "V 3"],
     triangles: Int[np.ndarray, "F 3"],
     cameras: Sequence[Camera],
     tolerance: float = 5e-4,
 ) -> Bool[np.ndarray, "P"]:
-    """Which points at least two cameras see past a mesh; world frame, metres."""
+    """Return which points at least two cameras see: in the image, and not occluded by a mesh.
+
+    Args:
+        points: metres, world.
+        vertices: of the mesh that occludes points; metres, world.
+        triangles: of the mesh.
+        cameras: calibrated in the same world.
+        tolerance: metres; a surface that is nearer to the camera than the point by less does not occlude it.
+    """
     count = np.zeros(len(points), int)
     mesh = RayCaster(vertices, triangles)
     for camera in cameras:

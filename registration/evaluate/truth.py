@@ -1,4 +1,4 @@
-"""Errors against true vertices: of one mesh, and of a mesh's motion between two moments. Millimetres."""
+"""Errors against ground-truth vertices, in millimetres: of one mesh, and of its motion from the neutral."""
 
 from typing import Any
 
@@ -7,27 +7,42 @@ from jaxtyping import Float, Int
 from scipy.spatial import cKDTree
 
 from registration.errors import InputError
-from registration.evaluate.distances import summary
+from registration.evaluate.distances import distance_statistics
 from registration.frames import MM_PER_M
 from registration.geometry.closest_point import barycentric_points, closest_points
 from registration.types import Registration
 
 
 def face_vertices(truth: Float[np.ndarray, "N 3"], face_points: Float[np.ndarray, "P 3"]) -> Int[np.ndarray, "M"]:
-    """The true vertices of the face: each scan point of the face chooses the nearest one."""
+    """Return the true vertices that are nearest to any of the scan's face points, each once, in ascending order.
+
+    Args:
+        truth: true vertices.
+        face_points: points of the scan's face, in the unit and frame of `truth`.
+    """
     return np.unique(cKDTree(truth).query(face_points)[1]).astype(np.int64)
 
 
 def vertex_error(
     registration: Registration, truth: Float[np.ndarray, "V 3"], face: Int[np.ndarray, "M"]
 ) -> dict[str, Any]:
-    """How far each vertex of the face is from the true vertex of the same index."""
-    away = registration.vertices[face].astype(np.float64) - truth[face]
-    return summary(np.linalg.norm(away, axis=1) * MM_PER_M)
+    """Return statistics of the distance between registered vertices and the true vertices of the same index.
+
+    Args:
+        registration: in the topology of the truth.
+        truth: true vertices, metres, capture world.
+        face: indices of the vertices that are compared.
+    """
+    residual = registration.vertices[face].astype(np.float64) - truth[face]
+    return distance_statistics(np.linalg.norm(residual, axis=1) * MM_PER_M)
 
 
 def require_same_topology(registration: Registration, neutral: Registration) -> None:
-    """Raise InputError if the two registrations' triangles differ."""
+    """Check that two registrations have the same triangles.
+
+    Raises:
+        InputError: the triangles differ.
+    """
     if not np.array_equal(registration.triangles, neutral.triangles):
         raise InputError(
             "The two registrations have different topologies",
@@ -45,14 +60,25 @@ def drift(
     neutral_truth: Float[np.ndarray, "N 3"],
     face: Int[np.ndarray, "M"],
 ) -> dict[str, Any]:
-    """How far surface points slide between two registrations of one person.
+    """Measure how far surface points slide between two registrations of one subject.
 
-    Each true vertex of the neutral (those in `face`) is carried to its closest point on the neutral registration;
-    the same face and barycentrics on the other registration are compared with that vertex in the other truth.
-    `carried_mm` is the mean distance of the first step, which the drift holds too. Both registrations must have one
-    topology.
+    Each true vertex of the neutral's face is projected to its closest point on the neutral registration. The point with
+    the same triangle and barycentric coordinates on the other registration is compared with the same vertex of the
+    other truth.
+
+    Args:
+        registration: of an expression.
+        truth: its true vertices, metres, capture world.
+        neutral: registration of the subject's neutral, in the topology of `registration`.
+        neutral_truth: its true vertices, in the topology of `truth`; metres, world of the neutral's capture.
+        face: indices of the true vertices that are compared.
+
+    Returns:
+        Statistics of the distances, and `carried_mm`, the mean distance of the projection, which is a part of them;
+        None without vertices.
     """
-    carried, hit, barycentric = closest_points(neutral_truth[face], neutral.vertices, neutral.triangles)
-    there = barycentric_points(registration.vertices.astype(np.float64), registration.triangles, hit, barycentric)
-    figures = summary(np.linalg.norm(there - truth[face], axis=1) * MM_PER_M)
-    return {**figures, "carried_mm": float(carried.mean() * MM_PER_M) if len(carried) else None}
+    projection, triangle, barycentric = closest_points(neutral_truth[face], neutral.vertices, neutral.triangles)
+    vertices = registration.vertices.astype(np.float64)
+    points = barycentric_points(vertices, registration.triangles, triangle, barycentric)
+    statistics = distance_statistics(np.linalg.norm(points - truth[face], axis=1) * MM_PER_M)
+    return {**statistics, "carried_mm": float(projection.mean() * MM_PER_M) if len(projection) else None}

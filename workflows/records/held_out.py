@@ -14,7 +14,7 @@ from registration.capture.native import natural_key, read_capture
 from registration.capture.scan import read_scan
 from registration.errors import InputError
 from registration.evaluate.evaluation import CLOUD_TOLERANCE
-from registration.evaluate.face import face_ball, seen
+from registration.evaluate.face import face_sphere, visible_in_two_views
 from registration.stabilize import stabilized_folder as stabilized
 from registration.storage.hashing import hash_arrays, hash_capture
 from registration.storage.npz import NpzSchema
@@ -167,10 +167,11 @@ def _with_captures(subject: HeldOutSubject, folder: Path, registration: Registra
     if capture.scan is not None:
         points = read_scan(capture.scan)
         cameras = [view.camera for view in capture.views]
-        face = face_ball(capture, registration).holds(points.vertices)
+        face = face_sphere(capture, registration).contains(points.vertices)
         surface = points if len(points.triangles) else registration
-        slack = () if len(points.triangles) else (CLOUD_TOLERANCE,)
-        face &= seen(points.vertices, surface.vertices.astype(np.float64), surface.triangles, cameras, *slack)
+        tolerance = () if len(points.triangles) else (CLOUD_TOLERANCE,)
+        occluder = surface.vertices.astype(np.float64), surface.triangles
+        face &= visible_in_two_views(points.vertices, *occluder, cameras, *tolerance)
         scan = points.vertices[face].astype(np.float64)
     categories = tuple(labels.get(label, label) for label in subject.categories)
     return replace(subject, tags=capture.tags, categories=categories, scan=scan)

@@ -11,7 +11,7 @@ import numpy as np
 
 from registration.capture.scan import read_truth
 from registration.errors import InputError
-from registration.evaluate.evaluation import evaluate
+from registration.evaluate.evaluation import evaluate_registration
 from registration.fit.recipes import load_recipe
 from registration.inputs import input_hash, read_schemes
 from registration.model import gnm_npz
@@ -255,7 +255,7 @@ def _register_row(
 
 
 def _with_drift(result: Registration, capture: Capture, folder: Path, neutral: _Neutral) -> Registration:
-    """Add the metrics of `evaluate` to the registration and its manifest, if the two ground truths can be compared.
+    """Add the evaluation's metrics to the registration and its manifest, if the two ground truths can be compared.
 
     Existing metrics are kept if they are newer than the neutral.
     """
@@ -264,9 +264,9 @@ def _with_drift(result: Registration, capture: Capture, folder: Path, neutral: _
     written, start = ((path / "manifest.json").stat().st_mtime_ns for path in (folder, neutral.folder))
     if "drift" in result.figures and written >= start:
         return result
-    figures = evaluate(result, capture, neutral=neutral.registration, neutral_capture=neutral.capture).figures
-    update_figures(folder, figures)
-    return replace(result, figures={**result.figures, **figures})
+    evaluation = evaluate_registration(result, capture, neutral=neutral.registration, neutral_capture=neutral.capture)
+    update_figures(folder, evaluation.metrics)
+    return replace(result, figures={**result.figures, **evaluation.metrics})
 
 
 def _comparable(capture: Capture, neutral: Capture) -> bool:

@@ -8,7 +8,7 @@ import trimesh
 from rich.console import Console
 
 from registration.errors import InputError
-from registration.evaluate.audit import BEYOND, Audit, Pair, audit, audit_folder
+from registration.evaluate.audit import BEYOND_KEY, PartPair, PenetrationAudit, audit_folder, audit_penetration
 from registration.evaluate.console_table import print_audit
 from registration.geometry.topology import vertex_normals
 from registration.geometry.winding import closed
@@ -24,49 +24,49 @@ from tests.registration.geometry.test_winding import by_ray
 LIPS = {"upper lip in lower lip", "lower lip in upper lip"}
 
 
-def pair(found: Audit, name: str) -> Pair:
-    return next(p for p in found.pairs if p.name == name)
+def pair(audit: PenetrationAudit, name: str) -> PartPair:
+    return next(p for p in audit.pairs if p.name == name)
 
 
-def flagged(found: Audit) -> set[str]:
-    return {p.name for p in found.pairs if len(p.beyond)}
+def flagged(audit: PenetrationAudit) -> set[str]:
+    return {p.name for p in audit.pairs if len(p.beyond)}
 
 
-def depths(found: Audit, name: str, count: int) -> np.ndarray:
+def depths(audit: PenetrationAudit, name: str, count: int) -> np.ndarray:
     """Depth of every vertex, mm."""
     depth = np.zeros(count)
-    depth[pair(found, name).vertices] = pair(found, name).depth_mm
+    depth[pair(audit, name).vertices] = pair(audit, name).depth_mm
     return depth
 
 
-def to_surface(points: np.ndarray, corners: np.ndarray) -> np.ndarray:
+def distance_to_surface(points: np.ndarray, corners: np.ndarray) -> np.ndarray:
     """Distance of each point to the nearest of all triangles (F, 3, 3): to its edges, or to its plane over it."""
     a = corners
     along = np.roll(a, -1, 1) - a
     normal = np.cross(along[:, 0], along[:, 1])
     normal /= np.linalg.norm(normal, axis=1, keepdims=True)
-    found = []
+    distances = []
     for point in points:
         off = point - a
         t = np.clip((off * along).sum(2) / (along * along).sum(2), 0, 1)
         edges = np.linalg.norm(off - t[..., None] * along, axis=2).min(1)
         over = ((np.cross(along, off) * normal[:, None]).sum(2) > 0).all(1)
-        found.append(min(edges.min(), np.abs((off[:, 0] * normal).sum(1))[over].min(initial=np.inf)))
-    return np.array(found)
+        distances.append(min(edges.min(), np.abs((off[:, 0] * normal).sum(1))[over].min(initial=np.inf)))
+    return np.array(distances)
 
 
-# --- balls and a sausage
+# --- balls, and a bent tube
 
 
-def of_parts(parts: dict[str, tuple[np.ndarray, np.ndarray]], groups: dict[str, np.ndarray]) -> GNMData:
+def model_of_parts(parts: dict[str, tuple[np.ndarray, np.ndarray]], groups: dict[str, np.ndarray]) -> GNMData:
     """A model file with this geometry; the skin comes first, is all exterior, and has the groups given."""
     tiny, starts = tiny_model(), np.cumsum([0] + [len(v) for v, _ in parts.values()])
     count, names = starts[-1], tiny.vertex_group_names.tolist()
     table = np.zeros((len(names), count), np.float32)
     for (name, (vertices, _)), start in zip(parts.items(), starts, strict=False):
         table[names.index(name), start : start + len(vertices)] = 1
-    for name, own in (("skin_exterior", "skin"), ("tongue", "tongue"), ("teeth", "lower_teeth_and_gums")):
-        table[names.index(name)] = table[names.index(own)]
+    for name, source in (("skin_exterior", "skin"), ("tongue", "tongue"), ("teeth", "lower_teeth_and_gums")):
+        table[names.index(name)] = table[names.index(source)]
     for name, members in groups.items():
         table[names.index(name), : len(members)] = members
     faces = np.concatenate([f + start for (_, f), start in zip(parts.values(), starts, strict=False)])
@@ -98,7 +98,7 @@ def balls(skin: tuple[np.ndarray, np.ndarray] | None = None, **groups: np.ndarra
     parts = {"skin": skin or ball(0.5)} | {n: ball(0.025 * k) for k, n in enumerate(names)}
     points, faces = parts["left_eye"]
     parts["left_eye"] = np.concatenate([points, 0.6 * points]), np.concatenate([faces, faces + len(points)])
-    return of_parts(parts, groups)
+    return model_of_parts(parts, groups)
 
 
 @pytest.mark.parametrize("sunk_mm", [0.2, 1.0, 4.0])
@@ -107,14 +107,14 @@ def test_a_ball_sunk_in_a_ball_has_the_depth_of_the_lens(sunk_mm):
     vertices = data.template_vertex_positions.astype(float)
     tongue, sunk = regions.tongue(data), sunk_mm * 1e-3
     vertices[tongue] -= [0.005 + sunk, 0, 0]
-    found = audit(vertices, data)
-    depth = depths(found, "tongue in teeth", len(vertices))
+    audit = audit_penetration(vertices, data)
+    depth = depths(audit, "tongue in teeth", len(vertices))
     expected = np.where(tongue, np.clip(10 - np.linalg.norm(vertices - [0.075, 0, 0], axis=1) * 1e3, 0, None), 0)
     np.testing.assert_allclose(depth, expected, atol=0.06)  # the facets' depth
     assert depth.max() == pytest.approx(sunk_mm, abs=0.06)
-    assert flagged(found) == ({"tongue in teeth"} if sunk_mm > 0.3 else set())
+    assert flagged(audit) == ({"tongue in teeth"} if sunk_mm > 0.3 else set())
     clear = np.abs(expected - 0.3) > 0.06
-    np.testing.assert_array_equal(np.isin(np.arange(len(depth)), found.beyond)[clear], (expected > 0.3)[clear])
+    np.testing.assert_array_equal(np.isin(np.arange(len(depth)), audit.beyond)[clear], (expected > 0.3)[clear])
 
 
 def test_in_an_eye_the_outermost_shell_counts():
@@ -123,13 +123,13 @@ def test_in_an_eye_the_outermost_shell_counts():
     vertices = data.template_vertex_positions.astype(float)
     skin = regions.exterior(data)
     vertices[skin] += [-0.5 - 0.012, 0, 0]
-    found = audit(vertices, data)
+    audit = audit_penetration(vertices, data)
     expected = np.where(skin, np.clip(10 - np.linalg.norm(vertices, axis=1) * 1e3, 0, None), 0)
-    np.testing.assert_allclose(depths(found, "lids in left eye", len(vertices)), expected, atol=0.06)
-    assert flagged(found) == {"lids in left eye"} and expected.max() == pytest.approx(8, abs=0.06)
+    np.testing.assert_allclose(depths(audit, "lids in left eye", len(vertices)), expected, atol=0.06)
+    assert flagged(audit) == {"lids in left eye"} and expected.max() == pytest.approx(8, abs=0.06)
 
 
-def test_only_what_exceeds_the_vertex_own_depth_in_the_template_counts():
+def test_only_the_excess_over_the_depth_in_the_template_counts():
     """The template's tongue is 1 mm in the teeth already; sunk by another 0.25 mm it is still within the tolerance."""
     data = balls()
     template = data.template_vertex_positions.copy()
@@ -138,9 +138,9 @@ def test_only_what_exceeds_the_vertex_own_depth_in_the_template_counts():
     for more_mm, count in ((0.0, 0), (0.25, 0), (0.5, 1)):
         vertices = template.astype(float)
         vertices[regions.tongue(data)] -= [more_mm * 1e-3, 0, 0]
-        row = audit(vertices, data).figures["pairs"]["tongue in teeth"]
+        row = audit_penetration(vertices, data).metrics["pairs"]["tongue in teeth"]
         assert row["template_max_mm"] == pytest.approx(1, abs=0.06) and row["template_vertices"] > 10
-        assert row["max_excess_mm"] == pytest.approx(more_mm, abs=0.02) and min(row[BEYOND], 1) == count
+        assert row["max_excess_mm"] == pytest.approx(more_mm, abs=0.02) and min(row[BEYOND_KEY], 1) == count
 
 
 def test_the_template_is_compared_at_the_size_of_the_mesh():
@@ -149,25 +149,27 @@ def test_the_template_is_compared_at_the_size_of_the_mesh():
     template[regions.tongue(data)] -= np.float32([0.009, 0, 0])
     data = dataclasses.replace(data, template_vertex_positions=template)
     larger = 1.1 * template.astype(float)
-    assert flagged(audit(larger, data)) == {"tongue in teeth"}
-    row = audit(larger, data, scale=1.1).figures["pairs"]["tongue in teeth"]
+    assert flagged(audit_penetration(larger, data)) == {"tongue in teeth"}
+    row = audit_penetration(larger, data, scale=1.1).metrics["pairs"]["tongue in teeth"]
     assert row["max_excess_mm"] < 1e-6 and row["template_max_mm"] == pytest.approx(4.4, abs=0.1)
 
 
-def test_another_place_and_turn_change_nothing():
+def test_rotation_and_translation_change_nothing():
     data = balls()
     vertices = data.template_vertex_positions.astype(float)
     vertices[regions.tongue(data)] -= [0.007, 0, 0]
-    turn = trimesh.transformations.rotation_matrix(1.0, [1, 2, 3])[:3, :3]
-    here, there = (
-        audit(v, data).figures["pairs"]["tongue in teeth"] for v in (vertices, vertices @ turn.T + [1, 2, 3])
+    rotation = trimesh.transformations.rotation_matrix(1.0, [1, 2, 3])[:3, :3]
+    original, transformed = (
+        audit_penetration(v, data).metrics["pairs"]["tongue in teeth"]
+        for v in (vertices, vertices @ rotation.T + [1, 2, 3])
     )
-    assert here["max_excess_mm"] == pytest.approx(there["max_excess_mm"], abs=1e-6) and here[BEYOND] == there[BEYOND]
+    assert original["max_excess_mm"] == pytest.approx(transformed["max_excess_mm"], abs=1e-6)
+    assert original[BEYOND_KEY] == transformed[BEYOND_KEY]
 
 
 @pytest.mark.parametrize("names", [{"ears": 1}, {"upper_lip": 1, "lower_lip": -1}])
 def test_two_lobes_of_the_skin_in_one_another(names):
-    """The ends of a bent sausage, 12 mm into one another: deeper than it is far to the vertices' own surface."""
+    """The ends of a bent tube, 12 mm inside one another: farther than the vertices are from their own surface."""
     open_, shut = np.pi - 0.8, np.pi - 0.1336
     rest, faces, share = sausage(open_)
     data = balls((rest, faces), **{name: share * side > 0.9 for name, side in names.items()})
@@ -178,42 +180,42 @@ def test_two_lobes_of_the_skin_in_one_another(names):
     expected = np.zeros(len(vertices))
     for side in (-1, 1):
         onwards = side * np.array([-np.sin(side * shut), np.cos(side * shut), 0])
-        away = vertices[: len(rest)] - end(shut, side)
-        inside = (share * side < -0.9) & (np.linalg.norm(away, axis=1) < RADIUS) & (away @ onwards > 0)
-        expected[: len(rest)][inside] = (RADIUS - np.linalg.norm(away[inside], axis=1)) * 1e3
-    found = audit(vertices, data)
-    lips = sum(depths(found, name, len(vertices)) for name in LIPS)
-    rows = {"skin in itself": depths(found, "skin in itself", len(vertices)), "lips": lips}
-    rows["ears in skin"] = depths(found, "ears in skin", len(vertices))
-    wanted = rows.pop("lips" if "upper_lip" in names else "ears in skin" if "ears" in names else "skin in itself")
+        offset = vertices[: len(rest)] - end(shut, side)
+        inside = (share * side < -0.9) & (np.linalg.norm(offset, axis=1) < RADIUS) & (offset @ onwards > 0)
+        expected[: len(rest)][inside] = (RADIUS - np.linalg.norm(offset[inside], axis=1)) * 1e3
+    audit = audit_penetration(vertices, data)
+    lips = sum(depths(audit, name, len(vertices)) for name in LIPS)
+    rows = {"skin in itself": depths(audit, "skin in itself", len(vertices)), "lips": lips}
+    rows["ears in skin"] = depths(audit, "ears in skin", len(vertices))
+    depth = rows.pop("lips" if "upper_lip" in names else "ears in skin" if "ears" in names else "skin in itself")
     in_cap = expected > 0
     assert in_cap.sum() > 100
-    np.testing.assert_allclose(wanted[in_cap], expected[in_cap], atol=0.12)  # the facets' depth
+    np.testing.assert_allclose(depth[in_cap], expected[in_cap], atol=0.12)  # the facets' depth
     assert all((row[in_cap] == 0).all() for row in rows.values())
-    assert wanted.max() > 8
+    assert depth.max() > 8
 
 
-def test_a_mesh_that_is_not_the_models_is_refused():
+def test_a_mesh_that_is_not_the_models_is_rejected():
     data = balls()
     with pytest.raises(InputError, match="cannot be audited") as caught:
-        audit(data.template_vertex_positions[1:], data)
+        audit_penetration(data.template_vertex_positions[1:], data)
     assert "0 not finite" in caught.value.got
     broken = data.template_vertex_positions.copy()
     broken[3] = np.nan
     with pytest.raises(InputError, match="cannot be audited") as caught:
-        audit(broken, data)
+        audit_penetration(broken, data)
     assert "1 not finite" in caught.value.got
 
 
-def test_a_folder_is_audited_printed_and_keeps_its_figures(tmp_path, capsys):
+def test_a_folder_is_audited_printed_and_keeps_its_metrics(tmp_path, capsys):
     data = balls()
     gnm_npz.write(data, tmp_path / "model.npz")
     vertices = data.template_vertex_positions.copy()
     vertices[regions.tongue(data)] -= np.float32([0.007, 0, 0])
     save_registration(a_registration(vertices, data.triangles), tmp_path / "r")
-    figures = audit_folder(tmp_path / "r", tmp_path / "model.npz").figures
-    assert load_registration(tmp_path / "r").figures["intersections"] == figures
-    assert figures[BEYOND] == figures["pairs"]["tongue in teeth"][BEYOND] > 10
+    metrics = audit_folder(tmp_path / "r", tmp_path / "model.npz").metrics
+    assert load_registration(tmp_path / "r").figures["intersections"] == metrics
+    assert metrics[BEYOND_KEY] == metrics["pairs"]["tongue in teeth"][BEYOND_KEY] > 10
     assert "tongue in teeth" in capsys.readouterr().out
     save_registration(a_registration(vertices, data.triangles[1:]), tmp_path / "other")
     with pytest.raises(InputError, match="different topologies"):
@@ -221,9 +223,10 @@ def test_a_folder_is_audited_printed_and_keeps_its_figures(tmp_path, capsys):
 
 
 def test_the_table_has_a_row_for_every_pair():
-    row = {"template_vertices": 1049, "template_max_mm": 4.441, BEYOND: 7, "max_excess_mm": 0.809}
+    row = {"template_vertices": 1049, "template_max_mm": 4.441, BEYOND_KEY: 7, "max_excess_mm": 0.809}
     console = Console(file=io.StringIO(), width=120)
-    print_audit({BEYOND: 6, "pairs": {"tongue in gums": row, "skin in itself": {**row, BEYOND: 0}}}, "title", console)
+    pairs = {"tongue in gums": row, "skin in itself": {**row, BEYOND_KEY: 0}}
+    print_audit({BEYOND_KEY: 6, "pairs": pairs}, "title", console)
     text = console.file.getvalue()
     for piece in ("title", "tongue in gums", "skin in itself", "1,049", "4.44", "7", "0.81", "6 vertices", "0.3 mm"):
         assert piece in text
@@ -239,15 +242,15 @@ def head() -> GNMData:
 
 def around(data: GNMData, point: np.ndarray, radius: float) -> np.ndarray:
     """A smooth bump over the vertices, 1 at the point, 0 from the radius on."""
-    away = np.linalg.norm(data.template_vertex_positions - point, axis=1) / radius
-    return np.clip(1 - away**2, 0, 1)[:, None] ** 2
+    distance = np.linalg.norm(data.template_vertex_positions - point, axis=1) / radius
+    return np.clip(1 - distance**2, 0, 1)[:, None] ** 2
 
 
 @needs_shared
-def test_the_template_exceeds_itself_nowhere_and_overlaps_where_it_is_known_to(head):
-    found = audit(head.template_vertex_positions, head)
-    assert found.figures[BEYOND] == 0 and not flagged(found)
-    rows = found.figures["pairs"]
+def test_the_template_has_no_excess_and_the_expected_overlaps(head):
+    audit = audit_penetration(head.template_vertex_positions, head)
+    assert audit.metrics[BEYOND_KEY] == 0 and not flagged(audit)
+    rows = audit.metrics["pairs"]
     assert all(row["max_excess_mm"] == 0 for row in rows.values())
     overlaps = {name: (row["template_vertices"], row["template_max_mm"]) for name, row in rows.items()}
     expected = {name: (0, 0.0) for name in rows} | {
@@ -270,15 +273,15 @@ def test_a_tongue_pushed_forward_into_the_lower_teeth(head, pushed_mm):
     tongue = np.flatnonzero(regions.tongue(head))
     front = np.clip((vertices[tongue, 2] - 0.100) / 0.010, 0, 1) * (vertices[tongue, 1] > 0.2235)
     vertices[tongue] += front[:, None] * [0, -0.4e-3 * pushed_mm, 1e-3 * pushed_mm]
-    found = audit(vertices, head)
+    audit = audit_penetration(vertices, head)
     jaw = head.triangles[regions.group(head, "lower_teeth_and_gums")[head.triangles].all(1)]
     inside = tongue[by_ray(vertices[tongue], *closed(vertices, jaw)) > 0]
     expected = np.zeros(len(vertices))
-    expected[inside] = to_surface(vertices[inside], vertices[jaw]) * 1e3
-    depth = sum(depths(found, f"tongue in {part}", len(vertices)) for part in ("teeth", "gums"))
+    expected[inside] = distance_to_surface(vertices[inside], vertices[jaw]) * 1e3
+    depth = sum(depths(audit, f"tongue in {part}", len(vertices)) for part in ("teeth", "gums"))
     np.testing.assert_allclose(depth, expected, atol=1e-6)
-    assert pair(found, "tongue in teeth").depth_mm.max(initial=0) >= 0.6 * (pushed_mm - 3)
-    assert flagged(found) - {"tongue in gums"} == ({"tongue in teeth"} if pushed_mm > 3 else set())
+    assert pair(audit, "tongue in teeth").depth_mm.max(initial=0) >= 0.6 * (pushed_mm - 3)
+    assert flagged(audit) - {"tongue in gums"} == ({"tongue in teeth"} if pushed_mm > 3 else set())
 
 
 @needs_shared
@@ -286,16 +289,17 @@ def test_a_tongue_pushed_forward_into_the_lower_teeth(head, pushed_mm):
 def test_a_lower_lip_pushed_up_into_the_upper_lip(head, pushed_mm):
     rest = head.template_vertex_positions.astype(float)
     lips = [regions.group(head, name) > 0.5 for name in ("upper_lip", "lower_lip")]
-    middle = rest[lips[1] & (np.abs(rest[:, 0]) < 0.004)].mean(0)
-    lower_jaw = ~lips[0] & ((rest[:, 1] < middle[1]) | lips[1])  # the lining over the upper lip stays too
-    vertices = rest + around(head, middle, 0.025) * lower_jaw[:, None] * [0, pushed_mm * 1e-3, 0]
-    found = audit(vertices, head)
-    assert flagged(found) == (LIPS if pushed_mm > 0.5 else set())
+    center = rest[lips[1] & (np.abs(rest[:, 0]) < 0.004)].mean(0)
+    lower_jaw = ~lips[0] & ((rest[:, 1] < center[1]) | lips[1])  # the lining over the upper lip stays too
+    vertices = rest + around(head, center, 0.025) * lower_jaw[:, None] * [0, pushed_mm * 1e-3, 0]
+    audit = audit_penetration(vertices, head)
+    assert flagged(audit) == (LIPS if pushed_mm > 0.5 else set())
     for name, lip, other in zip(sorted(LIPS, reverse=True), lips, lips[::-1], strict=True):
-        row, surface = pair(found, name), vertices[head.triangles[other[head.triangles].all(1)]]
+        row, surface = pair(audit, name), vertices[head.triangles[other[head.triangles].all(1)]]
         now = row.depth_mm > 0
         assert lip[row.vertices].all()
-        np.testing.assert_allclose(row.depth_mm[now], to_surface(vertices[row.vertices[now]], surface) * 1e3, atol=1e-6)
+        expected = distance_to_surface(vertices[row.vertices[now]], surface) * 1e3
+        np.testing.assert_allclose(row.depth_mm[now], expected, atol=1e-6)
         assert row.excess_mm.max() == pytest.approx(pushed_mm, abs=0.3)
 
 
@@ -311,14 +315,14 @@ def test_a_lid_moved_into_the_eye(head):
     towards = centre - rest[rim].mean(0)
     push = 1e-3 * towards / np.linalg.norm(towards)
     vertices = rest + around(head, rest[rim].mean(0), 0.008) * exterior[:, None] * push
-    found = audit(vertices, head)
-    assert flagged(found) == {"lids in left eye"}
-    depth = depths(found, "lids in left eye", len(vertices))
+    audit = audit_penetration(vertices, head)
+    assert flagged(audit) == {"lids in left eye"}
+    depth = depths(audit, "lids in left eye", len(vertices))
     near = np.flatnonzero(exterior & (np.linalg.norm(vertices - centre, axis=1) < 0.018))
     inside = near[by_ray(vertices[near], vertices, eye) > 0]
-    np.testing.assert_allclose(depth[inside], to_surface(vertices[inside], vertices[eye]) * 1e3, atol=1e-6)
+    np.testing.assert_allclose(depth[inside], distance_to_surface(vertices[inside], vertices[eye]) * 1e3, atol=1e-6)
     assert np.count_nonzero(depth) == len(inside)
-    assert pair(found, "lids in left eye").excess_mm.max() == pytest.approx(1, abs=0.1)
+    assert pair(audit, "lids in left eye").excess_mm.max() == pytest.approx(1, abs=0.1)
 
 
 @needs_shared
@@ -330,36 +334,36 @@ def test_an_ear_pushed_into_the_head(head):
     outer_half = np.clip((rest[:, 0] - 0.076) / 0.006, 0, 1) * ear
     pushed = around(head, hind, 0.020) * outer_half[:, None]
     vertices = rest + pushed * [-0.0192, 0, -0.0192]
-    found = audit(vertices, head)
-    assert flagged(found) == {"ears in skin"}
-    row, skin = pair(found, "ears in skin"), regions.solids(head)["skin"]
+    audit = audit_penetration(vertices, head)
+    assert flagged(audit) == {"ears in skin"}
+    row, skin = pair(audit, "ears in skin"), regions.solids(head)["skin"]
     scalp = skin[~regions.ears(head)[skin].any(1)]
-    own = ear[row.vertices]
-    expected = to_surface(vertices[row.vertices[own]], vertices[scalp]) * 1e3
-    np.testing.assert_allclose(row.depth_mm[own], expected, atol=1e-6)
-    assert row.depth_mm.max() == pytest.approx(3, abs=0.1) and own.sum() > 8
+    of_ear = ear[row.vertices]
+    expected = distance_to_surface(vertices[row.vertices[of_ear]], vertices[scalp]) * 1e3
+    np.testing.assert_allclose(row.depth_mm[of_ear], expected, atol=1e-6)
+    assert row.depth_mm.max() == pytest.approx(3, abs=0.1) and of_ear.sum() > 8
     near = ear & (pushed[:, 0] > 0)
     normals = vertex_normals(torch.from_numpy(vertices), torch.from_numpy(head.triangles.astype(int))).numpy()
     rays = by_ray((vertices + 1e-5 * normals)[near], *closed(vertices, skin))
-    np.testing.assert_array_equal(np.flatnonzero(near)[rays > 0], row.vertices[own & near[row.vertices]])
+    np.testing.assert_array_equal(np.flatnonzero(near)[rays > 0], row.vertices[of_ear & near[row.vertices]])
 
 
 @needs_shared
 def test_an_upper_lid_pushed_through_the_lower_lid(head):
-    """The eyeball is taken away: the skin alone crosses itself, in either lid."""
+    """Without the eyeball, only the skin intersects itself, in either eyelid."""
     rest = head.template_vertex_positions.astype(float)
     exterior, centre = regions.exterior(head), rest[regions.eyeball_shells(head)[0]].mean(0)
     shut = np.clip(1 - ((rest[:, 0] - centre[0]) / 0.009) ** 2, 0, 1) * np.clip((rest[:, 1] - 0.3005) / 0.002, 0, 1)
     shut *= np.clip((0.312 - rest[:, 1]) / 0.003, 0, 1) * (np.abs(rest[:, 2] - 0.115) < 0.006) * exterior
     vertices = rest + shut[:, None] * [0, -0.0105, 0]
     vertices[regions.group(head, "left_eye") > 0] -= [0, 0, 0.05]
-    found = audit(vertices, head)
-    assert flagged(found) == {"skin in itself"}
-    row, lids = pair(found, "skin in itself"), regions.solids(head)["skin"]
+    audit = audit_penetration(vertices, head)
+    assert flagged(audit) == {"skin in itself"}
+    row, lids = pair(audit, "skin in itself"), regions.solids(head)["skin"]
     lids = lids[exterior[lids].all(1)]
     above = rest[:, 1] > 0.3005
     assert above[row.vertices].sum() > 5 and (~above[row.vertices]).sum() > 2
     for here, other in ((above, ~above), (~above, above)):
         members = here[row.vertices]
-        expected = to_surface(vertices[row.vertices[members]], vertices[lids[other[lids].all(1)]]) * 1e3
+        expected = distance_to_surface(vertices[row.vertices[members]], vertices[lids[other[lids].all(1)]]) * 1e3
         np.testing.assert_allclose(row.depth_mm[members], expected, atol=1e-6)

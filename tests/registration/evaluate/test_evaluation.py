@@ -1,4 +1,4 @@
-"""Figures where the answer is known: spheres at known distances, truths moved by known amounts."""
+"""Metrics with known values: spheres at known distances, ground truths translated by known amounts."""
 
 import dataclasses
 import io
@@ -12,8 +12,8 @@ from rich.console import Console
 from registration.capture.native import read_capture
 from registration.capture.scan import read_scan, read_truth
 from registration.errors import InputError
-from registration.evaluate.console_table import print_figures
-from registration.evaluate.evaluation import evaluate, evaluate_folder
+from registration.evaluate.console_table import print_metrics
+from registration.evaluate.evaluation import evaluate_folder, evaluate_registration
 from registration.storage.mesh import write_ply
 from registration.storage.registration_folder import load_registration, save_registration
 from registration.types import Camera, Capture, Registration, View
@@ -36,7 +36,7 @@ def a_camera(angle: float) -> Camera:
 
 
 def landmarks() -> np.ndarray:
-    """A face on the sphere's +z side: ball centre (0, 0, 0.1), radius 1.4 (0.06 + 0.04) / 2 = 0.07."""
+    """A face on the sphere's +z side: sphere centre (0, 0, 0.1), radius 1.4 (0.06 + 0.04) / 2 = 0.07."""
     points = np.zeros((68, 3), np.float32)
     points[33], points[27] = [0, -0.012, 0.1], [0, 0.028, 0.1]
     points[36], points[45] = [-0.03, 0, 0.1], [0.03, 0, 0.1]
@@ -79,73 +79,79 @@ def a_capture(root: Path, scan=POINTS, faces=FACES, truth=None, angles=(-0.4, 0.
 @pytest.mark.parametrize("grown_mm", [-2.0, 0.5])
 def test_spheres_at_a_known_distance(tmp_path, grown_mm):
     grown = POINTS * (1 + grown_mm * 1e-3 / RADIUS)
-    found = evaluate(a_registration(grown), a_capture(tmp_path))
+    evaluation = evaluate_registration(a_registration(grown), a_capture(tmp_path))
     for kind, where in [("scan_to_mesh", "face"), ("scan_to_mesh", "seen"), ("mesh_to_scan", "face")]:
-        row = found.figures[kind][where]
+        row = evaluation.metrics[kind][where]
         assert row["mean_mm"] == pytest.approx(abs(grown_mm), rel=0.01), (kind, where)
         assert row["median_mm"] == pytest.approx(abs(grown_mm), rel=0.01) and row["std_mm"] < 0.01
-    by_area = found.figures["scan_to_mesh_by_area"]["face"]
+    by_area = evaluation.metrics["scan_to_mesh_by_area"]["face"]
     assert by_area["mean_mm"] == pytest.approx(abs(grown_mm), rel=0.01)
     assert by_area["points"] == 100_000 and by_area["dropped_normals"] == by_area["dropped_boundary"] == 0
 
 
-def test_the_face_is_seen_by_two_cameras_and_in_the_ball(tmp_path):
-    found = evaluate(a_registration(), a_capture(tmp_path, angles=(0.0, 1.0, 2.5)))
+def test_the_face_is_visible_to_two_cameras_and_in_the_sphere(tmp_path):
+    evaluation = evaluate_registration(a_registration(), a_capture(tmp_path, angles=(0.0, 1.0, 2.5)))
     normals = POINTS / RADIUS
     eyes = np.stack([a_camera(a).centre for a in (0.0, 1.0, 2.5)])
     towards = eyes[:, None] - POINTS
     facing = (towards * normals).sum(-1) / np.linalg.norm(towards, axis=-1)
     clear = (np.abs(facing) > 0.1).all(0)
-    np.testing.assert_array_equal(found.scan_seen[clear], ((facing > 0).sum(0) >= 2)[clear])
+    np.testing.assert_array_equal(evaluation.scan_visible[clear], ((facing > 0).sum(0) >= 2)[clear])
     near = np.linalg.norm(POINTS - [0, 0, 0.1], axis=1) <= 0.07
-    np.testing.assert_array_equal(found.scan_face, found.scan_seen & near)
-    assert found.figures["scan_to_mesh"]["face"]["points"] == found.scan_face.sum() > 100
-    assert found.figures["face_ball"]["radius_mm"] == pytest.approx(70, rel=1e-5)
-    np.testing.assert_array_equal(np.isfinite(found.vertex_distance_mm)[clear], found.scan_seen[clear])
+    np.testing.assert_array_equal(evaluation.scan_face, evaluation.scan_visible & near)
+    assert evaluation.metrics["scan_to_mesh"]["face"]["points"] == evaluation.scan_face.sum() > 100
+    assert evaluation.metrics["face_ball"]["radius_mm"] == pytest.approx(70, rel=1e-5)
+    np.testing.assert_array_equal(np.isfinite(evaluation.vertex_distance_mm)[clear], evaluation.scan_visible[clear])
 
 
 def test_sliding_gives_no_distance_but_a_vertex_error(tmp_path):
-    turn = trimesh.transformations.rotation_matrix(0.01, [0, 1, 0])[:3, :3]
-    found = evaluate(a_registration(POINTS @ turn.T), a_capture(tmp_path, truth=POINTS))
-    assert found.figures["scan_to_mesh"]["face"]["mean_mm"] < 0.05
-    across = np.linalg.norm(POINTS[found.scan_face][:, [0, 2]], axis=1)
+    rotation = trimesh.transformations.rotation_matrix(0.01, [0, 1, 0])[:3, :3]
+    evaluation = evaluate_registration(a_registration(POINTS @ rotation.T), a_capture(tmp_path, truth=POINTS))
+    assert evaluation.metrics["scan_to_mesh"]["face"]["mean_mm"] < 0.05
+    across = np.linalg.norm(POINTS[evaluation.scan_face][:, [0, 2]], axis=1)
     expected = 2 * np.sin(0.005) * across * 1e3
-    assert found.figures["vertex_error"]["face"]["mean_mm"] == pytest.approx(expected.mean(), rel=1e-3)
-    assert found.figures["vertex_error"]["face"]["points"] == found.scan_face.sum()
+    assert evaluation.metrics["vertex_error"]["face"]["mean_mm"] == pytest.approx(expected.mean(), rel=1e-3)
+    assert evaluation.metrics["vertex_error"]["face"]["points"] == evaluation.scan_face.sum()
 
 
 def test_a_hole_in_the_scan_shows_only_from_the_mesh(tmp_path):
     hole = np.linalg.norm(POINTS[FACES].mean(1) - [0, 0, RADIUS], axis=1) < 0.02
-    whole = evaluate(a_registration(), a_capture(tmp_path / "whole")).figures
-    holed = evaluate(a_registration(), a_capture(tmp_path / "holed", faces=FACES[~hole])).figures
+    whole = evaluate_registration(a_registration(), a_capture(tmp_path / "whole")).metrics
+    holed = evaluate_registration(a_registration(), a_capture(tmp_path / "holed", faces=FACES[~hole])).metrics
     assert holed["scan_to_mesh"]["face"]["mean_mm"] < 1e-4
     assert whole["mesh_to_scan"]["face"]["p95_mm"] < 1e-4
     assert holed["mesh_to_scan"]["face"]["p95_mm"] > 5
 
 
-def test_turned_normals_and_the_mesh_boundary_are_dropped_and_told(tmp_path):
+def test_turned_normals_and_the_mesh_boundary_are_excluded_and_counted(tmp_path):
     capture = a_capture(tmp_path)
+
+    def by_area(triangles: np.ndarray) -> dict:
+        evaluation = evaluate_registration(a_registration(triangles=triangles), capture)
+        return evaluation.metrics["scan_to_mesh_by_area"]["face"]
+
     half = FACES[POINTS[FACES].mean(1)[:, 0] < 0]  # the mesh ends at x = 0, in the middle of the face
-    cut = evaluate(a_registration(triangles=half), capture).figures["scan_to_mesh_by_area"]["face"]
+    cut = by_area(half)
     assert 0.4 < cut["dropped_boundary"] < 0.6 and cut["dropped_normals"] == 0
     assert cut["mean_mm"] < 0.01 and cut["points"] == round(100_000 * (1 - cut["dropped_boundary"]))
-    inside_out = evaluate(a_registration(triangles=FACES[:, ::-1]), capture).figures["scan_to_mesh_by_area"]["face"]
+    inside_out = by_area(FACES[:, ::-1])
     assert inside_out["dropped_normals"] == 1 and inside_out["mean_mm"] is None
 
 
 def test_regions_split_mesh_to_scan(tmp_path):
     pushed = POINTS * np.where(POINTS[:, :1] > 0, 1.01, 1.0)
     regions = {"left": POINTS[:, 0] > 0.01, "right": POINTS[:, 0] < -0.01, "nothing": np.zeros(len(POINTS), bool)}
-    figures = evaluate(a_registration(pushed), a_capture(tmp_path), regions=regions).figures["mesh_to_scan"]
-    assert figures["left"]["mean_mm"] == pytest.approx(1, rel=0.02) and figures["right"]["mean_mm"] < 0.01
-    assert figures["nothing"] == {"points": 0, "mean_mm": None, "median_mm": None, "std_mm": None, "p95_mm": None}
+    evaluation = evaluate_registration(a_registration(pushed), a_capture(tmp_path), regions=regions)
+    metrics = evaluation.metrics["mesh_to_scan"]
+    assert metrics["left"]["mean_mm"] == pytest.approx(1, rel=0.02) and metrics["right"]["mean_mm"] < 0.01
+    assert metrics["nothing"] == {"points": 0, "mean_mm": None, "median_mm": None, "std_mm": None, "p95_mm": None}
 
 
-def test_a_point_cloud_has_distances_and_no_surface_figures(tmp_path):
-    found = evaluate(a_registration(POINTS * 1.01), a_capture(tmp_path, faces=np.zeros((0, 3), int)))
-    assert found.figures["scan_to_mesh"]["face"]["mean_mm"] == pytest.approx(1, rel=0.02)
-    assert set(found.figures) == {"face_ball", "scan_to_mesh"} and np.isnan(found.vertex_distance_mm).all()
-    assert 0.2 < found.scan_seen.mean() < 0.6  # the far side is hidden by the registered surface
+def test_a_point_cloud_has_distances_and_no_surface_metrics(tmp_path):
+    evaluation = evaluate_registration(a_registration(POINTS * 1.01), a_capture(tmp_path, faces=np.zeros((0, 3), int)))
+    assert evaluation.metrics["scan_to_mesh"]["face"]["mean_mm"] == pytest.approx(1, rel=0.02)
+    assert set(evaluation.metrics) == {"face_ball", "scan_to_mesh"} and np.isnan(evaluation.vertex_distance_mm).all()
+    assert 0.2 < evaluation.scan_visible.mean() < 0.6  # the far side is hidden by the registered surface
 
 
 def test_drift_is_motion_of_the_mesh_against_the_truth(tmp_path):
@@ -158,30 +164,31 @@ def test_drift_is_motion_of_the_mesh_against_the_truth(tmp_path):
     slides = a_registration(POINTS + [0.002, 0.01, 0])
 
     def drift(registration):
-        return evaluate(registration, end, neutral=neutral, neutral_capture=start).figures["drift"]["face"]
+        return evaluate_registration(registration, end, neutral=neutral, neutral_capture=start).metrics["drift"]["face"]
 
     assert drift(follows)["mean_mm"] == pytest.approx(drift(follows)["carried_mm"], abs=1e-4)
     assert drift(follows)["mean_mm"] < 0.1  # the facets' depth
     assert drift(slides)["mean_mm"] == pytest.approx(2, abs=0.1)
-    assert "vertex_error" not in evaluate(follows, end).figures  # the truth is of another topology
+    assert "vertex_error" not in evaluate_registration(follows, end).metrics  # the truth is of another topology
 
 
 def test_what_cannot_be_evaluated(tmp_path):
     capture = a_capture(tmp_path, truth=POINTS)
     with pytest.raises(InputError, match="no scan"):
-        evaluate(a_registration(), dataclasses.replace(capture, scan=None))
-    with pytest.raises(InputError, match="face cannot be found"):
-        evaluate(a_registration(landmarks={}), capture)
+        evaluate_registration(a_registration(), dataclasses.replace(capture, scan=None))
+    with pytest.raises(InputError, match="face cannot be located"):
+        evaluate_registration(a_registration(landmarks={}), capture)
     with pytest.raises(InputError, match="neutral is incomplete"):
-        evaluate(a_registration(), capture, neutral=a_registration())
+        evaluate_registration(a_registration(), capture, neutral=a_registration())
     with pytest.raises(InputError, match="different topologies"):
-        evaluate(a_registration(), capture, neutral=a_registration(triangles=FACES[1:]), neutral_capture=capture)
+        other = a_registration(triangles=FACES[1:])
+        evaluate_registration(a_registration(), capture, neutral=other, neutral_capture=capture)
 
 
-def test_the_table_prints_every_figure(tmp_path):
-    figures = evaluate(a_registration(POINTS * 1.01), a_capture(tmp_path, truth=POINTS)).figures
+def test_the_table_prints_every_metric(tmp_path):
+    metrics = evaluate_registration(a_registration(POINTS * 1.01), a_capture(tmp_path, truth=POINTS)).metrics
     console = Console(file=io.StringIO(), width=120)
-    print_figures(figures, "title", console)
+    print_metrics(metrics, "title", console)
     text = console.file.getvalue()
     for name in ("scan to mesh", "scan to mesh, by area", "mesh to scan", "vertex error", "1.000"):
         assert name in text
@@ -195,15 +202,15 @@ def truth_registration(capture: Capture) -> Registration:
 
 
 @needs_shared
-def test_the_truth_has_no_error_and_figures_are_stored(tmp_path, capsys):
+def test_the_truth_has_no_error_and_metrics_are_stored(tmp_path, capsys):
     root = SHARED / "data/captures/gnm_identity_a/neutral"
     save_registration(truth_registration(read_capture(root)), tmp_path / "r", report_html="kept")
-    found = evaluate_folder(tmp_path / "r", root)
+    evaluation = evaluate_folder(tmp_path / "r", root)
     stored = load_registration(tmp_path / "r").figures
     assert stored["vertex_error"]["face"]["mean_mm"] == 0 and stored["scan_to_mesh"]["face"]["p95_mm"] < 1e-6
     assert stored["face_ball"]["landmarks"] == "capture"
     assert 4000 < stored["scan_to_mesh"]["face"]["points"] < 7000
-    assert stored == found.figures and "vertex error" in capsys.readouterr().out
+    assert stored == evaluation.metrics and "vertex error" in capsys.readouterr().out
     assert (tmp_path / "r" / "report.html").read_text() == "kept"
 
 
@@ -211,10 +218,10 @@ def test_the_truth_has_no_error_and_figures_are_stored(tmp_path, capsys):
 @pytest.mark.slow
 def test_truths_of_two_expressions_do_not_drift():
     neutral, happy = (read_capture(SHARED / f"data/captures/gnm_identity_a/{name}") for name in ("neutral", "happy"))
-    found = evaluate(
+    evaluation = evaluate_registration(
         truth_registration(happy), happy, neutral=truth_registration(neutral), neutral_capture=neutral
-    ).figures
-    assert found["drift"]["face"]["mean_mm"] == 0 and found["vertex_error"]["face"]["mean_mm"] == 0
+    ).metrics
+    assert evaluation["drift"]["face"]["mean_mm"] == 0 and evaluation["vertex_error"]["face"]["mean_mm"] == 0
 
 
 @needs_shared
@@ -223,6 +230,6 @@ def test_another_topology_has_drift_but_no_vertex_error():
     neutral, smile = (read_capture(SHARED / f"data/captures/ict_dev/{name}") for name in ("neutral", "smile"))
     meshes = [read_scan(capture.scan) for capture in (neutral, smile)]
     start, end = (a_registration(m.vertices, m.triangles, landmarks={}) for m in meshes)
-    figures = evaluate(end, smile, neutral=start, neutral_capture=neutral).figures
-    assert figures["scan_to_mesh"]["face"]["mean_mm"] < 1e-4 and "vertex_error" not in figures
-    assert figures["drift"]["face"]["mean_mm"] < 1e-3
+    metrics = evaluate_registration(end, smile, neutral=start, neutral_capture=neutral).metrics
+    assert metrics["scan_to_mesh"]["face"]["mean_mm"] < 1e-4 and "vertex_error" not in metrics
+    assert metrics["drift"]["face"]["mean_mm"] < 1e-3

@@ -81,7 +81,7 @@ def test_the_drift_is_that_of_evaluate(subject: Path, fake: FakeRegister, tmp_pa
     assert "drift" not in read_manifest(out / "rest").figures
     told = manifest(out)["captures"][-1]["figures"]
     assert told == {name: {"face": figures[name]["face"]} for name in ("scan_to_mesh", "drift")}
-    by_hand = evaluate_folder(out / "smile", subject / "smile", out / "rest", subject / "rest").figures
+    by_hand = evaluate_folder(out / "smile", subject / "smile", out / "rest", subject / "rest").metrics
     assert by_hand["drift"] == figures["drift"] and by_hand["scan_to_mesh"] == figures["scan_to_mesh"]
 
 
@@ -200,7 +200,7 @@ def test_a_drift_that_is_newer_than_the_neutral_stays(subject: Path, fake: FakeR
         asked.append(capture.root.name)
         raise REFUSED
 
-    monkeypatch.setattr(workflows.steps.subject, "evaluate", listen)
+    monkeypatch.setattr(workflows.steps.subject, "evaluate_registration", listen)
     again = run(subject)
     assert asked == [] and again.rows[-1].figures["drift"]["face"]["mean_mm"] == pytest.approx(1.0, abs=0.05)
     os.utime(out / "rest" / "manifest.json")
@@ -262,6 +262,6 @@ def test_a_subject_equals_its_captures_registered_by_hand(tmp_path: Path, monkey
         raise AssertionError("there was nothing to compute")
 
     monkeypatch.setattr(backend, "activate", stop)
-    monkeypatch.setattr(workflows.steps.subject, "evaluate", stop)
+    monkeypatch.setattr(workflows.steps.subject, "evaluate_registration", stop)
     register_subject(subject, MODEL, out, options)
     assert manifest(out) == record
