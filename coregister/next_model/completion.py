@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, Int
 
-from registration.geometry.extrapolation import continued
+from registration.geometry.extrapolation import extrapolate
 from registration.geometry.topology import vertex_areas
 from registration.model import regions
 from registration.model.gnm_npz import GNMData
@@ -79,7 +79,7 @@ class MissingDataCompletion:
         estimate = self._estimate(displacement, observed)
         residual = displacement - estimate
         fade_m = self._settings.fade_mm / 1000
-        extrapolated = continued(residual, observed >= 1, self._triangles, self._points, reach_m=fade_m)
+        extrapolated = extrapolate(residual, observed >= 1, self._triangles, self._points, reach_m=fade_m)
         blend = observed[:, None]
         return estimate + blend * residual + (1 - blend) * extrapolated
 

@@ -9,7 +9,7 @@ from jaxtyping import Float, Int
 
 from registration.frames import MM_PER_M
 from registration.geometry.closest_point import ClosestPointQuery, barycentric_points
-from registration.geometry.extrapolation import continued
+from registration.geometry.extrapolation import extrapolate
 from registration.model import regions
 from registration.model.gnm_npz import GNMData
 
@@ -147,7 +147,7 @@ def eyelids_on_eyeballs(
             negative, _ = eyelids.gaps(rest - motion, -BOUND * motions[k, side])
             corrections[eyelids.rim, k] = -((positive - negative) / (2 * BOUND))[:, None] * outward
     flat = corrections.reshape(len(template), -1)
-    change = continued(flat, on_rim, data.triangles, template, reach_m=_FADE_M)
+    change = extrapolate(flat, on_rim, data.triangles, template, reach_m=_FADE_M)
     change[~regions.skin(data)] = 0
     return basis + change.reshape(len(template), len(basis), 3).swapaxes(0, 1)
 

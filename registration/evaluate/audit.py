@@ -231,13 +231,13 @@ class _PartSurfaces:
         for name, (lip, other_lip) in zip(names, pairs, strict=False):
             members = inside[lip[inside]]
             to_lip = _distance(vertices, members, self.skin[other_lip[self.skin].all(1)])
-            distance, _, valid = self.overlap.ways_out(vertices, members, other_faces, to_lip)
-            elsewhere = valid & (distance < to_lip) | np.isinf(to_lip)
+            distance, _, penetrated = self.overlap.penetrated_faces(vertices, members, other_faces, to_lip)
+            elsewhere = penetrated & (distance < to_lip) | np.isinf(to_lip)
             set_depths(name, members[~elsewhere], to_lip[~elsewhere])
             set_depths(names[-1], members[elsewhere], distance[elsewhere])
         members = inside[~lips[inside]]
         unbounded = np.full(len(members), np.inf)
-        distance, face, _ = self.overlap.ways_out(vertices, members, np.arange(len(self.skin)), unbounded)
+        distance, face, _ = self.overlap.penetrated_faces(vertices, members, np.arange(len(self.skin)), unbounded)
         in_ear = self.ears[members] | self.ears[self.skin[face]].all(1)
         distance = np.where(self.exterior_faces[face], distance, 0.0)
         for name, rows in (("ears in skin", in_ear), ("skin in itself", ~in_ear)):

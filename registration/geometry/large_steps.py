@@ -1,8 +1,8 @@
-"""Large steps (Nicolet 2021): smooth displacements through a preconditioner, and quadratic penalties on them.
+"""Large steps [Nicolet 2021]: smooth displacements by a preconditioner; and the Laplacians of a mesh.
 
-The unknown is u = M d with M = I + lambda L, L the combinatorial Laplacian; d = M^-1 u and dLoss/du = M^-1 dLoss/dd.
+The variable is u = M d with M = I + lambda L, L the combinatorial Laplacian; d = M^-1 u and dLoss/du = M^-1 dLoss/dd.
 On a regular triangulation of edge length h this smooths over l = h sqrt(1.5 lambda). Lambda may vary from edge to edge,
-so that l is what was asked for where edges are longer, or where it is asked to be another.
+so that l does not depend on the edge length, or varies as required.
 """
 
 import warnings
@@ -17,7 +17,7 @@ from torch import Tensor
 
 
 def spacing(triangles: Int[np.ndarray, "F 3"], points: Float[np.ndarray, "V 3"]) -> Float[np.ndarray, "V"]:
-    """The mean length of each vertex' edges; the median of all for vertices without."""
+    """Compute the mean length of each vertex' edges, in the points' unit; for isolated vertices the median of all."""
     adjacency = _adjacency(triangles, len(points)).tocoo()
     length = np.linalg.norm(points[adjacency.row].astype(np.float64) - points[adjacency.col], axis=1)
     count = np.bincount(adjacency.row, minlength=len(points))
@@ -28,7 +28,13 @@ def spacing(triangles: Int[np.ndarray, "F 3"], points: Float[np.ndarray, "V 3"])
 def combinatorial_laplacian(
     triangles: Int[np.ndarray, "F 3"], vertex_count: int, strength: Float[np.ndarray, "V"] | None = None
 ) -> csr_matrix:
-    """L = D - A over the mesh's edges, (V, V); every row sums to zero. Edges count the mean strength of their ends."""
+    """Build the Laplacian D - A, (V, V), whose rows sum to zero.
+
+    Args:
+        triangles: vertex indices.
+        vertex_count: V.
+        strength: of the vertices; an edge has the mean of its ends as its weight. None: ones.
+    """
     adjacency = _adjacency(triangles, vertex_count)
     if strength is not None:
         scaled = diags(strength)
@@ -37,7 +43,7 @@ def combinatorial_laplacian(
 
 
 def normalised_laplacian(triangles: Int[np.ndarray, "F 3"], vertex_count: int) -> csr_matrix:
-    """D^-1 (D - A): a vertex minus the mean of its neighbours, (V, V); empty rows for isolated vertices."""
+    """Build D^-1 (D - A), (V, V): a vertex minus the mean of its neighbours; empty rows for isolated vertices."""
     adjacency = _adjacency(triangles, vertex_count)
     degree = np.asarray(adjacency.sum(1)).ravel()
     return (diags(1 / np.maximum(degree, 1)) @ (diags(degree) - adjacency)).tocsr()
@@ -50,24 +56,25 @@ def _adjacency(triangles: Int[np.ndarray, "F 3"], vertex_count: int) -> csr_matr
     return ((one_way + one_way.T) > 0).astype(np.float64)
 
 
-def to_torch(matrix: csr_matrix, device: torch.device) -> Tensor:
-    """A SciPy sparse matrix as a float32 torch one, for products that carry gradients."""
+def to_torch(matrix: csr_matrix, device: torch.device, dtype: torch.dtype = torch.float32) -> Tensor:
+    """Copy a SciPy sparse matrix into a PyTorch one in CSR format, for products that carry gradients."""
     matrix = matrix.tocsr()
     with warnings.catch_warnings():
-        # A product is 30 times faster than with COO, which would not warn.
+        # A product is 30 times as fast as in COO format, which would not warn.
         warnings.filterwarnings("ignore", "Sparse CSR tensor support is in beta", UserWarning)
         return torch.sparse_csr_tensor(
             torch.as_tensor(matrix.indptr.astype(np.int64)),
             torch.as_tensor(matrix.indices.astype(np.int64)),
-            torch.as_tensor(matrix.data.astype(np.float32)),
+            torch.as_tensor(matrix.data),
             matrix.shape,
+            dtype=dtype,
             device=device,
             check_invariants=False,
         )
 
 
 class LargeSteps:
-    """M of one mesh, factorised once, in double precision. Edge and smoothing lengths are one number or one a vertex.
+    """M of one mesh, factorized once, in float64.
 
     The factor lies in host memory (docs/adr/0006-no-gpl-by-default.md): with tensors on a GPU every solve copies its
     right-hand side to the host and the solution back.
@@ -82,6 +89,15 @@ class LargeSteps:
         smoothing_m: float | Float[np.ndarray, "V"],
         device: torch.device,
     ):
+        """Factorize M.
+
+        Args:
+            triangles: vertex indices.
+            vertex_count: V.
+            edge_length_m: one number, or one for each vertex.
+            smoothing_m: the length l over which displacements are smoothed; one number, or one for each vertex.
+            device: of the displacements.
+        """
         strength = np.broadcast_to(np.square(np.divide(smoothing_m, edge_length_m)) / 1.5, vertex_count)
         matrix = identity(vertex_count) + combinatorial_laplacian(triangles, vertex_count, strength)
         self._matrix = to_torch(matrix.tocsr(), device)
@@ -91,11 +107,11 @@ class LargeSteps:
         )
 
     def latent(self, displacement: Float[Tensor, "V 3"]) -> Float[Tensor, "V 3"]:
-        """u = M d."""
+        """Compute the latent u = M d of a displacement d."""
         return self._matrix @ displacement
 
     def displacement(self, latent: Float[Tensor, "V 3"]) -> Float[Tensor, "V 3"]:
-        """d = M^-1 u; differentiable."""
+        """Compute the displacement d = M^-1 u of a latent u; differentiable."""
         return _Solve.apply(latent, self._factor)
 
 

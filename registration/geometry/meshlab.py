@@ -10,10 +10,10 @@ from registration.geometry.quads import edges_of
 
 @dataclass(frozen=True, kw_only=True)
 class ScanTopology:
-    """How a scan's surface hangs together."""
+    """Connectivity of a scan's surface and its defects."""
 
     components: int
-    holes: int  # closed rings of boundary edges; -1 where non-manifold edges leave that undefined
+    holes: int  # closed loops of boundary edges; -1: undefined because of non-manifold edges
     boundary_edges: int
     non_manifold_edges: int
     non_manifold_vertices: int
@@ -27,7 +27,7 @@ class ScanTopology:
 
 
 def scan_topology(vertices: Float[np.ndarray, "V 3"], triangles: Int[np.ndarray, "F 3"]) -> ScanTopology | None:
-    """Components, holes and defects of a scan, or None where PyMeshLab is not installed or cannot start."""
+    """Measure the topology of a scan; None where PyMeshLab is not installed or cannot be loaded."""
     try:
         import pymeshlab
     except ImportError:
@@ -39,7 +39,7 @@ def scan_topology(vertices: Float[np.ndarray, "V 3"], triangles: Int[np.ndarray,
         components=measures["connected_components_number"],
         holes=measures["number_holes"],
         boundary_edges=measures["boundary_edges"],
-        # MeshLab's own count is of memory that nothing was written to.
+        # MeshLab's own count reads uninitialized memory.
         non_manifold_edges=int((edges_of(triangles)[2] > 2).sum()),
         non_manifold_vertices=measures["non_two_manifold_vertices"],
     )

@@ -1,4 +1,4 @@
-"""Flat maps of quad meshes (texture coordinates) that never flip a face."""
+"""Parameterization of quad meshes (texture coordinates) without flipped faces."""
 
 import numpy as np
 import scipy.sparse as sp
@@ -15,10 +15,19 @@ def flat_map(
     rim_uv: Float[np.ndarray, "N 2"],
     rounds: int = 8,
 ) -> Float[np.ndarray, "V 2"]:
-    """A map of a disc onto a convex outline without flips: Tutte's, its weights changed to even out the stretch.
+    """Map a disc onto a convex outline without flips [Tutte 1963].
 
-    `rim` is the outer boundary; other boundaries are holes, each spanned by one vertex that is thrown away.
-    (Tutte 1963; Yoshizawa, Belyaev and Seidel 2004 for the weights; positive weights keep every face upright.)
+    The weights are updated to equalize the stretch [Yoshizawa 2004]; positive weights keep every face upright.
+
+    Args:
+        vertices: in any unit.
+        quads: vertex indices.
+        rim: vertices of the outer boundary. Other boundaries are holes, each spanned by a temporary vertex.
+        rim_uv: where these are mapped to: a convex polygon.
+        rounds: largest number of updates of the weights.
+
+    Returns:
+        Map coordinates of all vertices.
     """
     holes = [loop for loop in boundary_loops(quads) if not np.isin(loop, rim).any()]
     triangles = triangles_of(quads)
@@ -50,7 +59,7 @@ def flat_map(
 def _harmonic(
     pairs: np.ndarray, weight: np.ndarray, fixed: np.ndarray, fixed_uv: np.ndarray, used: np.ndarray
 ) -> Float[np.ndarray, "V 2"]:
-    """Every free vertex at the weighted mean of its neighbours."""
+    """Solve for the map in which each free vertex is at the weighted mean of its neighbours."""
     n = len(fixed)
     W = sp.csr_matrix((weight, (pairs[:, 0], pairs[:, 1])), (n, n))
     A = sp.diags(np.asarray(W.sum(1)).ravel()) - W
@@ -61,7 +70,7 @@ def _harmonic(
 
 
 def _stretch(points: np.ndarray, uv: np.ndarray, triangles: np.ndarray) -> tuple[Float[np.ndarray, "V"], float]:
-    """Each vertex' mean L2 stretch from the map to the surface, and the whole mesh' (Sander et al. 2001)."""
+    """Mean L2 stretch of each vertex from the map to the surface, relative, and the sum over the mesh [Sander 2001]."""
     a, b, c = (points[triangles[:, k]] for k in range(3))
     u, v, w = (uv[triangles[:, k]] for k in range(3))
     double = (v[:, 0] - u[:, 0]) * (w[:, 1] - u[:, 1]) - (w[:, 0] - u[:, 0]) * (v[:, 1] - u[:, 1])

@@ -1,4 +1,4 @@
-"""Quad meshes: edges, loops, connected pieces, and one Catmull-Clark step as a matrix."""
+"""Quad meshes: edges, loops, connected components, and one Catmull-Clark step as a matrix."""
 
 from dataclasses import dataclass
 
@@ -9,20 +9,23 @@ from scipy.sparse.csgraph import connected_components
 
 
 def triangles_of(quads: Int[np.ndarray, "Q 4"]) -> Int[np.ndarray, "2*Q 3"]:
-    """Two triangles a quad: corners (0, 1, 2) in row 2 q, corners (2, 3, 0) in row 2 q + 1."""
+    """Cut each quad into two triangles: corners (0, 1, 2) in row 2 q, corners (2, 3, 0) in row 2 q + 1."""
     return quads[:, [[0, 1, 2], [2, 3, 0]]].reshape(-1, 3)
 
 
 def corner_triangles(corners: Float[np.ndarray, "Q 4 D"]) -> Float[np.ndarray, "2*Q 3 D"]:
-    """Values per corner of the quads, laid out like `triangles_of`."""
+    """Return values at the corners of quads at the corners of their triangles, in the order of `triangles_of`."""
     return corners[:, [[0, 1, 2], [2, 3, 0]]].reshape(-1, 3, corners.shape[-1])
 
 
 def edges_of(
     faces: Int[np.ndarray, "F S"],
 ) -> tuple[Int[np.ndarray, "E 2"], Int[np.ndarray, "F S"], Int[np.ndarray, "E"]]:
-    """Edges (lower vertex first), each face's edges (edge k joins corners k and k + 1), faces per edge. Quads, or
-    triangles of any mesh, manifold or not."""
+    """Return the edges of quads or triangles of any mesh, manifold or not.
+
+    Returns:
+        Edges (lower vertex first), the edges of each face (edge k joins corners k and k + 1), and faces per edge.
+    """
     low, high = np.sort(np.stack([faces, np.roll(faces, -1, 1)]).astype(np.int64), 0)
     size = int(faces.max(initial=0)) + 1
     number, inverse, count = np.unique(low * size + high, return_inverse=True, return_counts=True)  # rows sort slower
@@ -30,7 +33,7 @@ def edges_of(
 
 
 def boundary_loops(quads: Int[np.ndarray, "Q 4"]) -> list[Int[np.ndarray, "N"]]:
-    """The mesh' boundaries as closed vertex loops, in the direction of the quads' own edges."""
+    """Return the boundaries of a mesh as closed vertex loops, in the direction of the quads' edges."""
     following: dict[int, int] = {}
     _, of_quad, count = edges_of(quads)
     for quad, side in np.argwhere(count[of_quad] == 1):
@@ -46,9 +49,18 @@ def boundary_loops(quads: Int[np.ndarray, "Q 4"]) -> list[Int[np.ndarray, "N"]]:
 
 
 def edge_loop(quads: Int[np.ndarray, "Q 4"], first: int, second: int) -> Int[np.ndarray, "N"]:
-    """The closed loop of edges that runs straight on from an edge, through vertices of valence four.
+    """Return the closed edge loop that continues an edge through vertices of valence four.
 
-    Raises ValueError if it meets another vertex or a boundary.
+    Args:
+        quads: vertex indices.
+        first: vertex at which the edge starts.
+        second: vertex at its end.
+
+    Returns:
+        The vertices of the loop, beginning with these two.
+
+    Raises:
+        ValueError: the loop meets a vertex of another valence or a boundary.
     """
     edges, of_quad, _ = edges_of(quads)
     around: dict[int, set[int]] = {}
@@ -72,7 +84,7 @@ def edge_loop(quads: Int[np.ndarray, "Q 4"], first: int, second: int) -> Int[np.
 
 
 def beyond_loop(quads: Int[np.ndarray, "Q 4"], loop: Int[np.ndarray, "N"], inside: int) -> Bool[np.ndarray, "Q"]:
-    """The quads on that side of a closed loop of edges on which the vertex `inside` lies."""
+    """Select the quads on that side of a closed edge loop on which the vertex `inside` lies."""
     edges, of_quad, _ = edges_of(quads)
     ends = np.sort(np.stack([loop, np.roll(loop, -1)], 1), 1)
     wanted = set(map(tuple, ends.tolist()))
@@ -82,7 +94,7 @@ def beyond_loop(quads: Int[np.ndarray, "Q 4"], loop: Int[np.ndarray, "N"], insid
 
 
 def pieces(of_quad: Int[np.ndarray, "Q 4"], open_edge: Bool[np.ndarray, "E"]) -> tuple[Int[np.ndarray, "Q"], int]:
-    """Which connected piece each quad is in, and their number. Quads hang together over open edges only."""
+    """Return the connected component of each quad and the number of components; only open edges connect quads."""
     quad, side = np.nonzero(open_edge[of_quad])
     incidence = sp.csr_matrix((np.ones(len(quad)), (quad, of_quad[quad, side])), (len(of_quad), len(open_edge)))
     number, label = connected_components(incidence @ incidence.T, directed=False)
@@ -91,18 +103,20 @@ def pieces(of_quad: Int[np.ndarray, "Q 4"], open_edge: Bool[np.ndarray, "E"]) ->
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Subdivision:
-    """One Catmull-Clark step. Fine vertices: first the B coarse ones, then edge points, then face points."""
+    """One Catmull-Clark step. V fine vertices: first the B coarse ones, then edge points, then face points."""
 
     weights: sp.csr_matrix  # (V, B): fine = weights @ coarse; rows sum to one
-    linear: sp.csr_matrix  # (V, B): the same vertices without smoothing, for values that must not shrink
+    linear: sp.csr_matrix  # (V, B): the same vertices without smoothing, for values that must not be averaged
     quads: Int[np.ndarray, "F 4"]  # F = 4 Q, those of a coarse quad one after another
     mirror: Int[np.ndarray, "V"]
 
 
 def subdivide(quads: Int[np.ndarray, "Q 4"], mirror: Int[np.ndarray, "B"]) -> Subdivision:
-    """Catmull-Clark with smooth boundary curves (Catmull and Clark 1978; boundary rules of DeRose et al. 1998).
+    """Subdivide once [Catmull 1978], with smooth boundary curves [DeRose 1998].
 
-    Every one of the B vertices must belong to a quad.
+    Args:
+        quads: vertex indices; each of the B vertices must belong to a quad.
+        mirror: the mirrored vertex of each vertex.
     """
     edges, of_quad, count = edges_of(quads)
     B, E, Q = len(mirror), len(edges), len(quads)

@@ -1,4 +1,4 @@
-"""Rigid motions of points: the one that fits best, and small ones as twists. Float64 inside."""
+"""Least-squares alignment of corresponding points, and small rigid motions as twists. Computed in float64."""
 
 import numpy as np
 from jaxtyping import Float
@@ -7,28 +7,35 @@ from jaxtyping import Float
 def align(
     source: Float[np.ndarray, "S P 3"], target: Float[np.ndarray, "P 3"], weights: Float[np.ndarray, "S P"]
 ) -> Float[np.ndarray, "S 4 4"]:
-    """T_target_source of each point set: rotation and shift with the least weighted squared distance (Kabsch 1976).
+    """Align point sets rigidly to one target by weighted least squares [Kabsch 1976]; never by a reflection.
 
-    Never a reflection. A set whose weights sum to zero stays where it is.
+    Args:
+        source: S sets of P points.
+        target: the corresponding points, in the same unit.
+        weights: of the pairs, at least 0.
+
+    Returns:
+        T_target_source of each set; the identity for a set whose weights are all zero.
     """
     weights = weights.astype(np.float64)
     total = weights.sum(1)
     share = weights / np.where(total > 0, total, 1)[:, None]
-    middle = np.einsum("sp,spc->sc", share, source)
-    aim = share @ target.astype(np.float64)
-    spread = np.einsum("spc,spd->scd", (source - middle[:, None]) * share[:, :, None], target[None] - aim[:, None])
-    u, _, vt = np.linalg.svd(spread)
+    source_mean = np.einsum("sp,spc->sc", share, source)
+    target_mean = share @ target.astype(np.float64)
+    deviation = (source - source_mean[:, None]) * share[:, :, None]
+    covariance = np.einsum("spc,spd->scd", deviation, target[None] - target_mean[:, None])
+    u, _, vt = np.linalg.svd(covariance)
     flip = np.ones((len(source), 3))
     flip[:, 2] = np.sign(np.linalg.det(u @ vt))
-    found = np.tile(np.eye(4), (len(source), 1, 1))
-    found[:, :3, :3] = (vt.swapaxes(1, 2) * flip[:, None, :]) @ u.swapaxes(1, 2)
-    found[:, :3, 3] = aim - np.einsum("scd,sd->sc", found[:, :3, :3], middle)
-    found[total <= 0] = np.eye(4)
-    return found
+    T = np.tile(np.eye(4), (len(source), 1, 1))
+    T[:, :3, :3] = (vt.swapaxes(1, 2) * flip[:, None, :]) @ u.swapaxes(1, 2)
+    T[:, :3, 3] = target_mean - np.einsum("scd,sd->sc", T[:, :3, :3], source_mean)
+    T[total <= 0] = np.eye(4)
+    return T
 
 
 def angle_deg(transform: Float[np.ndarray, "S 4 4"]) -> Float[np.ndarray, "S"]:
-    """By how much transforms turn, degrees; exact also for small angles."""
+    """Compute the rotation angles of rigid transforms in degrees, accurate also for small angles."""
     rotation = transform[..., :3, :3]
     axis = np.stack(
         [
@@ -42,8 +49,15 @@ def angle_deg(transform: Float[np.ndarray, "S 4 4"]) -> Float[np.ndarray, "S"]:
 
 
 def motion_fields(points: Float[np.ndarray, "P 3"]) -> Float[np.ndarray, "6 P 3"]:
-    """What the six unit twists do to points: turns by one radian about x, y, z through the origin, to first order,
-    then shifts by one metre along them. A twist (w, t) moves p by w x p + t."""
+    """Compute the displacements of points by the six unit twists; a twist (w, t) moves p by w x p + t.
+
+    Args:
+        points: metres.
+
+    Returns:
+        Displacements by rotations of one radian about x, y and z through the origin, to first order, then by
+        translations of one metre along x, y and z.
+    """
     fields = np.zeros((6, len(points), 3))
     fields[:3] = np.cross(np.eye(3)[:, None], points[None])
     fields[3:] = np.eye(3)[:, None]
@@ -53,9 +67,16 @@ def motion_fields(points: Float[np.ndarray, "P 3"]) -> Float[np.ndarray, "6 P 3"
 def fit_twists(
     displacements: Float[np.ndarray, "S P 3"], points: Float[np.ndarray, "P 3"], weights: Float[np.ndarray, "P"]
 ) -> Float[np.ndarray, "S 6"]:
-    """The twist whose motion of the points is nearest to each displacement, in weighted least squares: rad, metres.
+    """Fit a twist to each displacement field by weighted least squares; linear in the displacements.
 
-    Linear in the displacement. Points at one place, or on one line, leave some turns open: those are zero.
+    Args:
+        displacements: S fields at P points, metres.
+        points: where they are, metres.
+        weights: of the points, at least 0.
+
+    Returns:
+        Rotation vector (radians) and translation (metres) of each field. Rotations that coincident or collinear points
+        do not determine are zero.
     """
     fields = motion_fields(points)
     weighted = (fields * weights[:, None]).reshape(6, -1)

@@ -1,4 +1,4 @@
-"""Spheres through points: found robustly once, then followed differentiably."""
+"""Least-squares spheres: a robust selection of the points once, then a differentiable fit."""
 
 import numpy as np
 import torch
@@ -9,10 +9,15 @@ _ROUNDS = 8
 
 
 def fit_sphere(points: Float[Tensor, "P 3"]) -> tuple[Float[Tensor, "3"], Float[Tensor, ""]]:
-    """Centre and radius of the sphere nearest to at least four points, in their unit; differentiable.
+    """Fit a sphere to at least four points; differentiable, computed in float64.
 
-    Minimises the sum of (|p - c|^2 - r^2)^2, which is linear in c and r^2 - |c|^2 (Kasa 1976, in three dimensions).
-    Points may cover a cap; they must not lie in one plane. Solved in float64 whatever comes in.
+    Minimizes the sum of (|p - c|^2 - r^2)^2, which is linear in c and r^2 - |c|^2 ([Kåsa 1976], in three dimensions).
+
+    Args:
+        points: in any unit. They may cover only a cap, but must not be coplanar.
+
+    Returns:
+        Centre and radius.
     """
     exact = points.double()
     origin = exact.mean(0)
@@ -28,15 +33,18 @@ def fit_sphere(points: Float[Tensor, "P 3"]) -> tuple[Float[Tensor, "3"], Float[
 
 
 def on_main_sphere(points: Float[np.ndarray, "P 3"], tolerance: float = 0.01) -> Bool[np.ndarray, "P"]:
-    """Which points lie on the sphere that most of them lie on, within `tolerance` of its radius.
+    """Select the points on the sphere on which most of them lie, such as an eyeball's sclera without the cornea.
 
-    An eyeball's sclera, for one, without the cornea's bulge. Trimmed least squares: points far from the sphere of the
-    last round are left out of the next.
+    Trimmed least squares: points far from the sphere of one round are excluded from the next.
+
+    Args:
+        points: in any unit.
+        tolerance: largest distance from the sphere, as a fraction of its radius.
     """
     keep = np.ones(len(points), bool)
-    away = np.zeros(len(points))
+    deviation = np.zeros(len(points))
     for _ in range(_ROUNDS):
         centre, radius = fit_sphere(torch.as_tensor(points[keep], dtype=torch.float64))
-        away = np.linalg.norm(points - centre.numpy(), axis=1) / float(radius) - 1
-        keep = np.abs(away) <= max(tolerance / 4, 2 * float(np.median(np.abs(away))))
-    return np.abs(away) <= tolerance
+        deviation = np.linalg.norm(points - centre.numpy(), axis=1) / float(radius) - 1
+        keep = np.abs(deviation) <= max(tolerance / 4, 2 * float(np.median(np.abs(deviation))))
+    return np.abs(deviation) <= tolerance

@@ -24,7 +24,7 @@ class Edges:
 
 
 def edges(triangles: Int[np.ndarray, "F 3"]) -> Edges:
-    """Unique edges with their one or two faces.
+    """Return the unique edges with their one or two faces.
 
     Raises:
         InputError: an edge has more than two faces (the mesh is not a manifold).
@@ -52,7 +52,7 @@ def edges(triangles: Int[np.ndarray, "F 3"]) -> Edges:
     second = np.where(two, first + 1, first)
     near = 3 * face + corner
     far = 3 * face + (corner + 1) % 3
-    # The second face normally runs along the edge the other way; a flipped neighbour does not.
+    # The second face normally traverses the edge in the opposite direction; a flipped neighbour does not.
     same_way = start[second] == start[first]
     corners = np.stack(
         [
@@ -70,7 +70,7 @@ def edges(triangles: Int[np.ndarray, "F 3"]) -> Edges:
 
 
 def connected_parts(triangles: Int[np.ndarray, "F 3"]) -> Int[np.ndarray, "F"]:
-    """For each triangle the number of the part of the mesh that it is connected to."""
+    """Return for each triangle the number of its connected component; triangles are connected by common vertices."""
     count = int(triangles.max()) + 1
     start, end = triangles[:, [0, 1]].ravel(), triangles[:, [1, 2]].ravel()
     graph = coo_matrix((np.ones(len(start)), (start, end)), (count, count))
@@ -78,10 +78,10 @@ def connected_parts(triangles: Int[np.ndarray, "F 3"]) -> Int[np.ndarray, "F"]:
 
 
 def vertex_normals(vertices: Float[Tensor, "V 3"], triangles: Int[Tensor, "F 3"]) -> Float[Tensor, "V 3"]:
-    """Unit normals, each the mean of the faces' around by their angles there; zero without area around.
+    """Compute unit vertex normals, the mean of the adjacent faces' normals weighted by their angles at the vertex.
 
-    Weighted by angles and not by areas, a vertex' normal does not depend on how quads are cut into triangles (Thuermer
-    and Wuethrich 1998). Differentiable.
+    With these weights a normal does not depend on how quads are cut into triangles [Thürmer 1998]. Differentiable. Zero
+    at vertices without adjacent area.
     """
     # Not vertices[...]: the adjoint of that sums in parallel, differently from run to run.
     corners = [vertices.index_select(0, triangles[:, k]) for k in range(3)]
@@ -100,7 +100,7 @@ def vertex_normals(vertices: Float[Tensor, "V 3"], triangles: Int[Tensor, "F 3"]
 
 
 def vertex_areas(vertices: Float[np.ndarray, "V 3"], triangles: Int[np.ndarray, "F 3"]) -> Float[np.ndarray, "V"]:
-    """A third of the area of the triangles around each vertex, m^2; together the area of the mesh."""
+    """Compute a third of the area of the triangles at each vertex; the sum is the area of the mesh."""
     a, b, c = (vertices[triangles[:, k]].astype(np.float64) for k in range(3))
     area = np.linalg.norm(np.cross(b - a, c - a), axis=1) / 2
     return np.bincount(triangles.ravel(), np.repeat(area / 3, 3), len(vertices))

@@ -21,7 +21,7 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from registration.frames import MM_PER_M
-from registration.geometry.contacts import Flesh, Solids, Watched, depths
+from registration.geometry.contacts import ContactCandidates, ContactSearch, Interior, depths
 from registration.geometry.spheres import fit_sphere, on_main_sphere
 from registration.geometry.topology import connected_parts, edges
 from registration.model import regions
@@ -45,7 +45,7 @@ class _Candidates:
     scale: float  # size of the head relative to the template
     origin: Float[Tensor, "3"]  # of the skin, world, metres
     index: Int[Tensor, "U"]  # the vertices that take part
-    watched: Watched  # in rows of `index`
+    contacts: ContactCandidates  # in rows of `index`
     slot: Int[Tensor, "M"]  # of each candidate, into the tolerances
     pair: Int[Tensor, "M"]  # of each candidate, into `SelfIntersectionPenalty.pairs`
 
@@ -148,17 +148,18 @@ class SelfIntersectionPenalty:
         scale, origin = _rms_radius(skin) / self._size, skin.mean(0)
         local = ((vertices - origin) * (MM_PER_M / scale)).cpu().numpy()
         tolerances = np.split(tolerance.cpu().numpy(), self._slots[1:-1])[len(self._eyeballs) :]
-        watched = [surface.watched(local, most) for (_, surface), most in zip(self._surfaces, tolerances, strict=True)]
-        index, joined = Watched.joined(watched).to(self._device).compact()
-        surface = np.repeat(np.arange(len(watched)), [len(rows.place) for rows in watched])
+        searches = [search for _, search in self._surfaces]
+        contacts = [search.candidates(local, allowed) for search, allowed in zip(searches, tolerances, strict=True)]
+        index, joined = ContactCandidates.concatenate(contacts).to(self._device).compact()
+        surface = np.repeat(np.arange(len(contacts)), [len(rows.query) for rows in contacts])
         first = self._slots[len(self._eyeballs) + surface]
         pair = np.array([self.pairs.index(name) for name, _ in self._surfaces])[surface]
         return _Candidates(
             scale=scale,
             origin=origin,
             index=index,
-            watched=joined,
-            slot=joined.place + torch.as_tensor(first, device=self._device),
+            contacts=joined,
+            slot=joined.query + torch.as_tensor(first, device=self._device),
             pair=torch.as_tensor(pair, device=self._device),
         )
 
@@ -171,10 +172,10 @@ class SelfIntersectionPenalty:
             return (vertices.index_select(0, index) - candidates.origin) * (MM_PER_M / candidates.scale)
 
         near = local(candidates.index)
-        current = depths(near, candidates.watched)
+        current = depths(near, candidates.contacts)
         deep = (current.depth > tolerance[candidates.slot]).nonzero()[:, 0]
-        points = candidates.watched.points
-        differentiable = current.again(near, points, deep)
+        points = candidates.contacts.points
+        differentiable = current.differentiable(near, points, deep)
         parts = [(candidates.slot[deep], candidates.pair[deep], candidates.index[points[deep]], differentiable)]
         for eyeball, start in zip(self._eyeballs, self._slots, strict=False):
             depth = eyeball.depths(local(eyeball.index))
@@ -209,7 +210,7 @@ class _Eyeball:
         return torch.stack(in_spheres).amax(0)
 
 
-def _surfaces(data: GNMData, rest: Float[np.ndarray, "V 3"]) -> list[tuple[str, Solids]]:
+def _surfaces(data: GNMData, rest: Float[np.ndarray, "V 3"]) -> list[tuple[str, ContactSearch]]:
     """Vertices and the parts that they can penetrate, each with the name of its pair."""
     mesh, skin = data.triangles.astype(np.int64), regions.solids(data)["skin"]
     upper, lower = regions.lips(data)
@@ -220,11 +221,11 @@ def _surfaces(data: GNMData, rest: Float[np.ndarray, "V 3"]) -> list[tuple[str, 
     def part(members: np.ndarray) -> list[np.ndarray]:
         return [mesh[members[mesh].all(1)]]
 
-    def into(points: np.ndarray, parts: list[np.ndarray], flesh: Flesh | None = None) -> Solids:
-        return Solids(np.flatnonzero(points), parts, inside=_INSIDE, outside=_OUTSIDE, flesh=flesh)
+    def into(points: np.ndarray, parts: list[np.ndarray], interior: Interior | None = None) -> ContactSearch:
+        return ContactSearch(np.flatnonzero(points), parts, inside=_INSIDE, outside=_OUTSIDE, interior=interior)
 
     around_mouth, around_ears = (
-        Flesh(skin[_near(rest, members, _INTERIOR_DISTANCE)[skin].all(1)])
+        Interior(skin[_near(rest, members, _INTERIOR_DISTANCE)[skin].all(1)])
         for members in (upper | lower | regions.mouth_lining(data), ears | head)
     )
     return [

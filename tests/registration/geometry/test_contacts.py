@@ -7,7 +7,7 @@ import trimesh
 
 from bench.support.crossed_parts import winding
 from registration.geometry.closest_point import closest_points
-from registration.geometry.contacts import Depths, Flesh, Solids, Watched, depths
+from registration.geometry.contacts import ContactCandidates, ContactSearch, Depths, Interior, depths
 
 
 class Scene:
@@ -22,16 +22,16 @@ class Scene:
         self.points = np.arange(len(points))
         self.vertices = np.concatenate([points, *(solid.vertices for solid in solids)])
 
-    def look(self, inside: float = 20.0, outside: float = 20.0) -> tuple[Watched, Depths]:
-        solids = Solids(self.points, self.parts, inside=inside, outside=outside)
-        watched = solids.watched(self.vertices, np.zeros(len(self.points)))
-        return watched, depths(torch.as_tensor(self.vertices), watched)
+    def look(self, inside: float = 20.0, outside: float = 20.0) -> tuple[ContactCandidates, Depths]:
+        search = ContactSearch(self.points, self.parts, inside=inside, outside=outside)
+        candidates = search.candidates(self.vertices, np.zeros(len(self.points)))
+        return candidates, depths(torch.as_tensor(self.vertices), candidates)
 
     def depth(self) -> np.ndarray:
-        """Of each point in the part that it is deepest in; nan where nothing is watched."""
-        watched, found = self.look()
+        """Of each point in the part that it is deepest in; nan where nothing is candidates."""
+        candidates, found = self.look()
         depth = np.full(len(self.points), np.nan)
-        for place, value in zip(watched.place.tolist(), found.depth.tolist(), strict=True):
+        for place, value in zip(candidates.query.tolist(), found.depth.tolist(), strict=True):
             depth[place] = np.fmax(depth[place], value)
         return depth
 
@@ -82,10 +82,10 @@ def test_over_a_sharp_tip_the_side_that_looks_at_a_point_decides():
     for order in ((0, 1, 2, 3), (1, 2, 3, 0), (2, 3, 0, 1), (3, 0, 1, 2)):
         triangles = sides[list(order)][None]
         zero = torch.zeros(1, dtype=torch.int64)
-        watched = Watched(
-            place=zero, points=zero, triangles=triangles, rim=torch.zeros(triangles.shape, dtype=torch.bool)
+        candidates = ContactCandidates(
+            query=zero, points=zero, triangles=triangles, rim=torch.zeros(triangles.shape, dtype=torch.bool)
         )
-        found = depths(vertices, watched)
+        found = depths(vertices, candidates)
         assert found.depth.item() == pytest.approx(-np.hypot(1, 0.6))
         np.testing.assert_allclose(found.direction[0], np.array([1, 0, 0.6]) / np.hypot(1, 0.6))
 
@@ -93,18 +93,18 @@ def test_over_a_sharp_tip_the_side_that_looks_at_a_point_decides():
 def test_gradient_reaches_both_sides():
     points = around(np.linspace(7, 10, 60), 1)
     scene = Scene(points, blob())
-    watched, found = scene.look()
+    candidates, found = scene.look()
     deep = (found.depth > 0).nonzero()[:, 0]
     assert len(deep) > 30
     vertices = torch.as_tensor(scene.vertices).requires_grad_(True)
-    torch.testing.assert_close(found.again(vertices, watched.points, deep), found.depth[deep])
-    (gradient,) = torch.autograd.grad(found.again(vertices, watched.points, deep).square().sum(), vertices)
+    torch.testing.assert_close(found.differentiable(vertices, candidates.points, deep), found.depth[deep])
+    (gradient,) = torch.autograd.grad(found.differentiable(vertices, candidates.points, deep).square().sum(), vertices)
     generator = torch.Generator().manual_seed(2)
     for side in (slice(0, len(points)), slice(len(points), None), slice(None)):
         along = torch.zeros_like(vertices)
         along[side] = torch.randn(along[side].shape, dtype=along.dtype, generator=generator)
         value = [
-            depths(vertices.detach() + sign * 1e-5 * along, watched).depth[deep].square().sum() for sign in (1, -1)
+            depths(vertices.detach() + sign * 1e-5 * along, candidates).depth[deep].square().sum() for sign in (1, -1)
         ]
         assert float((gradient * along).sum()) == pytest.approx(float(value[0] - value[1]) / 2e-5, rel=1e-4)
 
@@ -120,34 +120,34 @@ def test_a_touching_part_hides_nothing():
     points = np.array([[9.75, 0.3, 0.2], [9.9, 0.3, 0.2], [10.2, 0.3, 0.2]])
     scene = Scene(points, box(0, 10), box(9.8, 20))
     np.testing.assert_allclose(scene.depth(), [0.25, 0.1, 0.4], atol=1e-12)
-    watched, _ = scene.look()
-    assert watched.place.tolist() == [0, 1, 2, 0, 1, 2]
+    candidates, _ = scene.look()
+    assert candidates.query.tolist() == [0, 1, 2, 0, 1, 2]
 
 
 def test_only_what_is_near_is_watched():
     points = np.array([[-1.5, 0, 0], [-0.5, 0, 0], [0.5, 0, 0], [1.5, 0, 0]])
-    watched, found = Scene(points, box(0, 10)).look(inside=1, outside=1)
-    assert watched.place.tolist() == watched.points.tolist() == [1, 2]
+    candidates, found = Scene(points, box(0, 10)).look(inside=1, outside=1)
+    assert candidates.query.tolist() == candidates.points.tolist() == [1, 2]
     np.testing.assert_allclose(found.depth.numpy(), [-0.5, 0.5], atol=1e-12)
-    assert len(Scene(points[:1], box(0, 10)).look(inside=1, outside=1)[0].place) == 0
+    assert len(Scene(points[:1], box(0, 10)).look(inside=1, outside=1)[0].query) == 0
     fine = Scene(np.array([[4.0, 0.2, 0.1]]), box(0, 10, subdivisions=4))
-    assert [len(fine.look(inside, outside=1)[0].place) for inside in (3, 8)] == [0, 1]
+    assert [len(fine.look(inside, outside=1)[0].query) for inside in (3, 8)] == [0, 1]
 
 
 def test_a_vertex_that_left_what_it_watched_is_nowhere():
     scene = Scene(np.array([[0.1, -2, -2], [0.1, 1, 1]]), box(0, 10, subdivisions=4))
-    watched, found = scene.look()
+    candidates, found = scene.look()
     np.testing.assert_allclose(found.depth, 0.1)
     moved = torch.as_tensor(scene.vertices).clone()
     moved[:2] += torch.tensor([0.0, 3.5, 2.0])
-    assert (depths(moved, watched).depth == -torch.inf).all()
+    assert (depths(moved, candidates).depth == -torch.inf).all()
     np.testing.assert_allclose(Scene(moved[:2].numpy(), box(0, 10)).depth(), 0.1)
 
 
 def test_nothing_to_watch():
     for scene in (Scene(np.empty((0, 3)), box(0, 10)), Scene(np.zeros((2, 3)))):
-        watched, found = scene.look()
-        assert len(watched.place) == len(found.depth) == 0
+        candidates, found = scene.look()
+        assert len(candidates.query) == len(found.depth) == 0
 
 
 def pin_in_a_block() -> tuple[np.ndarray, np.ndarray, int]:
@@ -165,11 +165,11 @@ def pin_in_a_block() -> tuple[np.ndarray, np.ndarray, int]:
 
 def test_flesh_holds_what_is_inside_of_another_part_and_nothing_on_the_outside():
     vertices, triangles, block = pin_in_a_block()
-    flesh = Flesh(triangles)
+    interior = Interior(triangles)
     stuck = (np.arange(len(vertices)) >= block) & (vertices[:, 0] < 1)
     assert 5 < stuck.sum() < len(vertices) - block
-    np.testing.assert_array_equal(flesh.holds(vertices, np.arange(len(vertices))), stuck)
-    assert flesh.holds(vertices, np.empty(0, int)).shape == (0,)
+    np.testing.assert_array_equal(interior.contains(vertices, np.arange(len(vertices))), stuck)
+    assert interior.contains(vertices, np.empty(0, int)).shape == (0,)
 
 
 def test_the_far_side_of_ones_own_flesh_is_no_contact():
@@ -181,8 +181,8 @@ def test_the_far_side_of_ones_own_flesh_is_no_contact():
     assert len(right) == 1 and len(tip) >= 9
     options = {"parts": [left], "inside": 20.0, "outside": 20.0}
     everything, none = list(range(len(points))), np.zeros(len(points))
-    assert Solids(points, **options).watched(vertices, none).place.tolist() == everything
-    checked = Solids(points, **options, flesh=Flesh(triangles))
-    assert checked.watched(vertices, none).place.tolist() == everything[1:]
-    # What is no deeper than allowed is watched all the same.
-    assert checked.watched(vertices, np.full(len(points), 11.0)).place.tolist() == everything
+    assert ContactSearch(points, **options).candidates(vertices, none).query.tolist() == everything
+    checked = ContactSearch(points, **options, interior=Interior(triangles))
+    assert checked.candidates(vertices, none).query.tolist() == everything[1:]
+    # What is no deeper than allowed is candidates all the same.
+    assert checked.candidates(vertices, np.full(len(points), 11.0)).query.tolist() == everything

@@ -32,20 +32,21 @@ def test_the_way_out_of_a_lobe_is_its_surface_not_the_own_far_side(at_rest, thic
     members = np.flatnonzero(expected > 2e-4)
     np.testing.assert_array_equal(overlap.inside(vertices, members), members)
     assert len(members) > 30 and expected.max() > 4.5e-3
-    distance, face, sure = overlap.ways_out(vertices, members, np.arange(len(faces)), np.full(len(members), UNBOUNDED))
-    assert sure.all() and (share[faces[face]] < 0).all()
+    all_faces, unbounded = np.arange(len(faces)), np.full(len(members), UNBOUNDED)
+    distance, face, penetrated = overlap.penetrated_faces(vertices, members, all_faces, unbounded)
+    assert penetrated.all() and (share[faces[face]] < 0).all()
     np.testing.assert_allclose(distance, expected[members], atol=1.2e-4)  # the facets' depth
 
 
 def test_a_free_surface_has_no_vertex_inside_and_outside_is_not_inside():
     rest, faces, share = sausage(OPEN)
     overlap = SelfOverlap(rest, faces)
-    everyone = np.arange(len(rest))
-    assert not len(overlap.inside(rest, everyone))
+    all_faces = np.arange(len(rest))
+    assert not len(overlap.inside(rest, all_faces))
     shut = sausage(SHUT)[0]
-    inside = overlap.inside(shut, everyone)
+    inside = overlap.inside(shut, all_faces)
     assert (np.abs(share[inside]) > 0.85).all()
-    distance, _, _ = overlap.ways_out(shut, inside[:0], np.arange(len(faces)), np.zeros(0))
+    distance, _, _ = overlap.penetrated_faces(shut, inside[:0], np.arange(len(faces)), np.zeros(0))
     assert distance.shape == (0,)
 
 
@@ -54,18 +55,18 @@ def test_only_the_faces_asked_for_and_only_within_reach():
     overlap, vertices = SelfOverlap(rest, faces), sausage(SHUT)[0]
     members = np.flatnonzero(in_first_end(vertices, share) > 4e-3)
     own = np.flatnonzero((share[faces] > 0).all(1))
-    distance, face, sure = overlap.ways_out(vertices, members, own, np.full(len(members), 1e-4))
-    assert np.isin(face, own).all() and not sure.any()
-    _, none, _ = overlap.ways_out(vertices, members, own[:0], np.full(len(members), UNBOUNDED))
+    distance, face, penetrated = overlap.penetrated_faces(vertices, members, own, np.full(len(members), 1e-4))
+    assert np.isin(face, own).all() and not penetrated.any()
+    _, none, _ = overlap.penetrated_faces(vertices, members, own[:0], np.full(len(members), UNBOUNDED))
     assert (none == -1).all()
 
 
 def test_where_the_rest_shape_overlaps_itself_small_motions_change_little():
     """No way out can be told there; but the depth at rest and a moment later must be one measure."""
     rest, faces, _ = sausage(SHUT)
-    overlap, everyone = SelfOverlap(rest, faces), np.arange(len(faces))
+    overlap, all_faces = SelfOverlap(rest, faces), np.arange(len(faces))
     later = sausage(SHUT + 0.003)[0]  # 0.09 mm at either end
     members = np.intersect1d(*(overlap.inside(v, np.arange(len(rest))) for v in (rest, later)))
     unbounded = np.full(len(members), UNBOUNDED)
-    before, after = (overlap.ways_out(v, members, everyone, unbounded)[0] for v in (rest, later))
+    before, after = (overlap.penetrated_faces(v, members, all_faces, unbounded)[0] for v in (rest, later))
     assert len(members) > 100 and np.abs(after - before).max() < 3e-4
