@@ -1,4 +1,4 @@
-"""Processes beside this one: their share of the cores, and what is left when the caller goes."""
+"""Process pools: cores per worker, and termination with the parent."""
 
 import os
 import signal
@@ -12,7 +12,7 @@ from tests.workflows.farm.harness import ROOT, alive, interruptible
 from workflows.processes import run_parallel, shared_cores, terminated_with_us
 
 
-def test_processes_are_warm_and_share_the_cores(monkeypatch):
+def test_workers_are_reused_and_share_the_cores(monkeypatch):
     monkeypatch.delenv("OMP_NUM_THREADS", raising=False)
     monkeypatch.setattr(os, "cpu_count", lambda: 8)
     for jobs, threads in ((4, "2"), (1, None)):
@@ -25,7 +25,7 @@ def test_processes_are_warm_and_share_the_cores(monkeypatch):
         assert len({pool.schedule(os.getpid).result() for _ in range(3)}) == 1
 
 
-def test_one_death_does_not_stop_the_others():
+def test_a_dead_worker_does_not_stop_the_others():
     calls = {"ann": {"key": "NO_SUCH", "default": ""}, "bob": {"key": "NO_SUCH", "default": "tired"}}
     assert dict(run_parallel(os.getenv, calls, jobs=2)) == {"ann": "", "bob": "tired"}
     assert dict(run_parallel(os._exit, {"cleo": {"status": 3}}, jobs=1)) == {"cleo": "its process died"}
@@ -42,7 +42,7 @@ if __name__ == "__main__":
 
 
 @pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGINT])
-def test_they_end_with_a_parent_that_is_killed_or_interrupted(tmp_path, number):
+def test_workers_end_with_a_killed_or_interrupted_parent(tmp_path, number):
     (tmp_path / "sleeper.py").write_text(SLEEPER)
     environment = {**os.environ, "PYTHONPATH": str(ROOT)}
     command = [sys.executable, str(tmp_path / "sleeper.py")]
@@ -63,4 +63,4 @@ def test_they_end_with_a_parent_that_is_killed_or_interrupted(tmp_path, number):
         if not alive(child):
             return
         time.sleep(0.1)
-    raise AssertionError("the child is still there")
+    raise AssertionError("the child still runs")

@@ -53,7 +53,7 @@ def test_input_errors_are_printed_without_a_traceback(
         ("--target nose/nose-hump-incr=nan", "weight is out of range"),
     ],
 )
-def test_bad_studios_are_refused_before_any_work(
+def test_bad_studio_settings_are_refused_before_any_work(
     flags: str, what: str, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "empty"))
@@ -64,7 +64,7 @@ def test_bad_studios_are_refused_before_any_work(
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_synthetic_capture_replaces_nothing(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_synthetic_capture_does_not_overwrite_a_folder(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "mine").write_text("mine")
     assert main(["capture", "synth", str(tmp_path)]) == 2
     assert "exists already" in capsys.readouterr().err
@@ -79,10 +79,10 @@ def test_a_seed_is_a_number(tmp_path: Path, capsys: pytest.CaptureFixture[str]) 
 
 
 def test_model_info_prints_and_draws(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    picture = tmp_path / "model.png"
-    assert main(["model", "info", str(TINY_MODEL), "--out", str(picture)]) == 0
+    image = tmp_path / "model.png"
+    assert main(["model", "info", str(TINY_MODEL), "--out", str(image)]) == 0
     assert "vertices" in capsys.readouterr().out
-    assert picture.read_bytes().startswith(b"\x89PNG")
+    assert image.read_bytes().startswith(b"\x89PNG")
 
 
 @pytest.mark.parametrize(
@@ -165,7 +165,7 @@ def test_unknown_presets_stop_with_code_2(tmp_path: Path, capsys: pytest.Capture
 
 
 @pytest.mark.parametrize("status, code", [("converged", 0), ("stopped", 0), ("failed", 1)])
-def test_register_hands_over_every_argument(
+def test_register_passes_every_argument(
     status: str, code: int, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """The library's own work is tested in tests/registration/register; here only arguments, output and exit code."""
@@ -209,7 +209,7 @@ def test_register_hands_over_every_argument(
         (("error", "skipped"), 2),
     ],
 )
-def test_subject_hands_over_every_argument(
+def test_subject_passes_every_argument(
     statuses: tuple, code: int, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """The loop itself is tested in test_subject.py."""

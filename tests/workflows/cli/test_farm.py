@@ -140,7 +140,7 @@ def _done(url: str) -> bool:
 
 
 def _processes_of(word: str) -> list[int]:
-    """Processes whose command line names a folder."""
+    """Return the ids of processes whose command line contains a word."""
     pids = []
     for path in Path("/proc").glob("[0-9]*"):
         try:
@@ -151,7 +151,7 @@ def _processes_of(word: str) -> list[int]:
     return [pid for pid in pids if alive(pid)]
 
 
-def test_a_batch_that_ended_waits_for_added_captures(captures: Path) -> None:
+def test_captures_are_added_to_a_batch_that_ended(captures: Path) -> None:
     main(["migrate", "--folder", str(captures)])
     url = default_url(captures)
     settings = {"model": str(synthetic.MODEL), "out": str(captures.parent / "out")}

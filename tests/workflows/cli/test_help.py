@@ -1,4 +1,4 @@
-"""Help and the table of commands: complete, explained where shown, and fast."""
+"""Help texts and the table of commands are complete and import nothing heavy."""
 
 import importlib
 import inspect
@@ -73,7 +73,7 @@ def test_summaries_fit_into_the_overview() -> None:
 
 
 @pytest.mark.parametrize("words", ["registr", "capture synht", "capture"])
-def test_unknown_commands_show_what_there_is(words: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_unknown_commands_list_the_available_commands(words: str, capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as stop:
         main(words.split())
     error = capsys.readouterr().err
@@ -81,7 +81,7 @@ def test_unknown_commands_show_what_there_is(words: str, capsys: pytest.CaptureF
     assert "capture synth" in error and ("similar: " in error) == (words != "capture")
 
 
-def test_recipes_and_queues_in_the_help_are_those_that_exist(
+def test_the_help_lists_the_existing_recipes_and_queues(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("COLUMNS", "300")
@@ -121,7 +121,7 @@ def test_every_register_option_is_offered_by_all_commands_that_register(
         assert ("--landmarks" in text) == (command in ("register", "subject"))  # jobs cannot name files
 
 
-def test_options_of_jobs_become_the_librarys() -> None:
+def test_job_options_convert_to_register_options() -> None:
     options = JobOptions(recipe="studio", views=7, seed=3, deterministic=True, variant="cuda").register_options()
     assert type(options) is RegisterOptions  # input hashes contain the type's name
     assert options == RegisterOptions(recipe="studio", views=7, seed=3, deterministic=True, variant="cuda")

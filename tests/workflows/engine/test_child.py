@@ -16,30 +16,30 @@ STEPS = "tests.workflows.farm.steps"
 
 
 @pytest.fixture(scope="module")
-def slot() -> Iterator[StepProcess]:
-    made = StepProcess(modules=(STEPS,))
-    made.warm()
-    yield made
-    made.kill()
+def process() -> Iterator[StepProcess]:
+    process = StepProcess(modules=(STEPS,))
+    process.warm()
+    yield process
+    process.kill()
 
 
-def run(slot: StepProcess, name: str, log: Path, timeout_s: float = 30.0, **arguments: object) -> dict:
-    return asyncio.run(slot.run(f"{STEPS}:{name}", arguments, log=log, timeout_s=timeout_s))
+def run(process: StepProcess, name: str, log: Path, timeout_s: float = 30.0, **arguments: object) -> dict:
+    return asyncio.run(process.run(f"{STEPS}:{name}", arguments, log=log, timeout_s=timeout_s))
 
 
-def test_everything_a_step_prints_lands_in_its_log(slot: StepProcess, tmp_path: Path) -> None:
+def test_the_output_of_a_step_is_written_to_its_log(process: StepProcess, tmp_path: Path) -> None:
     log = tmp_path / "a" / "job.log"
-    outcome = run(slot, "talk", log, text="from a note")
+    outcome = run(process, "talk", log, text="from a note")
     assert (outcome["status"], outcome["result"]) == ("done", "from a note")
     assert set(log.read_text().split("\n")) >= {"from a note", "from Python", "from C"}
     assert '"done": 1' in log.with_suffix(".jsonl").read_text()
 
 
-def test_one_warm_process_serves_all_steps(slot: StepProcess, tmp_path: Path) -> None:
-    before = slot.warm()
-    run(slot, "talk", tmp_path / "log", text="")
-    run(slot, "fail", tmp_path / "log")
-    assert slot.warm() == before
+def test_one_warm_process_serves_all_steps(process: StepProcess, tmp_path: Path) -> None:
+    before = process.warm()
+    run(process, "talk", tmp_path / "log", text="")
+    run(process, "fail", tmp_path / "log")
+    assert process.warm() == before
 
 
 @pytest.mark.parametrize(
@@ -55,34 +55,32 @@ def test_one_warm_process_serves_all_steps(slot: StepProcess, tmp_path: Path) ->
         ("crash", {}, "died", "was killed by SIGSEGV"),
     ],
 )
-def test_what_goes_wrong_is_told_apart(
-    slot: StepProcess, tmp_path: Path, name: str, arguments: dict, status: str, reason: str
+def test_each_failure_has_its_own_status_and_reason(
+    process: StepProcess, tmp_path: Path, name: str, arguments: dict, status: str, reason: str
 ) -> None:
-    outcome = run(slot, name, tmp_path / "log", **arguments)
+    outcome = run(process, name, tmp_path / "log", **arguments)
     assert outcome["status"] == status
     assert reason in outcome["reason"]
     assert "secret" not in (tmp_path / "log").read_text() + outcome["reason"]
 
 
-def test_a_step_beyond_its_time_limit_is_killed_though_it_holds_the_interpreter(
-    slot: StepProcess, tmp_path: Path
-) -> None:
+def test_a_step_that_holds_the_interpreter_lock_is_killed_at_its_timeout(process: StepProcess, tmp_path: Path) -> None:
     trace = tmp_path / "trace"
-    pid = slot.warm()
-    begun = time.monotonic()
-    outcome = run(slot, "hold_gil", tmp_path / "log", timeout_s=0.5, seconds=60, trace=str(trace))
-    assert outcome["status"] == "timed out" and time.monotonic() - begun < 30
+    pid = process.warm()
+    start = time.monotonic()
+    outcome = run(process, "hold_gil", tmp_path / "log", timeout_s=0.5, seconds=60, trace=str(trace))
+    assert outcome["status"] == "timed out" and time.monotonic() - start < 30
     assert not alive(pid)
     assert trace.read_text() == "begin gil 0\n"
     assert "timed out" in (tmp_path / "log").read_text()
 
 
-def test_cancelling_kills_the_child(slot: StepProcess, tmp_path: Path) -> None:
-    pid = slot.warm()
+def test_cancelling_kills_the_child(process: StepProcess, tmp_path: Path) -> None:
+    pid = process.warm()
 
     async def cancelled() -> None:
         arguments = {"store": str(tmp_path), "key": "k", "seconds": 60.0}
-        task = asyncio.create_task(slot.run(f"{STEPS}:work", arguments, log=tmp_path / "log", timeout_s=90))
+        task = asyncio.create_task(process.run(f"{STEPS}:work", arguments, log=tmp_path / "log", timeout_s=90))
         while not list(tmp_path.glob("k/attempt-*")):
             await asyncio.sleep(0.05)
         task.cancel()
@@ -95,12 +93,12 @@ def test_cancelling_kills_the_child(slot: StepProcess, tmp_path: Path) -> None:
     assert not alive(pid)
 
 
-def test_a_child_that_dies_between_jobs_is_replaced(slot: StepProcess, tmp_path: Path) -> None:
-    pid = slot.warm()
+def test_a_child_that_dies_between_jobs_is_replaced(process: StepProcess, tmp_path: Path) -> None:
+    pid = process.warm()
     os.kill(pid, signal.SIGKILL)
     time.sleep(0.5)
-    assert run(slot, "talk", tmp_path / "log", text="again")["status"] == "done"
-    assert slot.warm() != pid
+    assert run(process, "talk", tmp_path / "log", text="again")["status"] == "done"
+    assert process.warm() != pid
 
 
 def test_a_child_dies_with_its_parent(tmp_path: Path) -> None:
@@ -108,8 +106,8 @@ def test_a_child_dies_with_its_parent(tmp_path: Path) -> None:
 import time
 from workflows.engine.child import StepProcess
 if __name__ == "__main__":
-    slot = StepProcess()
-    print(slot.warm(), flush=True)
+    process = StepProcess()
+    print(process.warm(), flush=True)
     time.sleep(60)
 """
     script = tmp_path / "parent.py"

@@ -1,17 +1,17 @@
-"""Parameters of queries, which go to the drivers without SQLAlchemy."""
+"""Binding of query parameters for the drivers, without SQLAlchemy."""
 
 from pathlib import Path
 
 from workflows.engine.database import _bind, default_url, prepare, reading
 
 
-def test_lists_and_names_that_begin_alike_are_bound_once(tmp_path: Path) -> None:
+def test_lists_and_names_with_a_common_prefix_are_bound_once(tmp_path: Path) -> None:
     url = default_url(tmp_path)
     prepare(url)
     query = "SELECT a.column1 FROM (VALUES ('x'), ('y'), ('z')) a WHERE a.column1 IN :run AND a.column1 <> :runs"
-    with reading(url) as ask:
-        assert ask(query, {"run": ["x", "y"], "runs": "y"}) == [("x",)]
-        assert ask("SELECT 1 WHERE 1 IN :ids", {"ids": []}) == []
+    with reading(url) as select:
+        assert select(query, {"run": ["x", "y"], "runs": "y"}) == [("x",)]
+        assert select("SELECT 1 WHERE 1 IN :ids", {"ids": []}) == []
 
 
 def test_placeholders_of_postgresql_leave_casts_alone() -> None:

@@ -1,4 +1,4 @@
-"""What comes out of a queue, or out of a store, that others can write to: refused with a clear error."""
+"""Jobs, locations and ids from a queue or a store that others can write to are checked."""
 
 import json
 from pathlib import Path
@@ -14,8 +14,8 @@ STEPS = {"register": Step(function="m:f", path_arguments=("capture", "out"))}
 
 def test_a_job_within_the_roots_is_accepted(tmp_path: Path) -> None:
     roots = resolve_roots((tmp_path, "s3://bucket/runs"))
-    for place in (str(tmp_path / "a"), f"file://{tmp_path}/a", "s3://bucket/runs/a", str(tmp_path)):
-        arguments = {"capture": place, "seed": 3}
+    for location in (str(tmp_path / "a"), f"file://{tmp_path}/a", "s3://bucket/runs/a", str(tmp_path)):
+        arguments = {"capture": location, "seed": 3}
         step, got = validate_arguments({"step": "register", "arguments": arguments}, STEPS, roots)
         assert (step.function, got) == ("m:f", arguments)
 
@@ -33,14 +33,14 @@ def test_a_job_within_the_roots_is_accepted(tmp_path: Path) -> None:
         ({"step": "register", "arguments": {"note": "x" * MAX_BYTES}}, f"at most {MAX_BYTES} bytes"),
     ],
 )
-def test_a_job_of_another_form_is_refused(spec: object, expected: str) -> None:
+def test_a_malformed_job_is_refused(spec: object, expected: str) -> None:
     with pytest.raises(InputError) as refused:
         validate_arguments(spec, STEPS, ("/",))
     assert expected in refused.value.expected
 
 
 @pytest.mark.parametrize(
-    "place",
+    "location",
     [
         "/etc/passwd",
         "{root}/../other/x",
@@ -59,20 +59,20 @@ def test_a_job_of_another_form_is_refused(spec: object, expected: str) -> None:
         "{root}/link/x",
     ],
 )
-def test_a_foreign_place_is_refused(tmp_path: Path, place: object) -> None:
+def test_a_location_outside_the_roots_is_refused(tmp_path: Path, location: object) -> None:
     root = tmp_path / "root"
     root.mkdir()
     (tmp_path / "other").mkdir()
     (root / "link").symlink_to(tmp_path / "other")
-    place = place.format(root=root) if isinstance(place, str) else place
+    location = location.format(root=root) if isinstance(location, str) else location
     with pytest.raises(InputError) as refused:
         validate_arguments(
-            {"step": "register", "arguments": {"capture": place}}, STEPS, resolve_roots((root, "s3://bucket/runs"))
+            {"step": "register", "arguments": {"capture": location}}, STEPS, resolve_roots((root, "s3://bucket/runs"))
         )
     assert "secret" not in str(refused.value).replace("secrets", "")
 
 
-def test_without_roots_no_place_is_accepted(tmp_path: Path) -> None:
+def test_without_roots_no_location_is_accepted(tmp_path: Path) -> None:
     with pytest.raises(InputError):
         check_location(str(tmp_path), (), "capture")
 
@@ -80,16 +80,16 @@ def test_without_roots_no_place_is_accepted(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     "identity", ["", "a/../b", "../a", "/a", "a/", "a//b", ".a", "a b", "a\n", "a/" * 9 + "a", "ä"]
 )
-def test_ids_that_would_be_no_paths_are_refused(identity: str) -> None:
+def test_ids_that_are_no_relative_paths_are_refused(identity: str) -> None:
     with pytest.raises(InputError):
         check_id(identity)
 
 
-def test_ids_of_the_pattern_are_accepted() -> None:
+def test_a_valid_id_is_accepted() -> None:
     assert check_id("run-1/it00/s0007/e03") == "run-1/it00/s0007/e03"
 
 
-def test_passwords_do_not_show() -> None:
+def test_passwords_are_redacted() -> None:
     text = json.dumps(
         {"a": "postgresql+psycopg://me:pass@h/db", "b": "x postgresql://me:word@h/db?x=1", "c": "s3://b/k"}
     )

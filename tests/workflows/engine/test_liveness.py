@@ -44,7 +44,7 @@ def test_a_lock_is_held_while_its_process_lives_even_frozen(tmp_path: Path) -> N
     assert locks.free(["w"]) == {"w"}
 
 
-def test_the_dead_are_told_when_patience_ends(tmp_path: Path) -> None:
+def test_a_dead_executor_is_reported_after_the_release_timeout(tmp_path: Path) -> None:
     liveness = Liveness(default_url(tmp_path), LivenessTimeouts(release_s=15.0, uptime_s=0.0))
     assert liveness.join(["me"]) == "me"
     assert liveness.dead(["w", "me"], now=100.0) == []
@@ -52,7 +52,7 @@ def test_the_dead_are_told_when_patience_ends(tmp_path: Path) -> None:
     assert liveness.dead(["w", "me"], now=115.0) == ["w"]
 
 
-def test_who_was_back_in_between_counts_anew(tmp_path: Path) -> None:
+def test_an_executor_that_came_back_restarts_the_timeout(tmp_path: Path) -> None:
     url = default_url(tmp_path)
     liveness = Liveness(url, LivenessTimeouts(release_s=15.0, uptime_s=0.0))
     assert liveness.dead(["w"], now=100.0) == []
@@ -64,7 +64,7 @@ def test_who_was_back_in_between_counts_anew(tmp_path: Path) -> None:
     assert liveness.dead(["w"], now=130.0) == ["w"]
 
 
-def test_a_server_that_has_just_started_is_waited_for(tmp_path: Path) -> None:
+def test_no_executor_is_dead_before_the_minimum_uptime_of_the_server(tmp_path: Path) -> None:
     liveness = Liveness(default_url(tmp_path), LivenessTimeouts(release_s=0.0, uptime_s=60.0))
     liveness._locks.uptime_s = lambda: 59.0  # type: ignore[method-assign]
     assert liveness.dead(["w"], now=1.0) == []
@@ -75,15 +75,15 @@ def test_a_server_that_has_just_started_is_waited_for(tmp_path: Path) -> None:
 def test_sqlite_gets_its_write_ahead_log_and_readers_cannot_write(tmp_path: Path) -> None:
     url = default_url(tmp_path / "new")
     prepare(url)
-    assert (tmp_path / "new" / "queue.sqlite").read_bytes()[18:20] == b"\x02\x02"  # the header's mark of WAL
-    with reading(url) as ask, pytest.raises(sqlite3.OperationalError, match="readonly"):
-        ask("CREATE TABLE x (y)", {})
+    assert (tmp_path / "new" / "queue.sqlite").read_bytes()[18:20] == b"\x02\x02"  # the header's WAL flag
+    with reading(url) as select, pytest.raises(sqlite3.OperationalError, match="readonly"):
+        select("CREATE TABLE x (y)", {})
 
 
 @pytest.mark.parametrize(
     "url", ["", "queue.sqlite", "mysql://h/d", "sqlite://", "sqlite:///:memory:", "postgresql://h"]
 )
-def test_urls_that_are_none_of_ours_are_refused(url: str) -> None:
+def test_unsupported_urls_are_refused(url: str) -> None:
     with pytest.raises(InputError):
         checked_url(url)
 
@@ -94,7 +94,7 @@ def test_a_network_disk_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPat
         checked_url(default_url(tmp_path))
 
 
-def test_a_server_that_does_not_answer_is_told_without_its_password() -> None:
+def test_the_error_for_an_unreachable_server_hides_the_password() -> None:
     url = "postgresql://me:secret@127.0.0.1:9/queue"
     with pytest.raises(InputError) as refused:
         prepare(checked_url(url))

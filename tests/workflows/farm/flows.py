@@ -1,4 +1,4 @@
-"""Flows of the test steps: the shape of the real ones, nothing of their weight."""
+"""Flows of test steps with the structure of the real flows."""
 
 from typing import Any
 
@@ -8,7 +8,7 @@ from workflows.farm.flows import batch
 
 
 async def graph(scope: FlowScope, *, subjects: int, expressions: int, folder: str, seconds: float) -> dict[str, Any]:
-    """Subjects of a neutral, expressions and a stabilization each, then a rebuild."""
+    """Run a flow per subject (neutral, expressions, stabilization), then a rebuild."""
     flows = [
         FlowJob(
             id=f"{scope.id}/s{number:04d}",

@@ -1,4 +1,4 @@
-"""Farms for tests: processes that are started, killed and frozen, and the queue that they share."""
+"""Farms for tests: processes to start, kill and freeze, and their shared queue."""
 
 import json
 import signal
@@ -20,7 +20,7 @@ QUICK = {"poll_s": 0.3, "release_s": 1.0, "uptime_s": 0.0}
 
 
 def interruptible() -> None:
-    """In a child, before it starts: a shell makes what it runs in the background, tests too, deaf to Ctrl-C."""
+    """Restore SIGINT in a child before it starts; a shell ignores it in background processes, tests too."""
     signal.signal(signal.SIGINT, signal.SIG_DFL)
 
 
@@ -36,8 +36,8 @@ class Farm:
         self.queue, self.reader = QueueClient(url), QueueReader(url)
 
     def start(self, *names: str) -> None:
-        """Names that begin with "c" are coordinators. Returns when all of them take jobs."""
-        before = {name: self.said(name).count("takes jobs") for name in names}
+        """Start workers, and coordinators for names that begin with "c"; return when all of them take jobs."""
+        before = {name: self.output(name).count("takes jobs") for name in names}
         for name in names:
             kind = "coordinator" if name.startswith("c") else "worker"
             with (self.folder / f"{name}.out").open("ab") as out:
@@ -49,13 +49,13 @@ class Farm:
                     stderr=out,
                 )
         for name in names:
-            self.until(lambda n=name: self._started(n, before[n]) or not self.runs(n), what=f"{name} to start")
-            assert self.runs(name), self.said(name)
+            self.wait_until(lambda n=name: self._started(n, before[n]) or not self.runs(n), what=f"{name} to start")
+            assert self.runs(name), self.output(name)
 
     def _started(self, name: str, before: int) -> bool:
-        return self.said(name).count("takes jobs") > before
+        return self.output(name).count("takes jobs") > before
 
-    def said(self, name: str) -> str:
+    def output(self, name: str) -> str:
         file = self.folder / f"{name}.out"
         return file.read_text() if file.exists() else ""
 
@@ -63,7 +63,7 @@ class Farm:
         return self.processes[name].poll() is None
 
     def kill(self, name: str) -> None:
-        """kill -9, and forget what it said."""
+        """Kill with SIGKILL and clear the output."""
         process = self.processes.pop(name)
         process.send_signal(signal.SIGCONT)
         process.kill()
@@ -77,22 +77,24 @@ class Farm:
         row = self.reader.rows([identity]).get(identity)
         return {"state": row.state, "result": row.result, "failure": row.failure} if row else {"state": "none"}
 
-    def ends(self, *identities: str, within_s: float = 300.0) -> None:
+    def wait_for_end(self, *identities: str, within_s: float = 300.0) -> None:
         """Wait until these jobs have ended."""
-        over = ("done", "failed", "cancelled")
-        self.until(lambda: all(self.job(i)["state"] in over for i in identities), within_s, what=f"{identities} to end")
+        final = ("done", "failed", "cancelled")
+        self.wait_until(
+            lambda: all(self.job(i)["state"] in final for i in identities), within_s, what=f"{identities} to end"
+        )
 
-    def until(self, condition: Callable[[], bool], within_s: float = 300.0, what: str = "it") -> float:
-        begun = time.monotonic()
+    def wait_until(self, condition: Callable[[], bool], within_s: float = 300.0, what: str = "it") -> float:
+        start = time.monotonic()
         while not condition():
-            if time.monotonic() - begun > within_s:
-                said = "\n".join(f"--- {n}\n{self.said(n)[-3000:]}" for n in self.processes)
-                raise AssertionError(f"waited {within_s} s for {what}\n{self.reader.metrics()}\n{said}")
+            if time.monotonic() - start > within_s:
+                outputs = "\n".join(f"--- {n}\n{self.output(n)[-3000:]}" for n in self.processes)
+                raise AssertionError(f"waited {within_s} s for {what}\n{self.reader.metrics()}\n{outputs}")
             time.sleep(0.05)
-        return time.monotonic() - begun
+        return time.monotonic() - start
 
     def lines(self, begin: str = "") -> Counter[str]:
-        """What the steps traced, without process ids."""
+        """Count the lines of the trace that begin with `begin`, without process ids."""
         text = self.trace.read_text() if self.trace.exists() else ""
         return Counter(line.rpartition(" ")[0] for line in text.splitlines() if line.startswith(begin))
 
@@ -105,16 +107,16 @@ class Farm:
 
 
 @contextmanager
-def farm(folder: Path, url: str | None = None, timeouts: dict[str, float] | None = None) -> Iterator[Farm]:
-    made = Farm(folder, url or f"sqlite:///{folder / 'queue.sqlite'}", timeouts)
+def open_farm(folder: Path, url: str | None = None, timeouts: dict[str, float] | None = None) -> Iterator[Farm]:
+    farm = Farm(folder, url or f"sqlite:///{folder / 'queue.sqlite'}", timeouts)
     try:
-        yield made
+        yield farm
     finally:
-        made.close()
+        farm.close()
 
 
 def alive(pid: int) -> bool:
-    """Whether a process runs that is no zombie."""
+    """Return whether the process runs and is not a zombie."""
     try:
         return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
     except OSError:
@@ -122,8 +124,8 @@ def alive(pid: int) -> bool:
 
 
 def children_of(pid: int) -> list[int]:
-    """Process ids of the direct children."""
-    found = []
+    """Return the process ids of the direct children."""
+    pids = []
     for task in Path(f"/proc/{pid}/task").iterdir():
-        found += [int(child) for child in (task / "children").read_text().split()]
-    return found
+        pids += [int(child) for child in (task / "children").read_text().split()]
+    return pids

@@ -1,4 +1,4 @@
-"""A worker or a coordinator of the test steps and flows, as a process of its own that can be killed."""
+"""A worker or a coordinator of the test steps and flows, in a separate process that can be killed."""
 
 import json
 import sys
@@ -12,7 +12,7 @@ from workflows.engine.process import EngineProcess, serve
 
 if __name__ == "__main__":
     kind, name, url, folder, settings = sys.argv[1:]
-    told = json.loads(settings)
+    config = json.loads(settings)
     serve(
         EngineProcess(
             url=url,
@@ -22,7 +22,7 @@ if __name__ == "__main__":
             roots=(folder,),
             steps=STEPS if kind == "worker" else {},
             flows=FLOWS if kind == "coordinator" else {},
-            timeouts=LivenessTimeouts(**told["timeouts"]) if told.get("timeouts") else None,
-            back_off_s=told.get("back_off_s", 0.2),
+            timeouts=LivenessTimeouts(**config["timeouts"]) if config.get("timeouts") else None,
+            back_off_s=config.get("back_off_s", 0.2),
         )
     )

@@ -1,4 +1,4 @@
-"""Steps that do in milliseconds, or in the worst way, what real ones do."""
+"""Test steps: stand-ins for real steps that take milliseconds, and steps that fail in different ways."""
 
 import ctypes
 import os
@@ -15,7 +15,7 @@ from workflows.records.store import Store
 
 
 def work(store: str, key: str, seconds: float = 0.0, trace: str | None = None) -> dict[str, Any]:
-    """Sleep and publish an artifact; the trace gets a line when the work begins and one when it is done."""
+    """Sleep and publish an artifact; write a line to the trace at the start and at the end."""
 
     def make(folder: Path) -> dict[str, Any]:
         _trace(trace, f"begin {key} {os.getpid()}")

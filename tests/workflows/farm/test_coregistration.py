@@ -1,4 +1,4 @@
-"""A coregistration in the queue: put in once, and forgotten when it is put in anew."""
+"""A coregistration in the queue: refused while its jobs run, replaced after they have ended."""
 
 from pathlib import Path
 
@@ -18,7 +18,7 @@ from workflows.farm.plan import RoundSettings, make_plan
 from workflows.records.coregistration import PLAN
 
 
-def test_a_run_that_goes_on_stays_and_one_that_ended_is_forgotten(capture: Path, tmp_path: Path) -> None:
+def test_an_active_run_is_kept_and_an_ended_run_is_replaced(capture: Path, tmp_path: Path) -> None:
     dataset = write_people(capture, tmp_path / "dataset", 5)
     url, out = default_url(tmp_path), tmp_path / "june"
     plan = make_plan(dataset, MODEL, out, rounds=RoundSettings(components=(2,)))

@@ -1,4 +1,4 @@
-"""A job again in the foreground, with stand-ins for what takes minutes."""
+"""Repeating a job in the foreground, with stand-ins for registrations."""
 
 import urllib.request
 from pathlib import Path
@@ -33,27 +33,27 @@ def row(step: str = "register", kind: str = "job", **arguments: Any) -> JobRow:
 
 @pytest.fixture
 def calls(monkeypatch: pytest.MonkeyPatch) -> list[dict[str, Any]]:
-    made: list[dict[str, Any]] = []
+    recorded: list[dict[str, Any]] = []
 
     def register(capture: Path, model: Path, out: Path, options: RegisterOptions, **settings: Any) -> Any:
-        made.append({"capture": capture, "model": model, "out": out, "options": options, **settings})
-        return a_registration(status="failed", reason="so it is")
+        recorded.append({"capture": capture, "model": model, "out": out, "options": options, **settings})
+        return a_registration(status="failed", reason="did not converge")
 
     monkeypatch.setattr(pipeline, "register", register)
-    return made
+    return recorded
 
 
 @pytest.mark.parametrize("step", ["register", "register stored"])
-def test_a_registration_is_made_again_with_pictures_and_out_of_the_way(
+def test_a_registration_is_repeated_with_stage_images_in_another_folder(
     calls: list[dict[str, Any]], tmp_path: Path, step: str
 ) -> None:
     arguments = {"capture": "/c/e", "model": "/m.npz", "options": {"recipe": "studio", "views": 5, "seed": 3}}
-    places = {
+    locations = {
         "register": {"out": "/results/e", "neutral": "/results/n"},
         "register stored": {"store": "/s", "key": "k"},
     }
-    result = debug(row(step, **arguments, **places[step]), tmp_path / "out", NullProgress())
-    assert result.summary == "failed: so it is" and result.page is None
+    result = debug(row(step, **arguments, **locations[step]), tmp_path / "out", NullProgress())
+    assert result.summary == "failed: did not converge" and result.page is None
     (call,) = calls
     assert call["capture"] == Path("/c/e") and call["model"] == Path("/m.npz")
     assert call["out"] == tmp_path / "out" / "registration" and call["pictures"] == tmp_path / "out" / "stages"
@@ -61,11 +61,11 @@ def test_a_registration_is_made_again_with_pictures_and_out_of_the_way(
     assert call["options"] == RegisterOptions(recipe="studio", views=5, seed=3)
 
 
-def test_a_capture_from_a_url_is_kept_for_looking(
+def test_a_capture_from_a_url_is_kept_for_inspection(
     calls: list[dict[str, Any]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("workflows.farm.debug.fetch_folder", lambda place, folder: folder.mkdir(parents=True))
-    monkeypatch.setattr("workflows.farm.debug.fetch_model", lambda place: Path("/cache/m.npz"))
+    monkeypatch.setattr("workflows.farm.debug.fetch_folder", lambda url, folder: folder.mkdir(parents=True))
+    monkeypatch.setattr("workflows.farm.debug.fetch_model", lambda url: Path("/cache/m.npz"))
     stored = row("register stored", capture="s3://b/c/e", model="s3://b/m.npz", store="s3://b/s", key="k")
     debug(stored, tmp_path / "out", NullProgress())
     assert calls[0]["capture"] == tmp_path / "out" / "inputs" / "e" and calls[0]["capture"].is_dir()
@@ -80,7 +80,7 @@ def test_a_registration_can_be_watched(calls: list[dict[str, Any]], tmp_path: Pa
     done.page.close()
 
 
-def test_a_page_ends_with_the_registration_that_was_refused(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_the_page_is_closed_when_the_registration_is_refused(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     def refuse(*_: Any, **__: Any) -> None:
         raise InputError("no", where="here", expected="a", got="b", fix="c")
 
@@ -97,14 +97,14 @@ def test_a_page_ends_with_the_registration_that_was_refused(monkeypatch: pytest.
 def test_jobs_that_cannot_be_debugged_are_refused(calls: list[dict[str, Any]], tmp_path: Path) -> None:
     (tmp_path / "full").mkdir()
     (tmp_path / "full" / "x").write_text("mine")
-    for wrong, out in (
+    for bad_row, out in (
         (row(kind="flow"), tmp_path / "out"),
         (row(), tmp_path / "full"),
         (row(step="os:system"), tmp_path / "out"),
         (row(capture="http://x/y"), tmp_path / "out"),
     ):
         with pytest.raises(InputError):
-            debug(wrong, out, NullProgress())
+            debug(bad_row, out, NullProgress())
     with pytest.raises(InputError, match="--view cannot show"):
         debug(row(step="stabilize", run="/r", model="/m.npz", out="/o"), tmp_path / "out", NullProgress(), port=0)
     assert not calls and not (tmp_path / "out").exists()

@@ -1,4 +1,4 @@
-"""The order of jobs, which are done at once by what a table says of them."""
+"""The order of jobs in flows; a stand-in returns fixed results for the steps."""
 
 import asyncio
 from collections.abc import Callable, Sequence
@@ -18,8 +18,6 @@ from workflows.records.coregistration import CoregistrationPlan
 from workflows.records.dataset import Split
 from workflows.records.step_results import BuildResult, EvaluateResult
 
-Told = dict[str, Any] | Exception
-
 
 def failed(reason: str) -> JobFailed:
     return JobFailed({"status": "failed", "reason": reason})
@@ -37,7 +35,7 @@ def run_subject(step: Callable[[Job], Any]) -> tuple[dict[str, Any], list[Job]]:
     return asyncio.run(subject(scope, **arguments)), scope.log  # type: ignore[arg-type]
 
 
-def test_a_subject_is_the_neutral_then_expressions_then_the_record() -> None:
+def test_a_subject_registers_its_neutral_then_expressions_then_collects() -> None:
     result, log = run_subject(lambda job: {})
     assert result == {"usable": 3, "failed": 0}
     assert [(j.step, j.priority) for j in log] == [("register", 5), ("register", 10), ("register", 10), ("collect", 3)]
@@ -48,7 +46,7 @@ def test_a_subject_is_the_neutral_then_expressions_then_the_record() -> None:
     assert all(job.arguments["options"] == {"recipe": "draft", "seed": 1, "variant": "cuda"} for job in log)
 
 
-def test_an_expression_that_fails_takes_no_other_along() -> None:
+def test_a_failed_expression_does_not_stop_the_others() -> None:
     def step(job: Job) -> dict[str, Any]:
         if job.id.endswith("e001"):
             raise failed("broken")
@@ -72,7 +70,7 @@ def test_without_a_neutral_nothing_else_is_registered() -> None:
 
 
 class Rounds:
-    """Answers of the steps of a coregistration; `proceed` says after which rounds another one follows."""
+    """Results of the steps of a coregistration; `proceed` says for each round whether another round follows."""
 
     def __init__(self, proceed: Sequence[bool], broken: Sequence[str] = ()) -> None:
         self.proceed, self.broken = list(proceed), broken
@@ -123,13 +121,13 @@ def run_loop(plan: Path, rounds: Rounds) -> tuple[dict[str, Any], list[Job]]:
     return asyncio.run(coregister(scope, plan=str(plan))), scope.log  # type: ignore[arg-type]
 
 
-def test_the_loop_goes_round_with_the_model_that_it_built_until_told(plan: Path) -> None:
+def test_each_round_uses_the_previous_model_until_the_verdict_stops(plan: Path) -> None:
     result, log = run_loop(plan, Rounds([True, False]))
     assert result == {"rounds": 2, "model": "/o/it01/model/gnm_head.npz", "reason": "no gain"}
     steps = [job.step for job in log if job.step not in ("register", "collect")]
     assert steps == ["hold out", *["stabilize", "build", "evaluate", "end round"] * 2]
     registered = [job for job in log if job.step == "register"]
-    assert len(registered) == 2 + 2 * 8  # the one held out without a truth, then four subjects twice
+    assert len(registered) == 2 + 2 * 8  # the held-out subject without a ground truth, then four subjects twice
     models = {job.id.split("/")[1]: job.arguments["model"] for job in registered}
     assert models == {"held": "/m0", "it00": "/m0", "it01": "/o/it00/model/gnm_head.npz"}
     assert log[-2].arguments["models"]["model 2"] == "/o/it01/model/gnm_head.npz"
@@ -140,17 +138,17 @@ def test_too_many_failures_park_the_run_before_a_model_is_built(plan: Path) -> N
         run_loop(plan, Rounds([True], broken=("it00/s00001/neutral",)))
 
 
-def test_few_failures_do_not(plan: Path) -> None:
+def test_few_failures_do_not_park_the_run(plan: Path) -> None:
     result, _ = run_loop(plan, Rounds([False], broken=("it00/s00001/e001",)))
     assert result["rounds"] == 1
 
 
-def test_a_step_that_fails_parks_the_run_and_says_which(plan: Path) -> None:
+def test_a_failed_step_parks_the_run_and_is_named(plan: Path) -> None:
     with pytest.raises(JobFailed, match="parked: it01/build: failed: broken"):
         run_loop(plan, Rounds([True, True], broken=("it01/build",)))
 
 
-def test_other_arguments_make_another_job(plan: Path) -> None:
+def test_different_arguments_give_a_different_job_id(plan: Path) -> None:
     _, first = run_loop(plan, Rounds([False]))
     _, second = run_loop(plan, Rounds([False], broken=("it00/s00001/e001",)))
     ids = [{job.id for job in log if "/collect" in job.id} for log in (first, second)]

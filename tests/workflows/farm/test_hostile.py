@@ -1,6 +1,6 @@
-"""Captures, models, stores and jobs made to do harm: each is refused with a clear error, and the worker's child lives.
+"""Malicious captures, models, stores and jobs: each is refused with a clear error, and the child process survives.
 
-Jobs go the way that they go in a worker: checked against the table of steps and the roots, then to the child.
+As in a worker, jobs are checked against the table of steps and the roots, then sent to the child process.
 """
 
 import asyncio
@@ -32,7 +32,7 @@ MODEL = FIXTURES / "tiny_gnm.npz"
 
 
 class Trap:
-    """Unpickling one would leave a file."""
+    """Unpickling an instance creates a file."""
 
     def __init__(self, file: Path) -> None:
         self.file = file
@@ -42,11 +42,11 @@ class Trap:
 
 
 @pytest.fixture(scope="module")
-def slot() -> Iterator[StepProcess]:
-    made = StepProcess(modules=("workflows.steps.register",))
-    made.warm()
-    yield made
-    made.kill()
+def process() -> Iterator[StepProcess]:
+    process = StepProcess(modules=("workflows.steps.register",))
+    process.warm()
+    yield process
+    process.kill()
 
 
 @pytest.fixture(scope="module")
@@ -56,12 +56,12 @@ def good(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def root(good: Path, tmp_path: Path) -> Path:
-    """What the worker may read and write: a capture and a model. A secret lies beside it."""
+    """A root folder with a capture and a model; a secret file is outside of it."""
     (tmp_path / "secret.txt").write_text("secret")
-    place = tmp_path / "root"
-    shutil.copytree(good, place / "capture")
-    shutil.copy(MODEL, place / "model.npz")
-    return place
+    root = tmp_path / "root"
+    shutil.copytree(good, root / "capture")
+    shutil.copy(MODEL, root / "model.npz")
+    return root
 
 
 def job(root: Path, **changed: Any) -> dict[str, Any]:
@@ -143,7 +143,7 @@ def endless_toml(root: Path) -> None:
     os.symlink("/dev/zero", root / "capture" / "capture.toml")
 
 
-SPOILS: dict[str, tuple[Callable[[Path], None], str]] = {
+ATTACKS: dict[str, tuple[Callable[[Path], None], str]] = {
     "an image that is a link out": (link_image, "link leads out"),
     "a scan that is a link out": (link_scan, "link leads out"),
     "a folder that is a link out": (link_folder, "link leads out"),
@@ -159,17 +159,19 @@ SPOILS: dict[str, tuple[Callable[[Path], None], str]] = {
 }
 
 
-@pytest.mark.parametrize("name", SPOILS)
-def test_a_hostile_capture_or_model_is_refused_and_the_worker_lives(slot: StepProcess, root: Path, name: str) -> None:
-    spoil, words = SPOILS[name]
-    spoil(root)
-    pid = slot.warm()
+@pytest.mark.parametrize("name", ATTACKS)
+def test_a_malicious_capture_or_model_is_refused_and_the_child_survives(
+    process: StepProcess, root: Path, name: str
+) -> None:
+    damage, words = ATTACKS[name]
+    damage(root)
+    pid = process.warm()
     step, arguments = validate_arguments(job(root), STEPS, resolve_roots((root,)))
-    outcome = asyncio.run(slot.run(step.function, arguments, log=root.parent / "log", timeout_s=120.0))
+    outcome = asyncio.run(process.run(step.function, arguments, log=root.parent / "log", timeout_s=120.0))
     assert outcome["status"] == "bad input" and words in outcome["reason"], outcome
     assert not (root.parent / "sprung").exists()
     assert not [path for path in (root / "store").rglob("*") if path.is_file()]
-    assert slot.warm() == pid
+    assert process.warm() == pid
 
 
 @pytest.mark.parametrize(
@@ -185,7 +187,7 @@ def test_a_hostile_capture_or_model_is_refused_and_the_worker_lives(slot: StepPr
         {"capture": "x" * MAX_BYTES},
     ],
 )
-def test_a_job_with_a_foreign_place_never_reaches_the_child(root: Path, changed: dict[str, str]) -> None:
+def test_a_location_outside_the_roots_never_reaches_the_child(root: Path, changed: dict[str, str]) -> None:
     (root / "out").mkdir()
     (root / "out" / "link").symlink_to(root.parent)
     changed = {key: value.replace("{root}", str(root)) for key, value in changed.items()}
@@ -194,23 +196,23 @@ def test_a_job_with_a_foreign_place_never_reaches_the_child(root: Path, changed:
     assert "password" not in str(refused.value)
 
 
-def test_a_step_that_is_not_in_the_table_never_reaches_the_child(root: Path) -> None:
+def test_an_unknown_step_never_reaches_the_child(root: Path) -> None:
     for step in ("os:system", "workflows.steps.register:register_stored", "__import__", ""):
         with pytest.raises(InputError, match="refused"):
             validate_arguments({"step": step, "arguments": {}}, STEPS, resolve_roots((root,)))
 
 
-def test_a_key_that_leads_out_of_the_store_is_refused(tmp_path: Path) -> None:
+def test_a_key_outside_the_store_is_refused(tmp_path: Path) -> None:
     for key in ("../x", "/etc/x", "a/../../x", ".hidden", ""):
         with pytest.raises(InputError):
             Store(tmp_path / "store").produce(key, input_hash="w", make=lambda folder: {})
     assert not (tmp_path / "store").exists()
 
 
-def test_a_store_whose_manifest_lies_about_sizes_is_found_out(tmp_path: Path) -> None:
+def test_verify_reports_a_manifest_with_a_wrong_checksum(tmp_path: Path) -> None:
     store = Store(tmp_path)
-    made = store.produce("k", input_hash="w", make=lambda folder: (folder / "f").write_text("abc") and {})
+    artifact = store.produce("k", input_hash="w", make=lambda folder: (folder / "f").write_text("abc") and {})
     value = json.loads((tmp_path / "k" / MANIFEST).read_text())
     value["files"]["f"]["sha256"] = "0" * 64
     (tmp_path / "k" / MANIFEST).write_text(json.dumps(value))
-    assert store.verify().unreadable and made.files["f"].bytes == 3
+    assert store.verify().unreadable and artifact.files["f"].bytes == 3

@@ -32,7 +32,7 @@ def a_round(name: str) -> dict[str, Any]:
     }
 
 
-def test_a_run_without_rounds_has_a_page_already():
+def test_a_run_without_rounds_has_a_page():
     page = write_coregistration_page(EMPTY)
     assert "The first round is not done yet." in page
     assert "a&lt;b&gt;" in page and "<b>" not in page and "<script" not in page

@@ -1,4 +1,4 @@
-"""The page of a built model, with real pictures."""
+"""The page of a built model, with rendered images."""
 
 import numpy as np
 
@@ -9,13 +9,13 @@ from tests.workflows.rounds import MODEL, head
 from workflows.pages import model
 
 
-def test_components_tables_and_what_was_left_out(monkeypatch):
+def test_the_page_shows_components_tables_and_rejected_subjects(monkeypatch):
     data = gnm_npz.read(MODEL)
 
     def mesh(name: str, vertices: np.ndarray) -> TrainingMesh:
-        sure = np.ones(len(vertices), np.float32)
+        confidence = np.ones(len(vertices), np.float32)
         shape = vertices.astype(np.float32)
-        return TrainingMesh(name=name, label=name, vertices=shape, confidence=sure, triangles=data.triangles)
+        return TrainingMesh(name=name, label=name, vertices=shape, confidence=confidence, triangles=data.triangles)
 
     subjects = []
     for seed in range(7):
@@ -30,10 +30,10 @@ def test_components_tables_and_what_was_left_out(monkeypatch):
     for name, value in {"IDENTITY": 2, "EXPRESSION": 1, "SIZE": (48, 52)}.items():
         monkeypatch.setattr(model, name, value)
     page = model.write_model_page(built.data, built.manifest)
-    drawn = page.count('class="zoom"')
-    assert drawn == 2 * 2 * (2 + len(built.manifest["expression"]))  # sides, ends, components
+    image_count = page.count('class="zoom"')
+    assert image_count == 2 * 2 * (2 + len(built.manifest["expression"]))  # sides, ends, components
     for text in ("head_000, +2", "lower_face_region_000, −2", "p&lt;3&gt;", "20-29", "smile", "<svg"):
         assert text in page
     assert "<3>" not in page and 'src="http' not in page and 'href="http' not in page
-    one, two = page.split('class="zoom"')[1:3]
-    assert one != two
+    first, second = page.split('class="zoom"')[1:3]
+    assert first != second

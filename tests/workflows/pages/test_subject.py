@@ -15,7 +15,7 @@ def a_subject(*rows: CaptureRow) -> SubjectRecord:
     return SubjectRecord(subject="a<b>", model="ab" * 32, recipe="draft", neutral="rest", rows=rows)
 
 
-def test_the_page_shows_every_row_and_needs_nothing_else():
+def test_the_page_shows_every_row_and_is_self_contained():
     figures = {"scan_to_mesh": {"face": {"mean_mm": 0.1234, "median_mm": 0.0456}}, "drift": {"face": {"mean_mm": 0.5}}}
     page = write_subject_page(
         a_subject(
@@ -40,7 +40,7 @@ def test_the_page_shows_every_row_and_needs_nothing_else():
 
 
 def test_a_thumbnail_shows_the_face_upright():
-    """A square in four colours that looks out of the face (+Z); the capture's world is turned."""
+    """A square in four colours that looks out of the face (+Z); the capture's world frame is rotated."""
     corners = np.array([[-0.1, -0.1, 0], [0.1, -0.1, 0], [0.1, 0.1, 0], [-0.1, 0.1, 0]], np.float32)
     root = np.array([0.4, 0.9, -0.2], np.float32)
     uvs = np.array([[0, 0], [1, 0], [1, 1], [0, 1]], np.float32)  # v is up: row 0 of the texture is on top
@@ -54,12 +54,12 @@ def test_a_thumbnail_shows_the_face_upright():
         rotations=root[None],
     )
     encoded = base64.b64decode(thumbnail(square).removeprefix("data:image/jpeg;base64,"))
-    picture = cv2.imdecode(np.frombuffer(encoded, np.uint8), cv2.IMREAD_COLOR)[..., ::-1]
-    height, width, _ = picture.shape
-    middle, step = np.array([height // 2, width // 2]), width // 4
+    image = cv2.imdecode(np.frombuffer(encoded, np.uint8), cv2.IMREAD_COLOR)[..., ::-1]
+    height, width, _ = image.shape
+    centre, step = np.array([height // 2, width // 2]), width // 4
     for (row, column), colour in np.ndenumerate(np.array(["red", "green", "blue", "black"]).reshape(2, 2)):
-        y, x = middle + step * (2 * np.array([row, column]) - 1)
-        want = {"red": (255, 0, 0), "green": (0, 255, 0), "blue": (0, 0, 255), "black": (0, 0, 0)}[colour]
-        assert np.abs(picture[y, x].astype(int) - want).max() < 40, (colour, picture[y, x])
-    assert picture[4, 4].min() > 235
+        y, x = centre + step * (2 * np.array([row, column]) - 1)
+        expected = {"red": (255, 0, 0), "green": (0, 255, 0), "blue": (0, 0, 255), "black": (0, 0, 0)}[colour]
+        assert np.abs(image[y, x].astype(int) - expected).max() < 40, (colour, image[y, x])
+    assert image[4, 4].min() > 235
     assert thumbnail(a_registration(vertices=np.full((4, 3), np.nan, np.float32))) is None

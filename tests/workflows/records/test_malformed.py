@@ -1,4 +1,4 @@
-"""Malformed records are errors that name the file and the field, whichever reader meets them; never silence."""
+"""Malformed records are errors that name the file and the field, whichever function reads them."""
 
 import json
 from collections.abc import Callable
@@ -64,7 +64,7 @@ def with_(key: str, item: Any) -> Callable[[dict[str, Any]], str]:
     return lambda value: json.dumps({**value, key: item})
 
 
-def refused(read: Callable[[], object], file: object, field: str = "") -> None:
+def assert_refused(read: Callable[[], object], file: object, field: str = "") -> None:
     with pytest.raises(InputError) as error:
         read()
     assert str(file) in error.value.where and field in error.value.where
@@ -101,7 +101,7 @@ def end_a_round(run: Path) -> object:
     ],
 )
 @pytest.mark.parametrize(
-    "spoil, field",
+    "damage, field",
     [
         (truncated, ""),
         (without("captures"), "captures"),
@@ -112,23 +112,23 @@ def end_a_round(run: Path) -> object:
         (with_("kind", "something"), ""),
     ],
 )
-def test_a_malformed_subject_record_drops_no_subject(
-    tmp_path: Path, read: Callable[[Path], object], spoil: Callable[[dict[str, Any]], str], field: str
+def test_a_malformed_subject_record_is_refused_by_every_reader(
+    tmp_path: Path, read: Callable[[Path], object], damage: Callable[[dict[str, Any]], str], field: str
 ) -> None:
     run = tmp_path / "it00" / "registrations"
     file = run / "ann" / "subject.json"
     file.parent.mkdir(parents=True)
-    file.write_text(spoil(SUBJECT.to_json()))
-    refused(lambda: read(run), file, field)
+    file.write_text(damage(SUBJECT.to_json()))
+    assert_refused(lambda: read(run), file, field)
 
 
-def test_a_folder_without_a_record_is_no_subject(tmp_path: Path) -> None:
+def test_a_folder_without_a_record_is_not_a_subject(tmp_path: Path) -> None:
     (tmp_path / "run" / "ann").mkdir(parents=True)
     assert read_usable(tmp_path / "run" / "ann") is None and not read_registered(tmp_path / "run")
 
 
 @pytest.mark.parametrize(
-    "type_, record, spoil, field",
+    "type_, record, damage, field",
     [
         (CoregistrationPlan, PLAN, truncated, ""),
         (CoregistrationPlan, PLAN, without("split"), "split"),
@@ -140,17 +140,17 @@ def test_a_folder_without_a_record_is_no_subject(tmp_path: Path) -> None:
     ],
 )
 def test_a_malformed_plan_or_state_is_refused(
-    tmp_path: Path, type_: Any, record: Any, spoil: Callable[[dict[str, Any]], str], field: str
+    tmp_path: Path, type_: Any, record: Any, damage: Callable[[dict[str, Any]], str], field: str
 ) -> None:
     file = tmp_path / "record.json"
     record.write(file)
     assert type_.read(file) == record
-    file.write_text(spoil(record.to_json()))
-    refused(lambda: type_.read(file), file, field)
+    file.write_text(damage(record.to_json()))
+    assert_refused(lambda: type_.read(file), file, field)
 
 
 @pytest.mark.parametrize(
-    "spoil, field",
+    "damage, field",
     [
         (truncated, ""),
         (without("complete"), "complete"),
@@ -159,15 +159,15 @@ def test_a_malformed_plan_or_state_is_refused(
     ],
 )
 def test_a_malformed_dataset_record_is_refused(
-    tmp_path: Path, spoil: Callable[[dict[str, Any]], str], field: str
+    tmp_path: Path, damage: Callable[[dict[str, Any]], str], field: str
 ) -> None:
     file = tmp_path / "dataset.json"
-    file.write_text(spoil(DatasetRecord(complete=True, categories={"smile": "lips"}).to_json()))
-    refused(lambda: read_dataset(tmp_path), file, field)
+    file.write_text(damage(DatasetRecord(complete=True, categories={"smile": "lips"}).to_json()))
+    assert_refused(lambda: read_dataset(tmp_path), file, field)
 
 
 @pytest.mark.parametrize(
-    "spoil, field",
+    "damage, field",
     [
         (truncated, ""),
         (without("region"), "region"),
@@ -175,17 +175,17 @@ def test_a_malformed_dataset_record_is_refused(
         (with_("action", "burn"), "action"),
     ],
 )
-def test_a_malformed_decision_is_named_by_its_line(
-    tmp_path: Path, spoil: Callable[[dict[str, Any]], str], field: str
+def test_a_malformed_decision_is_refused_with_its_line(
+    tmp_path: Path, damage: Callable[[dict[str, Any]], str], field: str
 ) -> None:
     file = tmp_path / "decisions.jsonl"
     entry = DecisionEntry(dataset="d", region="face", component=0, action="keep", reason="")
-    file.write_text(f"{json.dumps(entry.to_json())}\n{spoil(entry.to_json())}\n")
-    refused(lambda: read_decisions(file, "d"), f"{file}, line 2", field)
+    file.write_text(f"{json.dumps(entry.to_json())}\n{damage(entry.to_json())}\n")
+    assert_refused(lambda: read_decisions(file, "d"), f"{file}, line 2", field)
 
 
 @pytest.mark.parametrize(
-    "spoil, field",
+    "damage, field",
     [
         (truncated, ""),
         (without("attempt"), "attempt"),
@@ -193,15 +193,15 @@ def test_a_malformed_decision_is_named_by_its_line(
         (with_("schema", 9), "schema"),
     ],
 )
-def test_a_malformed_artifact_is_refused(tmp_path: Path, spoil: Callable[[dict[str, Any]], str], field: str) -> None:
+def test_a_malformed_artifact_is_refused(tmp_path: Path, damage: Callable[[dict[str, Any]], str], field: str) -> None:
     store = Store(tmp_path)
     store.produce("a", input_hash="h", make=lambda folder: {})
     file = tmp_path / "a" / MANIFEST
-    file.write_text(spoil(json.loads(file.read_text())))
-    refused(lambda: store.find("a"), file, field)
+    file.write_text(damage(json.loads(file.read_text())))
+    assert_refused(lambda: store.find("a"), file, field)
 
 
-def test_a_product_is_found_by_its_inputs_and_a_malformed_result_is_refused(tmp_path: Path) -> None:
+def test_a_product_is_looked_up_by_its_inputs_and_refused_if_malformed(tmp_path: Path) -> None:
     product = Product(tmp_path, "h", HoldOutResult)
     assert product.find() is None
     result = HoldOutResult(input_hash="h", people="people.npz", sources={"ann": "registrations"}, lost=("bob",))
@@ -217,7 +217,7 @@ def test_a_product_is_found_by_its_inputs_and_a_malformed_result_is_refused(tmp_
         (with_("lost", [3])(result.to_json()), "lost[0]"),
     ):
         file.write_text(text)
-        refused(product.find, file, field)
+        assert_refused(product.find, file, field)
 
 
 @pytest.mark.parametrize(

@@ -48,12 +48,12 @@ def write(folder: Path) -> dict[str, object]:
     return {"mm": 0.5}
 
 
-def never(folder: Path) -> dict[str, object]:
-    raise AssertionError("made again")
+def must_not_run(folder: Path) -> dict[str, object]:
+    raise AssertionError("produced again")
 
 
-def spoil(store: Store, name: str, content: bytes | None) -> None:
-    """Overwrite or delete a file behind the store's back."""
+def overwrite(store: Store, name: str, content: bytes | None) -> None:
+    """Overwrite or delete a file without the store's knowledge."""
     path = store._path(name)
     if content is None:
         store._fs.rm_file(path)
@@ -62,67 +62,67 @@ def spoil(store: Store, name: str, content: bytes | None) -> None:
     store._fs.pipe_file(path, content)
 
 
-def test_a_published_artifact_is_found(store: Store) -> None:
+def test_find_returns_the_published_artifact(store: Store) -> None:
     assert store.find("run/a") is None
-    made = store.produce("run/a", input_hash="hash", make=write)
-    assert store.find("run/a") == made
-    assert made.about == {"mm": 0.5} and set(made.files) == {"mesh.ply", "sub/page.html"}
+    artifact = store.produce("run/a", input_hash="hash", make=write)
+    assert store.find("run/a") == artifact
+    assert artifact.about == {"mm": 0.5} and set(artifact.files) == {"mesh.ply", "sub/page.html"}
     assert list(store.keys()) == ["run/a"]
 
 
-def test_the_same_input_returns_at_once_and_another_is_made(store: Store) -> None:
+def test_the_same_input_hash_returns_the_stored_artifact(store: Store) -> None:
     first = store.produce("a", input_hash="one", make=write)
-    assert store.produce("a", input_hash="one", make=never) == first
+    assert store.produce("a", input_hash="one", make=must_not_run) == first
     second = store.produce("a", input_hash="two", make=write)
     assert second.input_hash == "two" and second.attempt != first.attempt
     assert second.content_id == first.content_id
     assert len(store.verify().orphaned) == 2
 
 
-def test_a_file_that_vanished_makes_it_again(store: Store) -> None:
+def test_a_missing_file_leads_to_a_new_attempt(store: Store) -> None:
     first = store.produce("a", input_hash="one", make=write)
-    spoil(store, f"a/{first.attempt}/mesh.ply", None)
+    overwrite(store, f"a/{first.attempt}/mesh.ply", None)
     assert store.produce("a", input_hash="one", make=write).attempt != first.attempt
 
 
-def test_a_maker_that_fails_publishes_nothing(store: Store) -> None:
-    def half(folder: Path) -> dict[str, object]:
+def test_a_failing_step_publishes_nothing(store: Store) -> None:
+    def write_half(folder: Path) -> dict[str, object]:
         (folder / "half").write_text("x")
         raise ValueError("broken")
 
     with pytest.raises(ValueError, match="broken"):
-        store.produce("a", input_hash="one", make=half)
+        store.produce("a", input_hash="one", make=write_half)
     assert store.find("a") is None
     assert store.verify().artifacts == 0 and not store.verify().orphaned
 
 
-def test_two_attempts_at_a_time_disturb_nobody(store: Store) -> None:
-    """A thawed zombie publishes after its successor: one whole artifact is left, whichever."""
+def test_concurrent_attempts_leave_one_sound_artifact(store: Store) -> None:
+    """A suspended attempt publishes after its successor: exactly one complete artifact remains."""
 
-    def meanwhile(folder: Path) -> dict[str, object]:
+    def write_after_successor(folder: Path) -> dict[str, object]:
         store.produce("a", input_hash="one", make=write)
         return write(folder)
 
-    last = store.produce("a", input_hash="one", make=meanwhile)
+    last = store.produce("a", input_hash="one", make=write_after_successor)
     assert store.find("a") == last
-    found = store.verify()
-    assert found.is_sound and found.artifacts == 1 and len(found.orphaned) == 2
+    report = store.verify()
+    assert report.is_sound and report.artifacts == 1 and len(report.orphaned) == 2
 
 
-def test_verify_names_what_is_missing_altered_and_orphaned(store: Store) -> None:
+def test_verify_lists_missing_altered_and_orphaned_files(store: Store) -> None:
     a = store.produce("run/a", input_hash="one", make=write)
     b = store.produce("run/b", input_hash="one", make=write)
     assert store.verify().is_sound and store.verify().artifacts == 2
-    spoil(store, f"run/a/{a.attempt}/mesh.ply", b"mush")
-    spoil(store, f"run/b/{b.attempt}/sub/page.html", None)
-    spoil(store, "run/c/attempt-1/left", b"over")
-    spoil(store, f"run/d/{MANIFEST}", b"{}")
-    found = store.verify()
-    assert found.altered == (f"run/a/{a.attempt}/mesh.ply",)
-    assert found.missing == (f"run/b/{b.attempt}/sub/page.html",)
-    assert found.orphaned == ("run/c/attempt-1/left",)
-    assert list(found.unreadable) == [f"run/d/{MANIFEST}"]
-    assert not found.is_sound
+    overwrite(store, f"run/a/{a.attempt}/mesh.ply", b"mush")
+    overwrite(store, f"run/b/{b.attempt}/sub/page.html", None)
+    overwrite(store, "run/c/attempt-1/left", b"over")
+    overwrite(store, f"run/d/{MANIFEST}", b"{}")
+    report = store.verify()
+    assert report.altered == (f"run/a/{a.attempt}/mesh.ply",)
+    assert report.missing == (f"run/b/{b.attempt}/sub/page.html",)
+    assert report.orphaned == ("run/c/attempt-1/left",)
+    assert list(report.unreadable) == [f"run/d/{MANIFEST}"]
+    assert not report.is_sound
 
 
 @pytest.mark.parametrize("name", ["../../outside", "/etc/passwd", "sub/../../x"])
@@ -130,7 +130,7 @@ def test_a_manifest_that_points_outside_is_refused(store: Store, name: str) -> N
     store.produce("a", input_hash="one", make=write)
     value = json.loads(store._fs.cat_file(store._path("a", MANIFEST)))
     value["files"] = {name: {"sha256": "0", "bytes": 1}}
-    spoil(store, f"a/{MANIFEST}", json.dumps(value).encode())
+    overwrite(store, f"a/{MANIFEST}", json.dumps(value).encode())
     with pytest.raises(InputError) as refused:
         store.find("a")
     assert "inside the attempt" in refused.value.expected
@@ -139,8 +139,8 @@ def test_a_manifest_that_points_outside_is_refused(store: Store, name: str) -> N
 @pytest.mark.parametrize(
     "content", [b"", b"[]", b"{}", b"[" * 99_999, b'{"kind": "gnm-artifact", "schema": 1}', b"\xff"]
 )
-def test_a_manifest_that_is_none_is_refused(store: Store, content: bytes) -> None:
-    spoil(store, f"a/{MANIFEST}", content)
+def test_a_malformed_manifest_is_refused(store: Store, content: bytes) -> None:
+    overwrite(store, f"a/{MANIFEST}", content)
     with pytest.raises(InputError):
         store.find("a")
 
@@ -154,11 +154,11 @@ def test_old_iterations_are_retired(store: Store) -> None:
     assert store.retire("run", keep=2) == []
 
 
-def test_tidying_removes_what_nobody_published_and_spares_the_young(store: Store) -> None:
+def test_tidy_removes_only_old_unpublished_files(store: Store) -> None:
     store.produce("a", input_hash="one", make=write)
     store.produce("a", input_hash="two", make=write)
     assert store.tidy(older_than_s=3600) == 0
-    time.sleep(1.1)  # object storage tells whole seconds
+    time.sleep(1.1)  # modification times in object storage have a resolution of one second
     assert store.tidy(older_than_s=0.01) == 2
     assert store.verify().is_sound and not store.verify().orphaned
     assert store.find("a") is not None

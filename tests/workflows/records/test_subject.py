@@ -1,4 +1,4 @@
-"""Folders and settings of a subject that cannot be used."""
+"""Unusable folders and settings of a subject are refused."""
 
 import shutil
 from pathlib import Path
@@ -20,43 +20,43 @@ def nothing(subject: Path) -> dict:
     return {}
 
 
-def other(capture: str, old: str, new: str):
-    def do(subject: Path) -> dict:
+def changed(capture: str, old: str, new: str):
+    def prepare(subject: Path) -> dict:
         change(subject / capture, old, new)
         return {}
 
-    return do
+    return prepare
 
 
-def filled(name: str):
-    def do(subject: Path) -> dict:
-        place = subject.parent / "out" / name
-        place.mkdir(parents=True)
-        (place / "mine.txt").write_text("mine")
+def with_output(name: str):
+    def prepare(subject: Path) -> dict:
+        folder = subject.parent / "out" / name
+        folder.mkdir(parents=True)
+        (folder / "mine.txt").write_text("mine")
         if name != ".":
             SubjectRecord(subject="ball", model="ab", recipe="draft", neutral="rest", rows=()).write(
-                place.parent / "subject.json"
+                folder.parent / "subject.json"
             )
         return {}
 
-    return do
+    return prepare
 
 
 def without(*names: str):
-    def do(subject: Path) -> dict:
+    def prepare(subject: Path) -> dict:
         for name in names:
             shutil.rmtree(subject / name)
         return {}
 
-    return do
+    return prepare
 
 
 def unreadable(name: str, **options):
-    def do(subject: Path) -> dict:
+    def prepare(subject: Path) -> dict:
         shutil.rmtree(subject / name / "sparse")
         return options
 
-    return do
+    return prepare
 
 
 @pytest.mark.parametrize(
@@ -69,11 +69,11 @@ def unreadable(name: str, **options):
         (without("rest"), {}, "no neutral", "jaw2: jaw, jaw10: jaw, smile: smile"),
         (unreadable("rest"), {}, "no neutral", "rest: cannot be read"),
         (unreadable("rest", neutral="rest"), {}, "COLMAP model is missing", "no such folder"),
-        (other("smile", '"smile"', '"neutral"'), {}, "two neutrals", "rest, smile"),
+        (changed("smile", '"smile"', '"neutral"'), {}, "two neutrals", "rest, smile"),
         (nothing, {"neutral": "notes"}, "no such capture", "notes"),
-        (other("smile", '"ball"', '"cube"'), {}, "several subjects", "smile: cube"),
-        (filled("."), {}, "output folder", "other contents"),
-        (filled("smile"), {}, "output folder", "mine.txt"),
+        (changed("smile", '"ball"', '"cube"'), {}, "several subjects", "smile: cube"),
+        (with_output("."), {}, "output folder", "other contents"),
+        (with_output("smile"), {}, "output folder", "mine.txt"),
         (lambda subject: {"out": subject}, {}, "output folder", "other contents"),
         (lambda subject: {"out": subject / "smile" / "out"}, {}, "output folder", "inside the capture smile"),
         (lambda subject: {"out": subject / "smile"}, {}, "output folder", "inside the capture smile"),
@@ -89,7 +89,7 @@ def unreadable(name: str, **options):
         (nothing, {"model": Path("nowhere.npz")}, "", "nowhere.npz"),
     ],
 )
-def test_bad_input_is_told_before_any_work(prepare, options, what, got, subject: Path, fake: FakeRegister):
+def test_bad_input_is_refused_before_any_registration(prepare, options, what, got, subject: Path, fake: FakeRegister):
     options = {**options, **(prepare(subject) or {})}
     before = files(subject.parent)
     folder = options.pop("subject_dir", subject)

@@ -41,14 +41,14 @@ def test_stages_are_read_as_they_are_written(page: FitPage, tmp_path: Path) -> N
     page.refresh()
     assert page.stages == []
     stage(tmp_path / "stages", "00_start", 1.02)
-    (tmp_path / "stages" / ".01_pose.ply").write_bytes(b"half of i")
+    (tmp_path / "stages" / ".01_pose.ply").write_bytes(b"half of it")
     page.refresh()
     assert page.stages == ["00_start"] and page._stage.value == "00_start"
     stage(tmp_path / "stages", "01_pose", 1.0)
     page.refresh()
     assert (
         page.stages == ["00_start", "01_pose"] and page._stage.value == "01_pose"
-    )  # it was the last one, so it follows
+    )  # the last stage was selected: the page selects the new last stage
     page._stage.value = "00_start"
     stage(tmp_path / "stages", "02_end", 1.0)
     page.refresh()
@@ -94,16 +94,16 @@ def test_an_operator_watches_a_fit(page: FitPage, tmp_path: Path) -> None:
         requests = []
         tab.on("request", lambda request: requests.append(request.url))
         tab.goto(f"http://127.0.0.1:{page.port}")
-        see = sync_api.expect
-        see(tab.get_by_text("ball, neutral")).to_be_visible(timeout=60_000)
+        expect = sync_api.expect
+        expect(tab.get_by_text("ball, neutral")).to_be_visible(timeout=60_000)
         tab.set_default_timeout(15_000)
         choice = tab.get_by_role("combobox", name="Stage")
-        see(choice).to_have_value("waiting")
+        expect(choice).to_have_value("waiting")
         stage(tmp_path / "stages", "00_start", 1.02)
-        see(choice).to_have_value("00_start")
+        expect(choice).to_have_value("00_start")
         stage(tmp_path / "stages", "01_pose", 1.0)
-        see(choice).to_have_value("01_pose")
-        see(tab.locator("h4", has_text=TO_SCAN)).to_be_visible()
+        expect(choice).to_have_value("01_pose")
+        expect(tab.locator("h4", has_text=TO_SCAN)).to_be_visible()
         for name in ("Scan", "Cameras"):
             tab.get_by_label(name, exact=True).check()
         tab.wait_for_function("document.querySelectorAll('canvas').length > 0")
