@@ -1,4 +1,4 @@
-"""Charts as SVG inside a page: how an optimisation went, and figures over a number."""
+"""Charts as SVG inside a page: loss curves of an optimization, and metrics as functions of a number."""
 
 import io
 import math
@@ -18,9 +18,13 @@ _PANELS = 3  # side by side
 
 
 def loss_curves(history: Mapping[str, Mapping[str, Sequence[float]]]) -> str:
-    """One panel per stage, every term a line over the steps, logarithmic; a term keeps its colour throughout.
+    """Draw the loss terms over the steps, one panel per stage, with a logarithmic axis.
 
-    Values that are not positive and finite leave gaps. Empty without any value.
+    Args:
+        history: values of each term in each stage. Values that are not positive and finite leave gaps.
+
+    Returns:
+        An `<svg>` element; empty if there are no values.
     """
     stages = {name: terms for name, terms in history.items() if any(len(values) for values in terms.values())}
     if not stages:
@@ -44,7 +48,7 @@ def loss_curves(history: Mapping[str, Mapping[str, Sequence[float]]]) -> str:
 
 @dataclass(frozen=True, kw_only=True)
 class Line:
-    """Values over a number, with the band in which they may as well lie; None where there is no band."""
+    """Values as a function of a number, with a confidence band; None where the band is unknown."""
 
     name: str
     x: Sequence[float]
@@ -54,7 +58,15 @@ class Line:
 
 
 def number_curves(panels: Mapping[str, Sequence[Line]], x_name: str) -> str:
-    """One panel per title, its axis from zero; a line keeps its name's colour throughout. Empty without any line."""
+    """Draw lines over a number, one panel per title, with axes that begin at zero.
+
+    Args:
+        panels: lines by the title of their panel. Lines of one name have one colour.
+        x_name: label of the horizontal axes.
+
+    Returns:
+        An `<svg>` element; empty if there are no lines.
+    """
     panels = {title: lines for title, lines in panels.items() if lines}
     if not panels:
         return ""
@@ -82,7 +94,7 @@ def _style() -> AbstractContextManager[None]:
 
 
 def _drawn(figure: Figure, colours: Mapping[str, str]) -> str:
-    """The figure with its legend below, as SVG."""
+    """Render a figure with its legend below as SVG."""
     handles = [Line2D([], [], color=colour, lw=2.4) for colour in colours.values()]
     columns = min(len(colours), 8)
     figure.legend(handles, list(colours), loc="outside lower left", ncols=columns, fontsize=9, frameon=False)

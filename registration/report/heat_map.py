@@ -1,4 +1,4 @@
-"""Distances drawn on the mesh, softly shaded, from three sides."""
+"""Heat maps: distances as colours on the shaded mesh, from three sides."""
 
 from collections.abc import Sequence
 
@@ -24,7 +24,7 @@ _DISTANCE = 2.0  # m, camera to head: a portrait lens
 
 
 def scale_limit_mm(distance_mm: Float[np.ndarray, "V"]) -> float:
-    """The round distance at which the colour scale ends: at or above the 95th percentile."""
+    """Return the distance at which the colour scale ends: the first of `LIMITS_MM` at or above the 95th percentile."""
     known = distance_mm[np.isfinite(distance_mm)]
     wanted = np.percentile(known, 95) if len(known) else 0.0
     return next((limit for limit in LIMITS_MM if limit >= wanted), LIMITS_MM[-1])
@@ -33,7 +33,17 @@ def scale_limit_mm(distance_mm: Float[np.ndarray, "V"]) -> float:
 def heat_pictures(
     heat: HeatMap, limit_mm: float, *, sides: Sequence[str] = tuple(SIDES), size: tuple[int, int] = SIZE
 ) -> list[tuple[str, Picture]]:
-    """(side, picture of this width and height, px) for three sides of the head, or some of them."""
+    """Draw a heat map from several sides.
+
+    Args:
+        heat: mesh and distances.
+        limit_mm: distance at the end of the colour scale.
+        sides: names from `SIDES`.
+        size: width and height in px.
+
+    Returns:
+        Name of the side and picture, for each side.
+    """
     head = transform_points(heat.T_head_world, heat.vertices.astype(np.float64))
     head -= (head.min(0) + head.max(0)) / 2
     cameras = _cameras(head, size)
@@ -60,14 +70,14 @@ def _picture(
 
 
 def _shading(normal: Float[np.ndarray, "P 3"]) -> Float[np.ndarray, "P"]:
-    """Light from the camera's upper left and a weak one from its right; camera frame. Never so dark as to hide hue."""
+    """Shade normals (camera frame) by a light from the upper left and a weak one from the right, to at least half."""
     key = np.array([-0.45, -0.65, -0.61])
     fill = np.array([0.8, -0.1, -0.59])
     return 0.50 + 0.42 * np.clip(normal @ key, 0, 1) + 0.16 * np.clip(normal @ fill, 0, 1)
 
 
 def _cameras(head: Float[np.ndarray, "V 3"], size_px: tuple[int, int]) -> dict[str, Camera]:
-    """One camera a side, looking at the origin; all of one focal length, at which the head fills the pictures."""
+    """Place a camera for each side, looking at the origin, all with the focal length that fills the pictures."""
     size = np.array(size_px) * _OVERSAMPLING
     poses = {side: _pose(np.radians(yaw)) for side, yaw in SIDES.items()}
     tangents = {side: _tangents(pose, head) for side, pose in poses.items()}
@@ -82,7 +92,7 @@ def _cameras(head: Float[np.ndarray, "V 3"], size_px: tuple[int, int]) -> dict[s
 
 
 def _pose(yaw: float) -> Float[np.ndarray, "4 4"]:
-    """Looks at the origin from `yaw` about +Y; 0 is +Z."""
+    """T_cam_world of a camera that looks at the origin from `yaw` (radians) about +Y; 0 is +Z."""
     pose = np.eye(4)
     pose[:3, :3] = [[np.cos(yaw), 0, -np.sin(yaw)], [0, -1, 0], [-np.sin(yaw), 0, -np.cos(yaw)]]
     pose[2, 3] = _DISTANCE

@@ -1,4 +1,4 @@
-"""What a report shows. Plain NumPy, so that the page needs neither the renderer nor a GPU."""
+"""Content of a report as NumPy arrays, so that the page needs neither the renderer nor a GPU."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -11,12 +11,12 @@ from torch import Tensor
 from registration.frames import axis_angle_to_matrix
 from registration.types import Registration, Rendered, Targets
 
-_UNLISTED = 0.92  # linear; shown where the targets hold no pixel
+_UNLISTED = 0.92  # linear grey level of pixels that are not in the pixel list
 
 
 @dataclass(frozen=True, kw_only=True)
 class ReportView:
-    """One view: what the capture shows and what the registration renders, on one pixel grid."""
+    """Target and rendering of one view on one pixel grid."""
 
     name: str
     target_rgb: Float[np.ndarray, "H W 3"]  # linear
@@ -32,7 +32,7 @@ class ReportView:
 
 @dataclass(frozen=True, kw_only=True)
 class HeatMap:
-    """Distances to draw on a surface."""
+    """A mesh with distances of its vertices, and its orientation."""
 
     vertices: Float[np.ndarray, "V 3"]  # m, capture world
     triangles: Int[np.ndarray, "F 3"]
@@ -42,7 +42,7 @@ class HeatMap:
 
 @dataclass(frozen=True, kw_only=True)
 class ReportInputs:
-    """Everything on the page."""
+    """Content of the page."""
 
     registration: Registration
     subject: str
@@ -54,7 +54,7 @@ class ReportInputs:
 
 
 def heat_map(registration: Registration, distance_mm: Float[np.ndarray, "V"]) -> HeatMap:
-    """Distances of the registered vertices (NaN where not measured), upright as the root joint turns the head."""
+    """Combine a registered mesh with distances of its vertices (NaN: not measured) and the root joint's rotation."""
     T_head_world = np.eye(4)
     root = torch.from_numpy(registration.rotations[0].astype(np.float64))
     T_head_world[:3, :3] = axis_angle_to_matrix(root).numpy().T
@@ -67,7 +67,7 @@ def heat_map(registration: Registration, distance_mm: Float[np.ndarray, "V"]) ->
 
 
 def report_views(targets: Targets, rendered: Rendered) -> tuple[ReportView, ...]:
-    """One `ReportView` for each view of a batch of targets and its rendering at the same pixels."""
+    """Convert a batch of targets, and the rendering of its pixels, to images: one `ReportView` for each view."""
 
     def images(values: Tensor, background: float = 0.0) -> np.ndarray:
         flat = values.detach().float().reshape(len(values), -1)
@@ -78,20 +78,20 @@ def report_views(targets: Targets, rendered: Rendered) -> tuple[ReportView, ...]
     normals *= images(targets.normal_weight) > 0
     classed = (images(targets.class_weight)[..., 0] > 0) & (classes.max(-1) > 0.5)
     mask, mask_weight = images(targets.mask)[..., 0], images(targets.mask_weight)[..., 0]
-    drawn_mask, drawn_classes = images(rendered.mask)[..., 0], images(rendered.classes).argmax(-1)
-    drawn_rgb, drawn_normals = images(rendered.rgb), images(rendered.normals)
+    rendered_mask, rendered_classes = images(rendered.mask)[..., 0], images(rendered.classes).argmax(-1)
+    rendered_rgb, rendered_normals = images(rendered.rgb), images(rendered.normals)
     return tuple(
         ReportView(
             name=name,
             target_rgb=target_rgb[n],
-            rendered_rgb=drawn_rgb[n],
+            rendered_rgb=rendered_rgb[n],
             compared=compared[n],
             target_mask=mask[n] if mask_weight[n].any() else None,
-            rendered_mask=drawn_mask[n],
+            rendered_mask=rendered_mask[n],
             target_normals=normals[n] if normals[n].any() else None,
-            rendered_normals=drawn_normals[n],
+            rendered_normals=rendered_normals[n],
             target_classes=np.where(classed[n], classes[n].argmax(-1), -1) if classed[n].any() else None,
-            rendered_classes=np.where(drawn_mask[n] > 0.5, drawn_classes[n], -1),
+            rendered_classes=np.where(rendered_mask[n] > 0.5, rendered_classes[n], -1),
         )
         for n, name in enumerate(targets.names)
     )

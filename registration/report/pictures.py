@@ -1,4 +1,4 @@
-"""The report's pictures, as 8 bit sRGB arrays: per-view comparisons and the numbers that go with them."""
+"""Pictures of the report as 8 bit sRGB arrays, and the metrics of each view."""
 
 import base64
 from dataclasses import dataclass
@@ -12,9 +12,9 @@ from registration.report.inputs import ReportView
 
 Picture = UInt8[np.ndarray, "H W 3"]
 
-PAPER = (246, 246, 243)  # where there is nothing to show
+PAPER = (246, 246, 243)  # background
 OUTLINE = (0, 214, 190)
-# Distances and differences: teal is good, crimson is bad; even in lightness and told apart by the colour-blind.
+# Distances and differences, from small (teal) to large (crimson): even in lightness, distinct for the colour-blind.
 SCALE = ((38, 128, 122), (127, 196, 168), (245, 232, 170), (242, 160, 88), (209, 68, 84), (112, 22, 56))
 CLASS_COLOURS = (
     (226, 188, 160),
@@ -29,12 +29,12 @@ CLASS_COLOURS = (
 )
 COLOUR_LIMIT = 0.25  # sRGB difference at the end of the colour scale
 ANGLE_LIMIT = 40.0  # degrees at the end of the colour scale
-PICTURE_HEIGHT = 640  # px; larger views are shown smaller
+PICTURE_HEIGHT = 640  # px; larger views are reduced to it
 
 
 @dataclass(frozen=True, kw_only=True)
 class ViewPictures:
-    """What one view's card shows: rows of (caption, picture), and what was measured at full size."""
+    """Content of one view's card: rows of (caption, picture), and metrics, measured at full resolution."""
 
     name: str
     rows: dict[str, list[tuple[str, Picture]]]
@@ -42,7 +42,7 @@ class ViewPictures:
 
 
 def view_pictures(view: ReportView) -> ViewPictures:
-    """Compare one view: colour, normals and classes, each as target, render and difference."""
+    """Compare one view: colours, normals and classes, each as target, rendering and difference."""
     target, rendered = (linear_to_srgb(rgb.astype(np.float32)) for rgb in (view.target_rgb, view.rendered_rgb))
     difference = np.where(view.compared & (view.rendered_mask > 0.5), np.abs(target - rendered).mean(-1), np.nan)
     rows = {"Colour": _colour_row(view, target, rendered, difference)}
@@ -66,14 +66,14 @@ def view_pictures(view: ReportView) -> ViewPictures:
 
 
 def scale_colours(value: Float[np.ndarray, "*S"]) -> Float[np.ndarray, "*S 3"]:
-    """Colours in [0, 255] of values in [0, 1]; beyond it the end colours."""
+    """Map values to colours in [0, 255]: 0 to 1 along the scale, other values to the end colours."""
     stops = np.linspace(0, 1, len(SCALE))
     value = np.clip(np.nan_to_num(value), 0, 1)
     return np.stack([np.interp(value, stops, np.array(SCALE, float)[:, k]) for k in range(3)], -1)
 
 
 def data_uri(picture: Picture, quality: int = 86) -> str:
-    """A JPEG inside a page."""
+    """Encode a picture as a JPEG data URI."""
     ok, encoded = cv2.imencode(".jpg", picture[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, quality])
     if not ok:
         raise ValueError(f"cannot encode a picture of shape {picture.shape}")
@@ -81,7 +81,7 @@ def data_uri(picture: Picture, quality: int = 86) -> str:
 
 
 def overlap(target: Float[np.ndarray, "H W"], rendered: Float[np.ndarray, "H W"]) -> float:
-    """Intersection over union of two masks; 1 if both are empty."""
+    """Compute the intersection over union of two masks; 1 if both are empty."""
     union = np.maximum(target, rendered).sum()
     return float(np.minimum(target, rendered).sum() / union) if union else 1.0
 
@@ -117,7 +117,7 @@ def _class_row(view: ReportView, target: np.ndarray, srgb: np.ndarray, wrong: np
 
 
 def _normal_angle(view: ReportView, target: np.ndarray) -> np.ndarray:
-    """Degrees; NaN where either has no normal."""
+    """Angle between the normals in degrees; NaN where either is missing."""
     both = target.any(-1) & view.rendered_normals.any(-1)
     lengths = np.linalg.norm(target, axis=-1) * np.linalg.norm(view.rendered_normals, axis=-1)
     cosine = (target * view.rendered_normals).sum(-1) / np.where(both, lengths, 1)
@@ -130,7 +130,7 @@ def _class_picture(classes: Int[np.ndarray, "H W"]) -> Picture:
 
 
 def _heat(value: Float[np.ndarray, "H W"]) -> Picture:
-    """Values in [0, 1] in the scale's colours, NaN as paper."""
+    """Values in [0, 1] as colours of the scale, NaN as background."""
     return np.where(np.isfinite(value)[..., None], scale_colours(value), PAPER).astype(np.uint8)
 
 
@@ -151,7 +151,7 @@ def _shrunk(picture: Picture) -> UInt8[np.ndarray, "h w 3"]:
 
 
 def _outlined(picture: Picture, mask: Float[np.ndarray, "h w"]) -> Picture:
-    """The mask's outline drawn on a picture of any size."""
+    """Draw the outline of a mask on a picture of any size."""
     size = (picture.shape[1], picture.shape[0])
     filled = (cv2.resize(mask.astype(np.float32), size, interpolation=cv2.INTER_AREA) > 0.5).astype(np.uint8)
     contours, _ = cv2.findContours(filled, cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)

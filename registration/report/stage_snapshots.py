@@ -1,4 +1,4 @@
-"""Where a fit stands, to be looked at when a registration went wrong: a picture and the mesh after each stage."""
+"""Snapshots of a fit for debugging: an image and the mesh after each stage."""
 
 from pathlib import Path
 
@@ -19,16 +19,26 @@ def write_stage(
     vertices: Float[np.ndarray, "V 3"],
     triangles: Int[np.ndarray, "F 3"],
 ) -> Path:
-    """NAME.png: a row for each view of the target, the rendering, where their colours differ (x 4), and its normals.
+    """Write the state of a fit after a stage.
 
-    NAME.ply, which is returned: the mesh, metres, capture world. It appears last, and whole: whoever waits for it finds
-    both.
+    NAME.png has a row for each view: target, rendering, absolute colour difference times 4, and rendered normals.
+    NAME.ply is the mesh. It is written atomically and last, so that its existence implies that of the image.
+
+    Args:
+        folder: created if necessary.
+        name: of both files.
+        views: to draw.
+        vertices: metres, capture world.
+        triangles: vertex indices.
+
+    Returns:
+        The path of NAME.ply.
     """
     rows = []
     for view in views:
-        target, drawn = linear_to_srgb(view.target_rgb), linear_to_srgb(view.rendered_rgb)
-        difference = np.abs(target - drawn) * view.compared[..., None] * 4
-        rows.append(np.concatenate([target, drawn, difference, 0.5 + 0.5 * view.rendered_normals], axis=1))
+        target, rendered = linear_to_srgb(view.target_rgb), linear_to_srgb(view.rendered_rgb)
+        difference = np.abs(target - rendered) * view.compared[..., None] * 4
+        rows.append(np.concatenate([target, rendered, difference, 0.5 + 0.5 * view.rendered_normals], axis=1))
     width = max(row.shape[1] for row in rows)
     sheet = np.concatenate([np.pad(row, ((0, 0), (0, width - row.shape[1]), (0, 0))) for row in rows])
     folder.mkdir(parents=True, exist_ok=True)
