@@ -1,4 +1,4 @@
-"""What all tests share: shape checks on the library, where the shared data lies, and when GPU tests run."""
+"""Shared by all tests: shape checks on the library, the location of the shared data, and the condition of GPU tests."""
 
 import ctypes
 from pathlib import Path
@@ -6,8 +6,8 @@ from pathlib import Path
 import pytest
 from jaxtyping import install_import_hook
 
-# Before any test module imports the library: every jaxtyping annotation there becomes a checked one.
-# An int will do for a float, as PEP 484 has it.
+# Before any test module imports the library: every jaxtyping annotation there is checked at run time.
+# An int is accepted for a float, as in PEP 484.
 _CHECKER = "beartype.beartype(conf=beartype.BeartypeConf(is_pep484_tower=True))"
 install_import_hook(["registration", "coregister"], _CHECKER)
 

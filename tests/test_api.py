@@ -1,4 +1,4 @@
-"""The public names of the packages: which there are, that they are lazy, and that each is documented."""
+"""The public names of the packages: the complete list, lazy loading, and documentation of each."""
 
 import dataclasses
 import inspect
@@ -29,8 +29,8 @@ bootstrap build_model evaluate_models load_model_recipe
 NAMES = [(registration, name) for name in REGISTRATION] + [(coregister, name) for name in COREGISTER]
 
 
-def test_the_inventory() -> None:
-    """A name that goes or comes is a change for users: change this list with it, and the list in docs/python.md."""
+def test_the_list_of_public_names() -> None:
+    """A removed or added name is a change for users: change this list with it, and the list in docs/python.md."""
     assert REGISTRATION == registration.__all__ == sorted(_imported_names(Path(registration.__file__)))
     assert COREGISTER == coregister.__all__ == sorted(_imported_names(Path(coregister.__file__)))
     table = DOCUMENT.read_text()[DOCUMENT.read_text().index("## Names") :]
@@ -72,7 +72,7 @@ def test_importing_the_packages_loads_nothing_heavy() -> None:
 
 
 def test_a_function_of_a_modules_name_stays_a_function() -> None:
-    """Submodules become attributes of their package when they are imported: none may have a public name."""
+    """Imported submodules become attributes of their package: none may have the name of a public function."""
     code = """
 import registration.pipeline, registration.evaluate.evaluation, coregister.next_model.build
 import registration, coregister

@@ -1,4 +1,4 @@
-"""The first model and what it is made of, made once for all tests. Without MakeHuman's head they skip."""
+"""Fixtures of the first model and its source data, built once per session; skipped without MakeHuman's head."""
 
 from pathlib import Path
 

@@ -1,4 +1,4 @@
-"""Options, recipes by import path, and what decides a registration."""
+"""Options, recipes by import path, and the options that enter the input hash."""
 
 import dataclasses
 from dataclasses import field, fields, make_dataclass, replace
@@ -25,7 +25,7 @@ def parsed(words: str) -> RegisterOptions:
     return tyro.cli(RegisterOptions, args=words.split())
 
 
-def test_the_command_line_fills_every_field() -> None:
+def test_the_command_line_sets_every_field() -> None:
     assert parsed("") == RegisterOptions()
     words = "--recipe my:own --views 3 --seed 4 --deterministic --variant cuda --landmarks 68=a.txt 5=b=c.txt"
     assert parsed(words) == RegisterOptions(
@@ -51,7 +51,7 @@ def test_help_shows_every_field_with_its_docstring(
 
 
 @pytest.mark.parametrize("pair", ["68", "68=", "=file.txt"])
-def test_landmark_files_are_pairs(pair: str) -> None:
+def test_malformed_landmark_pairs_are_refused(pair: str) -> None:
     with pytest.raises(InputError, match="landmark file argument"):
         parsed(f"--landmarks {pair}")
 
@@ -90,7 +90,7 @@ def test_a_recipe_is_a_name_an_import_path_or_itself(tmp_path: Path, monkeypatch
         ("other_recipes:draft.x", "AttributeError"),
     ],
 )
-def test_no_such_recipe(name: str, got: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_unknown_recipes_are_refused(name: str, got: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "other_recipes.py").write_text(MODULE)
     monkeypatch.chdir(tmp_path)
     with pytest.raises(InputError, match="no such recipe") as refused:
@@ -167,10 +167,10 @@ def put(container: Any, path: str, change: Any) -> Any:
         "options.recipe.regions.0",
     ],
 )
-def test_a_new_field_anywhere_decides_the_hash(
+def test_a_new_field_anywhere_changes_the_hash(
     path: str, capture: Capture, scheme: LandmarkScheme, data: gnm_npz.GNMData
 ) -> None:
-    """Nobody has to add it to a list."""
+    """No list has to be extended for it."""
     hashes = []
     for content in (1, 2):
         changed = put(deciding(capture, scheme), path, lambda value, content=content: with_new_field(value, content))
@@ -195,14 +195,16 @@ def test_a_new_field_anywhere_decides_the_hash(
         ("options.recipe.regions", (OffsetRegion(name="lips"),)),
     ],
 )
-def test_what_decides(
+def test_options_that_change_the_hash(
     path: str, value: object, capture: Capture, scheme: LandmarkScheme, data: gnm_npz.GNMData
 ) -> None:
     before = deciding(capture, scheme)
     assert input_hash(data=data, **put(before, path, lambda _: value)) != input_hash(data=data, **before)
 
 
-def test_what_decides_nothing(capture: Capture, scheme: LandmarkScheme, data: gnm_npz.GNMData, tmp_path: Path) -> None:
+def test_options_that_do_not_change_the_hash(
+    capture: Capture, scheme: LandmarkScheme, data: gnm_npz.GNMData, tmp_path: Path
+) -> None:
     before = deciding(capture, scheme)
     for path, value in (
         ("capture.root", tmp_path / "elsewhere"),

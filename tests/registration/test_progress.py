@@ -15,14 +15,14 @@ class Terminal(io.StringIO):
 
 @pytest.fixture
 def clock(monkeypatch):
-    """A clock that tests turn by hand; a list of one number."""
+    """A clock that tests set; a list with a single number."""
     now = [100.0]
     monkeypatch.setattr(progress.time, "monotonic", lambda: now[0])
     return now
 
 
-def test_lines_in_a_log(clock, capsys):
-    """A line when something new begins, then one each 15 s; notes at once."""
+def test_progress_in_a_log_is_lines(clock, capsys):
+    """A line when a task starts, then a line every 15 s; messages immediately."""
     with progress.console_progress() as shown:
         for done in range(60):
             shown.update(done, 60, "model")
@@ -42,8 +42,8 @@ def test_lines_in_a_log(clock, capsys):
     ]
 
 
-def test_a_bar_in_a_terminal(monkeypatch):
-    """Notes are printed as they are: a path may hold what rich would take for markup."""
+def test_progress_in_a_terminal_is_a_bar(monkeypatch):
+    """Messages are printed literally: a path may contain text that rich would interpret as markup."""
     terminal = Terminal()
     monkeypatch.setattr(sys, "stderr", terminal)
     with progress.console_progress() as shown:
@@ -55,7 +55,7 @@ def test_a_bar_in_a_terminal(monkeypatch):
     assert "run[/red] [bold] is there" in text
 
 
-def test_all_are_progress(capsys):
+def test_all_implementations_satisfy_the_protocol(capsys):
     silent = progress.NullProgress()
     assert isinstance(silent, progress.Progress)
     silent.message("a")

@@ -113,7 +113,7 @@ def test_tables_group_subjects_by_region_category_and_tag(model, result):
     assert {name for kind, name in rows if kind == "age"} == {"20-29", "30-39", "60-69"}
     assert rows["age", "30-39"].subjects == 2 and rows["age", "20-29"].subjects == 1
     assert rows["age", "20-29"].distance_mm.low is None
-    assert "note" not in {kind for kind, _ in rows}  # every subject has another one
+    assert "note" not in {kind for kind, _ in rows}  # the note differs for every subject
     neutrals = own.identity.at_components(8)
     assert rows["gender", "female"].distance_mm.mean == pytest.approx(neutrals[::2].mean())
     assert rows["gender", "male"].distance_mm.mean == pytest.approx(neutrals[1::2].mean())
@@ -174,7 +174,7 @@ INVALID = {
     "one subject": (lambda m, p, s: ({"m": m}, p[:1], m.triangles, s), "too few held-out"),
     "a subject twice": (lambda m, p, s: ({"m": m}, [p[0], p[0]], m.triangles, s), "comes twice"),
     "no model": (lambda m, p, s: ({}, p, m.triangles, s), "no model"),
-    "foreign topology": (lambda m, p, s: ({"m": m}, p, m.triangles[:, ::-1], s), "another topology"),
+    "different topology": (lambda m, p, s: ({"m": m}, p, m.triangles[:, ::-1], s), "another topology"),
     "NaN": (lambda m, p, s: ({"m": m}, [with_value(p[0], np.nan), *p[1:]], m.triangles, s), "not finite"),
     "infinite": (lambda m, p, s: ({"m": m}, [with_value(p[0], np.inf), *p[1:]], m.triangles, s), "not finite"),
     "fewer vertices": (

@@ -131,6 +131,6 @@ def test_fits_are_deterministic(model):
     guess = linear_fit.fit_correspondence(
         part, part.rest + 1e-3 * np.random.default_rng(8).standard_normal(part.rest.shape), [4]
     )
-    one, two = (fit_scan(part, points, guess, seed=9)[0] for _ in range(2))
-    np.testing.assert_array_equal(one.coefficients, two.coefficients)
-    assert len(one.distance_mm) == 6000
+    first, second = (fit_scan(part, points, guess, seed=9)[0] for _ in range(2))
+    np.testing.assert_array_equal(first.coefficients, second.coefficients)
+    assert len(first.distance_mm) == 6000

@@ -39,8 +39,8 @@ def test_the_result_does_not_depend_on_the_heads_poses(part):
     transformed = np.stack(
         [rotation.apply(head) + (1.0, -2.0, 0.5) for rotation, head in zip(rotations, real, strict=True)]
     )
-    one, two = (specificity_mm(part, heads, [2, 12], samples=SAMPLES, seed=SEED) for heads in (real, transformed))
-    np.testing.assert_allclose(one, two, atol=1e-4)
+    first, second = (specificity_mm(part, heads, [2, 12], samples=SAMPLES, seed=SEED) for heads in (real, transformed))
+    np.testing.assert_allclose(first, second, atol=1e-4)
 
 
 def test_distances_of_spheres_are_differences_of_radii():

@@ -2,7 +2,7 @@
 
 Topology and mirror are frozen: registrations, offsets and landmark schemes of one model only fit models with the same
 ones. Where the change is meant (other teeth, another cut of the neck), put the new hashes here, which the failing test
-prints, and say so in the change's description: every registration made with the old model must be made again.
+prints, and say so in the change's description: every registration with the old model must be recomputed.
 """
 
 import hashlib
@@ -38,15 +38,15 @@ GROUPS = """
     upper_lip_region lower_lip_region chin_region
 """.split()
 FLIP = np.float32([-1, 1, 1])
-# Landmarks of the 68 that lie on the midline, and the right one's twin for the rest.
+# Landmarks of the 68 on the midline, and the mirror landmark of each of the others on the right.
 MIDLINE = (8, 27, 28, 29, 30, 33, 51, 57, 62, 66)
-TWINS = {
+MIRROR_LANDMARKS = {
     **{n: 16 - n for n in range(8)},
     **{17 + n: 26 - n for n in range(5)},
     **{31: 35, 32: 34, 36: 45, 37: 44, 38: 43, 39: 42, 40: 47, 41: 46},
     **{48: 54, 49: 53, 50: 52, 58: 56, 59: 55, 60: 64, 61: 63, 67: 65},
 }
-ORAL_TWINS = {**{n: 5 - n for n in range(3)}, **{6 + n: 11 - n for n in range(3)}, 15: 16}
+ORAL_MIRROR_LANDMARKS = {**{n: 5 - n for n in range(3)}, **{6 + n: 11 - n for n in range(3)}, 15: 16}
 
 
 @pytest.fixture(scope="module")
@@ -57,7 +57,7 @@ def schemes(model_file, model):
 def own_quads(model, component):
     inside = regions.group(model, component) > 0.5
     quads = model.quads[inside[model.quads[:, 0]]]
-    assert inside[quads].all()  # no quad joins two components
+    assert inside[quads].all()  # no quad spans two components
     return quads
 
 
@@ -74,7 +74,7 @@ def test_names_sizes_and_joints(model):
 
 
 @needs_shared
-def test_names_are_the_official_file_s(model):
+def test_names_equal_those_of_the_official_file(model):
     official = gnm_npz.read(SHARED / "data/gnm/gnm_head_reconstructed.npz")
     for name in ("mesh_component_names", "vertex_group_names", "joint_names", "joint_parent_indices", "version"):
         np.testing.assert_array_equal(getattr(model, name), getattr(official, name))
@@ -96,10 +96,10 @@ def test_topology_and_mirror_are_frozen(model):
     np.testing.assert_array_equal(model.triangles, triangles_of(model.quads))
 
 
-def test_every_vertex_is_in_one_component_and_in_one_side_s_groups(model):
-    share = np.stack([regions.group(model, name) for name in COMPONENTS])
-    assert set(np.unique(share)) == {0, 1} and (share.sum(0) == 1).all()
-    assert (np.diff(share.argmax(0)) >= 0).all()  # components lie one after another
+def test_every_vertex_is_in_one_component_and_in_the_groups_of_one_side(model):
+    memberships = np.stack([regions.group(model, name) for name in COMPONENTS])
+    assert set(np.unique(memberships)) == {0, 1} and (memberships.sum(0) == 1).all()
+    assert (np.diff(memberships.argmax(0)) >= 0).all()  # components lie one after another
     assert model.vertex_groups.any(1).all() and model.vertex_groups.min() == 0 and model.vertex_groups.max() == 1
     left, right = (regions.group(model, side) for side in ("left", "right"))
     assert ((left + right) >= 1).all()
@@ -126,7 +126,7 @@ def test_mirror_is_exact(model):
         np.testing.assert_array_equal(regions.group(model, name)[mirror], regions.group(model, other), err_msg=name)
 
 
-def test_the_right_eye_s_region_moves_as_the_left_one_s(model):
+def test_expression_components_of_the_right_eye_mirror_those_of_the_left(model):
     left, right = (
         model.expression_basis[np.char.startswith(model.expression_names, f"{side}_eye_region")]
         for side in ("left", "right")
@@ -144,9 +144,9 @@ def test_surfaces(model, component):
     assert len(np.unique(directed, axis=0)) == len(directed)  # neighbours agree on what is outside
     loops = boundary_loops(quads)
     if component == "skin":
-        (rim,) = loops
+        (boundary,) = loops
         height = model.template_vertex_positions[:, 1]
-        assert height[rim].max() < np.percentile(height, 15)  # the neck's
+        assert height[boundary].max() < np.percentile(height, 15)  # the neck's
     else:
         assert not loops
 
@@ -165,7 +165,7 @@ def test_no_quad_is_degenerate_and_all_face_outwards(model, component):
     assert (np.bincount(label, volume) > 0).all() and number == PIECES[component]
 
 
-def test_texture_maps_lie_in_the_square_and_flip_nothing(model):
+def test_texture_maps_lie_in_the_unit_square_without_flipped_triangles(model):
     assert model.quad_uvs.min() >= 0 and model.quad_uvs.max() <= 1
     np.testing.assert_array_equal(model.triangle_uvs, corner_triangles(model.quad_uvs))
     a, b, c = (model.triangle_uvs[:, k].astype(np.float64) for k in range(3))
@@ -180,12 +180,12 @@ def test_texture_maps_do_not_overlap(model, component):
     size, count = 1000, len(uv)
     scale = np.array([[size, 0, 0.2137], [0, size, 0.3719], [0, 0, 1]])  # no pixel's centre on an edge
     camera = Camera(width_px=size, height_px=size, intrinsics=scale, T_cam_world=np.eye(4))
-    # Every triangle at a depth of its own: where two overlap, the one in front is another with the order reversed.
-    seen = []
+    # Every triangle has a different depth: where two overlap, reversing the order changes which is in front.
+    face_maps = []
     for depth in (np.linspace(1, 2, count), np.linspace(2, 1, count)):
         points = np.concatenate([uv, np.ones((count, 3, 1))], 2) * depth[:, None, None]
-        seen.append(rasterize(points.reshape(-1, 3), np.arange(3 * count).reshape(-1, 3), camera)[0])
-    twice, covered = (seen[0] != seen[1]).sum(), (seen[0] >= 0).sum()
+        face_maps.append(rasterize(points.reshape(-1, 3), np.arange(3 * count).reshape(-1, 3), camera)[0])
+    twice, covered = (face_maps[0] != face_maps[1]).sum(), (face_maps[0] >= 0).sum()
     print(f"{component}: {covered} texels, {twice} of them twice")
     assert covered > 0.5 * size**2 and twice <= 1e-5 * covered
 
@@ -199,13 +199,13 @@ def test_landmark_schemes_are_vertices_and_symmetric(model, schemes):
     for name, scheme in schemes.items():
         assert len(np.unique(vertex[name])) == len(vertex[name])
         assert (scheme.weights == (1, 0, 0)).all() and scheme.indices.max() < len(mirror)
-    for twins, name in ((TWINS | {n: n for n in MIDLINE}, "68"), (ORAL_TWINS, "oral")):
-        for one, other in twins.items():
-            assert mirror[vertex[name][one]] == vertex[name][other], (name, one)
+    for mirror_landmarks, name in ((MIRROR_LANDMARKS | {n: n for n in MIDLINE}, "68"), (ORAL_MIRROR_LANDMARKS, "oral")):
+        for row, mirror_row in mirror_landmarks.items():
+            assert mirror[vertex[name][row]] == vertex[name][mirror_row], (name, row)
     assert set(mirror[vertex["dense"]]) == set(vertex["dense"])
 
 
-def test_the_68_are_where_they_should_be(model, schemes):
+def test_the_68_landmarks_are_at_their_anatomical_positions(model, schemes):
     points = schemes["68"].points(model.template_vertex_positions.astype(np.float64))
     x, y, z = points.T
     assert (x[[*range(9, 17), *range(22, 27), *range(42, 48)]] > 0).all()  # the subject's left
@@ -222,14 +222,14 @@ def test_the_68_are_where_they_should_be(model, schemes):
         assert regions.group(model, name)[schemes["68"].indices[list(members), 0]].min() > 0.5, name
 
 
-def test_dense_covers_the_face_and_oral_has_teeth_and_tongue(model, schemes):
-    place = schemes["dense"].points(model.template_vertex_positions)
+def test_the_dense_scheme_covers_the_face_and_the_oral_scheme_teeth_and_tongue(model, schemes):
+    points = schemes["dense"].points(model.template_vertex_positions)
     face = regions.group(model, "hockey_mask") > 0.5
     on_face = face[schemes["dense"].indices[:, 0]]
     assert 0.4 < on_face.mean() < 0.95
     chin = model.template_vertex_positions[regions.group(model, "chin_region") > 0.5, 1].mean()
     covered = model.template_vertex_positions[face & (model.template_vertex_positions[:, 1] > chin)]
-    assert np.linalg.norm(covered[:, None] - place[None], axis=2).min(1).max() < 0.014  # metres
+    assert np.linalg.norm(covered[:, None] - points[None], axis=2).min(1).max() < 0.014  # metres
     vertex = schemes["oral"].indices[:, 0]
     for name, members in (("upper_teeth_and_gums", slice(0, 6)), ("lower_teeth_and_gums", slice(6, 12))):
         assert (regions.group(model, name) * regions.group(model, "teeth"))[vertex[members]].min() == 1
@@ -240,27 +240,27 @@ def test_landmarks_of_a_posed_head_are_its_vertices(model, schemes):
     rng = np.random.default_rng(5)
     gnm = GNM(model)
     rest = gnm.neutral()
-    moved = Parameters(
+    parameters = Parameters(
         identity=rest.identity + gnm.template.new_tensor(rng.normal(size=len(rest.identity))),
         expression=rest.expression + gnm.template.new_tensor(rng.normal(size=len(rest.expression)) * 0.3),
         rotations=rest.rotations + gnm.template.new_tensor(rng.normal(size=rest.rotations.shape) * 0.2),
         translation=rest.translation + 0.1,
         scale=rest.scale,
     )
-    posed = gnm(moved).numpy()
+    posed = gnm(parameters).numpy()
     for scheme in schemes.values():
         np.testing.assert_allclose(scheme.points(posed), posed[scheme.indices[:, 0]], atol=1e-7)
 
 
-def test_a_build_repeats_what_is_in_the_cache(source, model, schemes):
+def test_a_new_build_equals_the_cached_model(source, model, schemes):
     data, built = bootstrap.build_first_model(source)
     for name in gnm_npz.AXES:
-        fresh, cached = getattr(data, name), getattr(model, name)
-        assert fresh.dtype == cached.dtype
-        if fresh.dtype.kind == "f":  # another number of threads sums in another order
-            np.testing.assert_allclose(fresh, cached, rtol=0, atol=1e-9, err_msg=name)
+        new, cached = getattr(data, name), getattr(model, name)
+        assert new.dtype == cached.dtype
+        if new.dtype.kind == "f":  # the order of summation depends on the number of threads
+            np.testing.assert_allclose(new, cached, rtol=0, atol=1e-9, err_msg=name)
         else:
-            np.testing.assert_array_equal(fresh, cached, err_msg=name)
+            np.testing.assert_array_equal(new, cached, err_msg=name)
     for name, scheme in built.items():
         np.testing.assert_array_equal(scheme.indices, schemes[name].indices)
         np.testing.assert_array_equal(scheme.weights, schemes[name].weights)
@@ -272,7 +272,7 @@ def test_two_builds_are_equal(source):
     assert gnm_npz.content_hash(first) == gnm_npz.content_hash(second)
 
 
-def test_a_second_call_builds_nothing_and_copies_where_asked(model_file, monkeypatch, tmp_path):
+def test_a_second_call_copies_the_cached_model_without_building(model_file, monkeypatch, tmp_path):
     monkeypatch.setattr(bootstrap, "build_first_model", lambda source: pytest.fail("it was built again"))
     assert bootstrap.bootstrap() == model_file
     files = {"gnm_head_first.npz", "head_sparse_68.txt", "head_sparse_dense.txt", "head_sparse_oral.txt"}
@@ -286,7 +286,7 @@ def test_a_second_call_builds_nothing_and_copies_where_asked(model_file, monkeyp
 
 @pytest.fixture
 def counted(monkeypatch, tmp_path):
-    """An empty cache and a build that takes no time; the list of its calls."""
+    """An empty cache and a build that does nothing; the list of its calls."""
     calls = []
     tiny = gnm_npz.read(HERE / "tiny_gnm.npz")
     scheme = LandmarkScheme(name="68", indices=np.zeros((1, 3), int), weights=np.array([[1.0, 0, 0]]))
@@ -302,7 +302,7 @@ def counted(monkeypatch, tmp_path):
     return calls
 
 
-def test_it_is_built_once_for_what_it_depends_on(counted, monkeypatch):
+def test_the_model_is_rebuilt_only_when_its_inputs_change(counted, monkeypatch):
     first = bootstrap.bootstrap()
     assert bootstrap.bootstrap() == first and len(counted) == 1
     for change in (
@@ -315,7 +315,7 @@ def test_it_is_built_once_for_what_it_depends_on(counted, monkeypatch):
     assert len(counted) == 3
 
 
-def test_a_build_that_fails_leaves_nothing(counted, monkeypatch, tmp_path):
+def test_a_failed_build_leaves_no_files(counted, monkeypatch, tmp_path):
     def fail(scheme, path):
         raise InputError("no room", where=path, expected="", got="", fix="")
 

@@ -1,4 +1,4 @@
-"""The procedural eyeball against the figures of the two-sphere model."""
+"""The procedural eyeball against the dimensions of the two-sphere model."""
 
 import numpy as np
 import pytest
@@ -36,7 +36,7 @@ def test_both_shells_are_closed_and_face_outwards(eye: MeshPart) -> None:
     assert len(eye.vertices) <= 620
 
 
-def test_figures_of_the_mean_eye(eye: MeshPart) -> None:
+def test_dimensions_of_the_mean_eye(eye: MeshPart) -> None:
     exterior = eye.vertices[eye.groups["eye_exteriors"]]
     radius = np.linalg.norm(exterior, axis=1)
     assert exterior[:, 2].max() == pytest.approx(15.789e-3, abs=1e-6)  # z_c + r_c
@@ -50,7 +50,7 @@ def test_figures_of_the_mean_eye(eye: MeshPart) -> None:
 
 
 @pytest.mark.parametrize("limbus, cornea", [(6.0e-3, 8.5e-3), (7.2e-3, 7.4e-3), (4.7e-3, 10.7e-3)])
-def test_the_blend_keeps_value_and_slope(limbus: float, cornea: float) -> None:
+def test_the_blend_is_continuous_in_value_and_slope(limbus: float, cornea: float) -> None:
     angle = np.linspace(0, np.pi / 2, 200_001)
     step = angle[1]
     radius = eyes.radius_at(angle, np.array(limbus), np.array(cornea))
@@ -58,22 +58,22 @@ def test_the_blend_keeps_value_and_slope(limbus: float, cornea: float) -> None:
     half = eyes.BLEND_LENGTH / eyes.SCLERA_RADIUS / 2
     edge = np.arcsin(limbus / eyes.SCLERA_RADIUS)
     steepest = np.abs(slope).max()
-    # Over the blend the slope changes by `steepest`: a step of the grid may change it by only a few times its share.
+    # Over the blend the slope changes by `steepest`: one grid step may cause only a few times its fraction of that.
     assert np.abs(np.diff(slope)).max() < 10 * steepest * step / (2 * half)
     assert (radius[angle > edge + half] == eyes.SCLERA_RADIUS).all()
     assert (np.diff(radius) < 1e-15).all()
 
 
 @pytest.mark.parametrize("limbus, cornea", [(6.0e-3, 8.5e-3), (7.3e-3, 7.4e-3), (4.7e-3, 10.7e-3), (7.3e-3, 10.7e-3)])
-def test_the_interior_stays_inside(limbus: float, cornea: float) -> None:
+def test_the_interior_lies_inside_the_exterior(limbus: float, cornea: float) -> None:
     eye = eyes.eyeball(limbus, cornea)
     inner, outer = (triangles(eye.quads[eye.groups[g][eye.quads].all(1)]) for g in ("eye_interiors", "eye_exteriors"))
-    shares = np.array([(i, j, 6 - i - j) for i in range(7) for j in range(7 - i)]) / 6
-    points = np.einsum("sk,fkc->fsc", shares, eye.vertices[inner]).reshape(-1, 3)
-    distance, face, share = closest_points(points, eye.vertices, outer)
+    barycentrics = np.array([(i, j, 6 - i - j) for i in range(7) for j in range(7 - i)]) / 6
+    points = np.einsum("sk,fkc->fsc", barycentrics, eye.vertices[inner]).reshape(-1, 3)
+    distance, face, weights = closest_points(points, eye.vertices, outer)
     a, b, c = (eye.vertices[outer[face]][:, k] for k in range(3))
     depth = np.einsum(
-        "ij,ij->i", np.einsum("pk,pkc->pc", share, eye.vertices[outer[face]]) - points, np.cross(b - a, c - a)
+        "ij,ij->i", np.einsum("pk,pkc->pc", weights, eye.vertices[outer[face]]) - points, np.cross(b - a, c - a)
     )
     assert (depth > 0).all()
     assert distance.min() > 0.1e-3
@@ -94,18 +94,18 @@ def test_groups_and_rings(eye: MeshPart) -> None:
     assert np.ptp(eye.vertices[groups["irises"]][:, 2]) < 1e-15  # flat
 
 
-def test_mirror(eye: MeshPart) -> None:
+def test_the_mirror_is_exact(eye: MeshPart) -> None:
     mirror = eye.mirror
     assert (mirror[mirror] == np.arange(len(mirror))).all()
     assert (eye.vertices[mirror] == eye.vertices * [-1, 1, 1]).all()
-    turned = mirror[eye.quads][:, ::-1]
-    assert {frozenset(q) for q in turned.tolist()} == {frozenset(q) for q in eye.quads.tolist()}
+    mirrored = mirror[eye.quads][:, ::-1]
+    assert {frozenset(q) for q in mirrored.tolist()} == {frozenset(q) for q in eye.quads.tolist()}
     edges = {tuple(e) for q in eye.quads for e in zip(q, np.roll(q, -1), strict=True)}
-    assert all(tuple(e) in edges for q in turned for e in zip(q, np.roll(q, -1), strict=True))
+    assert all(tuple(e) in edges for q in mirrored for e in zip(q, np.roll(q, -1), strict=True))
     assert all((member[mirror] == member).all() for member in eye.groups.values())
 
 
-def test_uv_charts(eye: MeshPart) -> None:
+def test_uv_charts_do_not_overlap(eye: MeshPart) -> None:
     uvs = eye.quad_uvs
     assert uvs.min() >= 0 and uvs.max() <= 1
     outside = eye.groups["eye_exteriors"][eye.quads].all(1)
@@ -113,29 +113,29 @@ def test_uv_charts(eye: MeshPart) -> None:
     assert coverage(uvs).max() == 1
     iris = eye.groups["irises"][eye.quads].all(1)
     offset = uvs[iris] - [0.75, 0.75]
-    share = np.linalg.norm(offset, axis=-1) / np.linalg.norm(eye.vertices[eye.quads[iris]][..., :2], axis=-1).clip(1e-9)
-    assert np.ptp(share[share > 0]) < 1e-9 * share.max()  # the iris is round and to scale
+    scale = np.linalg.norm(offset, axis=-1) / np.linalg.norm(eye.vertices[eye.quads[iris]][..., :2], axis=-1).clip(1e-9)
+    assert np.ptp(scale[scale > 0]) < 1e-9 * scale.max()  # the iris is round and to scale
 
 
-def turn(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+def cross_2d(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     return a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]
 
 
 def coverage(uvs: np.ndarray, size: int = 512) -> np.ndarray:
-    """How many triangles cover each pixel centre of the unit square; every triangle must turn counter-clockwise."""
+    """How many triangles cover each pixel centre of the unit square; every triangle must be counter-clockwise."""
     counts = np.zeros((size, size), int)
     for a, b, c in np.concatenate([uvs[:, [0, 1, 2]], uvs[:, [0, 2, 3]]]) * size:
-        area = turn(b - a, c - a)
+        area = cross_2d(b - a, c - a)
         assert area > 1e-3  # pixels
         low, high = np.floor(np.min([a, b, c], 0)).astype(int), np.ceil(np.max([a, b, c], 0)).astype(int)
         points = np.stack(np.meshgrid(np.arange(low[0], high[0]), np.arange(low[1], high[1])), -1) + 0.5
-        inside = np.all([turn(q - p, points - p) > 1e-6 for p, q in ((a, b), (b, c), (c, a))], 0)
+        inside = np.all([cross_2d(q - p, points - p) > 1e-6 for p, q in ((a, b), (b, c), (c, a))], 0)
         counts[low[1] : high[1], low[0] : high[0]] += inside
     assert counts.sum() > 0.1 * size**2
     return counts
 
 
-def test_pupil_end_points(eye: MeshPart) -> None:
+def test_the_pupil_spans_from_a_point_to_the_limbus(eye: MeshPart) -> None:
     basis = eyes.pupil_displacement(eye)
     pupil = eye.groups["pupils"]
     iris = eye.groups["irises"] & ~pupil  # the visible ring
@@ -144,32 +144,32 @@ def test_pupil_end_points(eye: MeshPart) -> None:
     limbus = rest[iris].max()
     edge = pupil & np.isclose(rest, limbus / 2)
     for coefficient in (-3, -1.5, 0, 1, 3):
-        moved = eye.vertices + coefficient * basis
-        radius = np.hypot(*moved.T[:2])
+        vertices = eye.vertices + coefficient * basis
+        radius = np.hypot(*vertices.T[:2])
         assert radius[edge] == pytest.approx(limbus * (0.5 + coefficient / 6), abs=1e-15)
-        assert (moved[:, 2] == eye.vertices[:, 2]).all()
-        share = (limbus - radius[iris]) / (limbus - rest[iris]).clip(1e-15)
-        assert share[rest[iris] < limbus - 1e-9] == pytest.approx(1 - coefficient / 3, abs=1e-9)
+        assert (vertices[:, 2] == eye.vertices[:, 2]).all()
+        fraction = (limbus - radius[iris]) / (limbus - rest[iris]).clip(1e-15)
+        assert fraction[rest[iris] < limbus - 1e-9] == pytest.approx(1 - coefficient / 3, abs=1e-9)
     assert np.hypot(*(eye.vertices - 3 * basis)[pupil].T[:2]).max() < 1e-15
     assert np.hypot(*(eye.vertices + 3 * basis)[iris].T[:2]) == pytest.approx(limbus, abs=1e-15)
 
 
-def test_three_components_reproduce_drawn_eyes(eye: MeshPart) -> None:
+def test_three_components_reproduce_sampled_eyes(eye: MeshPart) -> None:
     basis = eyes.variation().reshape(3, -1)
-    drawn = [
+    sampled = [
         eyes.eyeball(*radii).vertices for radii in zip(*eyes.sample_radii(400, np.random.default_rng(7)), strict=True)
     ]
-    moved = (np.stack(drawn) - eye.vertices).reshape(len(drawn), -1)
-    coefficients = moved @ np.linalg.pinv(basis)
-    rest = np.linalg.norm((moved - coefficients @ basis).reshape(len(drawn), -1, 3), axis=2)
-    assert np.sqrt((np.linalg.norm(moved.reshape(len(drawn), -1, 3), axis=2) ** 2).mean()) > 0.2e-3
-    assert np.sqrt((rest**2).mean()) < 3e-6
-    assert np.quantile(rest.max(1), 0.99) < 60e-6
+    displacements = (np.stack(sampled) - eye.vertices).reshape(len(sampled), -1)
+    coefficients = displacements @ np.linalg.pinv(basis)
+    residual = np.linalg.norm((displacements - coefficients @ basis).reshape(len(sampled), -1, 3), axis=2)
+    assert np.sqrt((np.linalg.norm(displacements.reshape(len(sampled), -1, 3), axis=2) ** 2).mean()) > 0.2e-3
+    assert np.sqrt((residual**2).mean()) < 3e-6
+    assert np.quantile(residual.max(1), 0.99) < 60e-6
     assert coefficients[:, :2].std(0) == pytest.approx([1, 1], abs=0.12)  # two radii: two free components
     assert np.abs(np.corrcoef(coefficients[:, 0], coefficients[:, 1])[0, 1]) < 0.15
 
 
-def test_variation_repeats_and_keeps_the_sclera(eye: MeshPart) -> None:
+def test_variation_is_deterministic_and_preserves_the_sclera(eye: MeshPart) -> None:
     basis = eyes.variation(seed=3)
     assert (basis == eyes.variation(seed=3)).all()
     assert not (basis == eyes.variation(seed=4)).all()
@@ -180,12 +180,12 @@ def test_variation_repeats_and_keeps_the_sclera(eye: MeshPart) -> None:
     # Between limbus and lids the sclera's vertices slide: along a tangent, at three deviations 1.2 mm, so up to
     # 1.2^2 / (2 * 14.6) mm off the sphere.
     for sign in (-3, 3):
-        moved = eye.vertices + sign * basis[0]
+        vertices = eye.vertices + sign * basis[0]
         on_sclera = eye.groups["eye_exteriors"] & (angle > np.radians(32))
-        assert np.linalg.norm(moved[on_sclera], axis=1) == pytest.approx(eyes.SCLERA_RADIUS, abs=0.055e-3)
+        assert np.linalg.norm(vertices[on_sclera], axis=1) == pytest.approx(eyes.SCLERA_RADIUS, abs=0.055e-3)
 
 
 @pytest.mark.parametrize("limbus, cornea", [(8.5e-3, 8.5e-3), (0.0, 8.5e-3), (13.5e-3, 14e-3), (6.0, 8.5)])
-def test_impossible_radii(limbus: float, cornea: float) -> None:
+def test_impossible_radii_are_refused(limbus: float, cornea: float) -> None:
     with pytest.raises(InputError, match="do not form an eyeball"):
         eyes.eyeball(limbus, cornea)

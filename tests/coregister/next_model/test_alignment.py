@@ -45,8 +45,8 @@ def test_heads_are_aligned_with_their_mean_and_the_mean_with_the_template(model,
 
 def test_the_result_does_not_depend_on_the_heads_poses(model, scattered):
     again = samples.transformed(scattered, np.random.default_rng(5)).astype(np.float32)
-    one, two = (align_neutrals(heads, _observed(heads), _names(), model) for heads in (scattered, again))
-    assert np.abs(one.vertices - two.vertices).max() < 5e-6
+    first, second = (align_neutrals(heads, _observed(heads), _names(), model) for heads in (scattered, again))
+    assert np.abs(first.vertices - second.vertices).max() < 5e-6
 
 
 def test_no_head_is_reflected(model, scattered):
@@ -99,10 +99,10 @@ def test_mirrored_heads_give_mirrored_results(model):
     mirror, flip = model.mirror_indices, (-1, 1, 1)
     confidence = rng.uniform(0.2, 1, heads.shape[:2]).astype(np.float32)
     names = [str(k) for k in range(6)]
-    one = align_neutrals(heads.astype(np.float32), confidence, names, model, mirrored=True)
-    two = align_neutrals(
+    original = align_neutrals(heads.astype(np.float32), confidence, names, model, mirrored=True)
+    mirrored_result = align_neutrals(
         (heads[:, mirror] * flip).astype(np.float32), confidence[:, mirror], names, model, mirrored=True
     )
-    assert np.abs(two.vertices - one.vertices[:, mirror] * flip).max() < 2e-6
-    alone = align_neutrals(heads.astype(np.float32), confidence, names, model)
-    assert np.abs(alone.vertices - one.vertices).max() > 1e-5
+    assert np.abs(mirrored_result.vertices - original.vertices[:, mirror] * flip).max() < 2e-6
+    unpaired = align_neutrals(heads.astype(np.float32), confidence, names, model)
+    assert np.abs(unpaired.vertices - original.vertices).max() > 1e-5

@@ -56,10 +56,10 @@ def test_all_23_fields_come_back_from_the_file(built: BuiltModel, files: Path, m
     again = gnm_npz.read(files)
     assert len(AXES) == 23
     for name in AXES:
-        one, two, old = (getattr(data, name) for data in (built.data, again, model))
-        assert one.dtype == two.dtype and one.shape == two.shape and np.array_equal(one, two)
-        assert one.dtype.kind == old.dtype.kind and one.ndim == old.ndim
-        assert one.dtype == old.dtype or one.dtype.kind == "U"
+        first, second, previous = (getattr(data, name) for data in (built.data, again, model))
+        assert first.dtype == second.dtype and first.shape == second.shape and np.array_equal(first, second)
+        assert first.dtype.kind == previous.dtype.kind and first.ndim == previous.ndim
+        assert first.dtype == previous.dtype or first.dtype.kind == "U"
     assert gnm_npz.content_hash(again) == built.manifest["content_id"]
     sizes = [len(getattr(again, name)) for name in ("identity_names", "expression_names")]
     assert sizes == [len(again.vertex_identity_basis), len(again.expression_basis)]

@@ -139,7 +139,7 @@ def test_teeth_and_tongue_follow_the_skin_as_in_the_heads(model):
 
 @pytest.fixture(scope="module")
 def subjects_basis(head_assembly, model) -> tuple[GNMData, IdentityBasis, IdentityBasis]:
-    """The model with the template of subjects outside its span, their basis, and one without correction of the lids."""
+    """The model with the template of subjects outside its span, their basis, and a basis without lid correction."""
     subjects = samples.subjects(head_assembly, model, range(300, 324), ("smile",))
     heads = np.stack([subject.neutral.vertices for subject in subjects])
     aligned = align_neutrals(heads, np.ones(heads.shape[:2], np.float32), [s.name for s in subjects], model)
@@ -217,7 +217,7 @@ def test_mirror_images_make_a_symmetric_model(model):
         assert np.abs(template - result.template).max() <= 1e-7 and np.abs(left).max() <= 1e-7
         same, opposite = (np.abs(mirror_images - sign * result.basis).max((1, 2)) < 1e-7 for sign in (1, -1))
         assert (same ^ opposite).all() and opposite.sum() >= 1
-    # Components of the heads alone are neither.
+    # Components from the heads without mirror images are neither.
     alone = build_identity_basis(heads, model, RAW)
     mirror_images = mirrored(alone.basis, model.mirror_indices)
     assert min(np.abs(mirror_images - sign * alone.basis).max((1, 2)).min() for sign in (1, -1)) > 1e-5

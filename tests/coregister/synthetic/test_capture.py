@@ -1,4 +1,4 @@
-"""Synthetic captures, read back and held against the mesh that they were made from."""
+"""Synthetic captures, read back and compared with the mesh that they were rendered from."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -37,7 +37,7 @@ WORN = replace(SMALL, hair=True, shirt=True)
 
 
 def vertices() -> np.ndarray:
-    """Another identity and expression than the template's, in a turned world."""
+    """Another identity and expression than the template's, in a rotated world."""
     return evaluate(
         TINY,
         identity=np.array([0.4, -0.8, 0.7, 0.5, -0.6, 0.9]),
@@ -86,7 +86,7 @@ def at(image: np.ndarray, xy: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return image[y, x], inside
 
 
-def test_the_doctor_finds_nothing(capture) -> None:
+def test_the_capture_check_reports_no_problem(capture) -> None:
     report = check_capture(capture.root)
     assert report.warnings == ()
     assert (capture.subject, capture.expression, capture.tags["age"]) == ("tiny", "smile", 30)
@@ -95,7 +95,7 @@ def test_the_doctor_finds_nothing(capture) -> None:
     np.testing.assert_allclose(read_truth(capture.ground_truth), vertices())
 
 
-def test_a_worn_capture_passes_too(worn) -> None:
+def test_a_capture_with_hair_and_shirt_passes_too(worn) -> None:
     assert check_capture(worn.root).warnings == ()
 
 
@@ -113,17 +113,17 @@ def test_the_scan_is_the_heads_visible_outside(capture) -> None:
     inner = (group(TINY, "teeth") + group(TINY, "tongue") + group(TINY, "gums"))[TINY.triangles].max(1) > 0.5
     assert not inner[face].any()
     a, b, c = scan.vertices[scan.triangles].transpose(1, 0, 2)
-    normals, middle = np.cross(b - a, c - a), (a + b + c) / 3
-    views = np.stack([((view.camera.centre - middle) * normals).sum(1) > 0 for view in capture.views])
+    normals, centres = np.cross(b - a, c - a), (a + b + c) / 3
+    views = np.stack([((view.camera.centre - centres) * normals).sum(1) > 0 for view in capture.views])
     assert views.any(0).mean() > 0.99
 
 
-def test_labels_are_those_of_the_vertices(capture) -> None:
-    truth, (names, shares) = vertices(), vertex_classes(TINY)
-    pure = np.ones(len(truth), bool)  # a vertex all of whose neighbours are of its class
-    own = shares.argmax(1)
+def test_labels_equal_the_vertices_classes(capture) -> None:
+    truth, (names, memberships) = vertices(), vertex_classes(TINY)
+    pure = np.ones(len(truth), bool)  # vertices whose neighbours all have their class
+    vertex_class = memberships.argmax(1)
     for a, b in ((0, 1), (1, 2), (2, 0)):
-        differ = own[TINY.triangles[:, a]] != own[TINY.triangles[:, b]]
+        differ = vertex_class[TINY.triangles[:, a]] != vertex_class[TINY.triangles[:, b]]
         pure[TINY.triangles[differ].ravel()] = False
     seen_classes = set()
     for view in capture.views:
@@ -133,10 +133,10 @@ def test_labels_are_those_of_the_vertices(capture) -> None:
         normal = facing(truth, view.camera)
         chosen = chosen[normal[chosen] > 0.3]
         value, inside = at(labels, pixels_of(view.camera, truth[chosen]))
-        expected = np.array([LABELS.index(names[k]) for k in own[chosen[inside]]])
+        expected = np.array([LABELS.index(names[k]) for k in vertex_class[chosen[inside]]])
         value = np.where(value == LABELS.index("neck_other"), LABELS.index("skin"), value)
         assert len(value) > 100 and (value == expected).mean() > 0.93
-        # A pixel is 2 mm: beside an eye's or an ear's rim its centre may show the other side, but no more than that.
+        # A pixel is 2 mm: next to the outline of an eye or ear, labels may be off by one pixel, but not more.
         xy = pixels_of(view.camera, truth[chosen[inside]])
         merged = np.where(labels == LABELS.index("neck_other"), LABELS.index("skin"), labels)
         around = [at(np.pad(merged, 1), xy + (1 + x, 1 + y))[0] for x in (-1, 0, 1) for y in (-1, 0, 1)]
@@ -153,10 +153,10 @@ def on_the_head(points: np.ndarray) -> np.ndarray:
 
 
 def facing(points: np.ndarray, camera) -> np.ndarray:
-    """Cosine between each vertex' normal and the way to the camera."""
+    """Cosine between each vertex' normal and the direction to the camera."""
     normals = vertex_normals(torch.as_tensor(points), torch.as_tensor(TINY.triangles.astype(np.int64))).numpy()
-    away = camera.centre - points
-    return (normals * away).sum(1) / np.linalg.norm(away, axis=1)
+    to_camera = camera.centre - points
+    return (normals * to_camera).sum(1) / np.linalg.norm(to_camera, axis=1)
 
 
 def test_left_is_the_subjects_left(capture) -> None:
@@ -183,11 +183,11 @@ def test_normals_face_the_camera_and_follow_the_mesh(capture) -> None:
         value, _ = at(normals, pixels_of(view.camera, truth[chosen]))
         world = vertex_normals(torch.as_tensor(truth), torch.as_tensor(TINY.triangles.astype(np.int64))).numpy()
         expected = world[chosen] @ view.camera.T_cam_world[:3, :3].T
-        # A pixel is 2 mm here, and triangles are 12 mm: half a pixel turns the normal by degrees.
+        # A pixel is 2 mm here, and triangles are 12 mm: half a pixel rotates the normal by degrees.
         assert np.median(np.degrees(np.arccos(np.clip((value * expected).sum(1), -1, 1)))) < 5
 
 
-def test_landmarks_come_back(capture) -> None:
+def test_landmarks_match_the_mesh(capture) -> None:
     points, used, residuals = triangulation.triangulate(capture, "68")
     truth = SCHEMES["68"].points(vertices())
     assert (used >= 2).all()
@@ -199,7 +199,7 @@ def test_landmarks_come_back(capture) -> None:
         assert set(np.unique(marks[:, 2])) <= {1.0, 0.2} and agree.mean() > 0.95
 
 
-def test_hair_and_shirt_show_and_leave_the_face_free(capture, worn) -> None:
+def test_hair_and_shirt_are_visible_and_do_not_cover_the_face(capture, worn) -> None:
     if capture.views[0].camera.distortion:
         pytest.skip("the worn capture's cameras have no lenses")
     truth = vertices()
@@ -210,22 +210,22 @@ def test_hair_and_shirt_show_and_leave_the_face_free(capture, worn) -> None:
         labels = read_labels(view.segmentation, view.camera, worn.classes)
         assert not np.isin(before, [LABELS.index("hair"), LABELS.index("clothes")]).any()
         assert (labels == LABELS.index("hair")).mean() > 0.02 and (labels == LABELS.index("clothes")).mean() > 0.02
-        seen = face[
+        visible_rows = face[
             visible(truth[face], truth, TINY.triangles, view.camera, 1e-3) & (facing(truth, view.camera)[face] > 0.2)
         ]
-        value, _ = at(labels, pixels_of(view.camera, truth[seen]))
+        value, _ = at(labels, pixels_of(view.camera, truth[visible_rows]))
         assert np.isin(value, [LABELS.index("hair"), LABELS.index("clothes")]).mean() < 0.02
         hidden = (before > 0) & np.isin(labels, [LABELS.index("hair"), LABELS.index("clothes")])
         assert not np.isin(before[hidden], [LABELS.index(f"{side}_eye") for side in ("left", "right")]).any()
 
 
-def test_the_scan_leaves_out_what_is_worn_over(capture, worn) -> None:
+def test_the_scan_excludes_skin_under_hair_and_shirt(capture, worn) -> None:
     bare, scan = read_scan(capture.scan), read_scan(worn.scan)
     assert len(scan.vertices) < 0.9 * len(bare.vertices)
     on_the_head(scan.vertices)
 
 
-def test_one_studio_makes_one_capture(tmp_path) -> None:
+def test_equal_settings_give_equal_captures(tmp_path) -> None:
     noisy = replace(SMALL, cameras=2, size_px=(72, 96), sensor=Sensor(read_noise=0.01, exposure_spread=0.1))
     roots = [
         make(tmp_path / name, studio) for name, studio in (("a", noisy), ("b", noisy), ("c", replace(noisy, seed=1)))
@@ -237,7 +237,7 @@ def test_one_studio_makes_one_capture(tmp_path) -> None:
     assert (roots[0] / "images/cam00.png").read_bytes() != (roots[2] / "images/cam00.png").read_bytes()
 
 
-def test_sixteen_bits(tmp_path) -> None:
+def test_images_of_sixteen_bits(tmp_path) -> None:
     capture = native.read_capture(make(tmp_path / "deep", replace(SMALL, cameras=2, size_px=(48, 64), bits=16)))
     assert read_image(capture.views[0].image, capture.views[0].camera).dtype == np.uint16
 
@@ -255,13 +255,13 @@ def test_sixteen_bits(tmp_path) -> None:
         {"quality": Quality(light_rays=0)},
     ],
 )
-def test_studios_that_cannot_be(tmp_path, change) -> None:
+def test_invalid_studio_options_are_refused(tmp_path, change) -> None:
     with pytest.raises(InputError):
         make(tmp_path / "refused", replace(SMALL, **change))
     assert list(tmp_path.iterdir()) == []
 
 
-def test_vertices_that_are_not_the_models(tmp_path) -> None:
+def test_vertices_of_another_topology_are_refused(tmp_path) -> None:
     broken = vertices()
     broken[3, 1] = np.nan
     for wrong in (vertices()[:-1], broken):
@@ -271,7 +271,7 @@ def test_vertices_that_are_not_the_models(tmp_path) -> None:
             )
 
 
-def test_a_folder_that_is_there_stays(tmp_path) -> None:
+def test_an_existing_folder_is_not_overwritten(tmp_path) -> None:
     (tmp_path / "mine").mkdir()
     with pytest.raises(InputError, match="exists"):
         make(tmp_path / "mine", SMALL)

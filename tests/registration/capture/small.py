@@ -1,7 +1,7 @@
-"""A small synthetic capture with known everything: a coloured ball of 9 cm with the 68 landmarks on it.
+"""A small synthetic capture with complete ground truth: a coloured ball of 9 cm with the 68 landmarks on it.
 
-Rays are traced through OpenCV's `undistortPoints`, pixel by pixel, so the pictures owe nothing to the image warp
-that the tests look at.
+Rays are traced through OpenCV's `undistortPoints`, pixel by pixel, so the images do not depend on the image
+warp under test.
 """
 
 from dataclasses import replace
@@ -26,10 +26,10 @@ DISTORTIONS = {
 
 
 def camera(
-    turn: float = 0.0, *, distortion: tuple[float, ...] = (), width_px: int = 120, height_px: int = 160
+    yaw_rad: float = 0.0, *, distortion: tuple[float, ...] = (), width_px: int = 120, height_px: int = 160
 ) -> Camera:
-    """45 cm away on a circle around the head, `turn` radians from the front towards the subject's left."""
-    z = -np.array([np.sin(turn), 0.15, np.cos(turn)])
+    """A camera at 45 cm from the head, rotated by `yaw_rad` from the front towards the subject's left."""
+    z = -np.array([np.sin(yaw_rad), 0.15, np.cos(yaw_rad)])
     z /= np.linalg.norm(z)
     x = np.cross([0, -1.0, 0], z)
     x /= np.linalg.norm(x)
@@ -62,8 +62,8 @@ def distorted(cam: Camera, points: Float[np.ndarray, "P 3"]) -> Float[np.ndarray
     return cv2.projectPoints(points, rotation, cam.T_cam_world[:3, 3], cam.intrinsics, coefficients)[0][:, 0]
 
 
-def picture(name: str, cam: Camera) -> ViewArrays:
-    """What the camera sees, distortion included; landmarks on the far side have confidence 0.2."""
+def synthetic_view(name: str, cam: Camera) -> ViewArrays:
+    """A camera's view of the ball, with distortion; landmarks on the far side have confidence 0.2."""
     y, x = np.mgrid[: cam.height_px, : cam.width_px] + 0.5
     grid = np.stack([x, y], -1).reshape(-1, 1, 2)
     coefficients = np.array(cam.distortion) if cam.distortion else None
@@ -107,12 +107,12 @@ def data_lines(path: Path) -> list[str]:
     return [line for line in path.read_text().splitlines() if not line.startswith("#")]
 
 
-TURNS = (-1.0, -0.4, 0.1, 0.5, 1.1)
+YAWS_RAD = (-1.0, -0.4, 0.1, 0.5, 1.1)
 
 
 def make(root: Path, *, distortion: tuple[float, ...] = (), drop: tuple[str, ...] = (), bits: int = 8) -> Path:
     """Write a capture of five views, cam0 to cam4; `drop` names optional parts of the views to leave out."""
-    views = [picture(f"cam{i}", camera(turn, distortion=distortion)) for i, turn in enumerate(TURNS)]
+    views = [synthetic_view(f"cam{i}", camera(yaw_rad, distortion=distortion)) for i, yaw_rad in enumerate(YAWS_RAD)]
     views = [replace(view, **{part: {} if part == "landmarks" else None for part in drop}) for view in views]
     return write_capture(
         root,

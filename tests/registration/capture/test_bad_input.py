@@ -1,4 +1,4 @@
-"""Everything that `gnmreg capture check` and `gnmreg register` must refuse before any compute."""
+"""Invalid captures that `gnmreg capture check` and `gnmreg register` must refuse before any computation."""
 
 import json
 import shutil
@@ -17,14 +17,14 @@ from registration.errors import InputError
 from tests.registration.capture.binary_model import to_binary
 from tests.registration.capture.small import data_lines, make
 
-Spoil = Callable[[Path], None]
-BAD: dict[str, tuple[Spoil, str, str, str, str]] = {}  # name -> how to spoil, what, where (its end), got, fix
+Damage = Callable[[Path], None]
+BAD: dict[str, tuple[Damage, str, str, str, str]] = {}  # name -> damage, what, where (its end), got, fix
 
 
-def bad(what: str, *, where: str, got: str, fix: str) -> Callable[[Spoil], Spoil]:
-    def register(spoil: Spoil) -> Spoil:
-        BAD[spoil.__name__] = (spoil, what, where, got, fix)
-        return spoil
+def bad(what: str, *, where: str, got: str, fix: str) -> Callable[[Damage], Damage]:
+    def register(damage: Damage) -> Damage:
+        BAD[damage.__name__] = (damage, what, where, got, fix)
+        return damage
 
     return register
 
@@ -35,9 +35,9 @@ def edit(path: Path, old: str, new: str, count: int = -1) -> None:
     path.write_text(text.replace(old, new, count))
 
 
-def cut(path: Path, share: float = 0.6) -> None:
+def cut(path: Path, fraction: float = 0.6) -> None:
     content = path.read_bytes()
-    path.write_bytes(content[: int(share * len(content))])
+    path.write_bytes(content[: int(fraction * len(content))])
 
 
 def resize(path: Path) -> None:
@@ -314,9 +314,9 @@ def good(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.mark.parametrize("name", BAD)
 def test_bad_input(good: Path, tmp_path: Path, name: str) -> None:
-    spoil, what, where, got, fix = BAD[name]
+    damage, what, where, got, fix = BAD[name]
     root = shutil.copytree(good, tmp_path / "capture")
-    spoil(root)
+    damage(root)
     before = state(tmp_path)
     with pytest.raises(InputError) as caught:
         check_capture(root, sheet=tmp_path / "sheet.png")

@@ -21,15 +21,15 @@ COLOURS = np.array([[1, 2, 3], [250, 251, 252]], np.uint8)
 
 def cameras() -> dict[str, Camera]:
     rng = np.random.default_rng(0)
-    made = {}
+    by_name = {}
     for number, name in enumerate(NAMES):
         T = np.eye(4)
         T[:3, :3] = Rotation.random(rng=rng).as_matrix()
         T[:3, 3] = rng.normal(size=3)
         intrinsics = np.array([[600.5 + number, 0, 119.25], [0, 601.75, 160.125], [0, 0, 1.0]])
         distortion = ((), (0.1, -0.2, 0.001, 0.002), (0.1, -0.2, 0.001, 0.002, 0.03))[number]
-        made[name] = Camera(width_px=240, height_px=320, intrinsics=intrinsics, T_cam_world=T, distortion=distortion)
-    return made
+        by_name[name] = Camera(width_px=240, height_px=320, intrinsics=intrinsics, T_cam_world=T, distortion=distortion)
+    return by_name
 
 
 @pytest.fixture
@@ -38,16 +38,16 @@ def sparse(tmp_path: Path) -> Path:
     return tmp_path / "sparse"
 
 
-def assert_same(found: dict[str, Camera], expected: dict[str, Camera]) -> None:
-    assert found.keys() == expected.keys()
+def assert_same(actual: dict[str, Camera], expected: dict[str, Camera]) -> None:
+    assert actual.keys() == expected.keys()
     for name, camera in expected.items():
-        np.testing.assert_allclose(found[name].T_cam_world, camera.T_cam_world, atol=1e-14)
-        np.testing.assert_array_equal(found[name].intrinsics, camera.intrinsics)
-        read, written = found[name].distortion, camera.distortion
+        np.testing.assert_allclose(actual[name].T_cam_world, camera.T_cam_world, atol=1e-14)
+        np.testing.assert_array_equal(actual[name].intrinsics, camera.intrinsics)
+        read, written = actual[name].distortion, camera.distortion
         assert (*read, *[0.0] * 8)[:8] == (*written, *[0.0] * 8)[:8]
 
 
-def test_what_is_written_is_read(sparse: Path) -> None:
+def test_a_written_model_is_read_back_equal(sparse: Path) -> None:
     assert_same(read_cameras(sparse), cameras())
     points, colours = read_points(sparse)
     np.testing.assert_array_equal(points, POINTS)
@@ -60,7 +60,7 @@ def test_binary_files_are_read(sparse: Path, tmp_path: Path) -> None:
     np.testing.assert_array_equal(read_points(copy)[0], POINTS)
 
 
-def test_pycolmap_reads_what_we_write_and_we_what_it_writes(sparse: Path, tmp_path: Path) -> None:
+def test_our_files_and_those_of_pycolmap_are_interchangeable(sparse: Path, tmp_path: Path) -> None:
     pycolmap = pytest.importorskip("pycolmap", reason="pycolmap is not installed: make setup-optional")
     text = sparse / "images.txt"
     text.write_text(text.read_text().replace("left/cam 1 (ü).png", "cam1.png"))  # it cuts names at a space
@@ -87,7 +87,7 @@ def test_parameter_counts_are_pycolmaps() -> None:
 
 
 def test_a_rigs_poses_are_the_images(sparse: Path) -> None:
-    """Two cameras on one rig, the second with a pose in it: consistent, then moved."""
+    """Two cameras on one rig, the second with a pose in it: consistent, then displaced."""
     first, second = (cameras()[name].T_cam_world for name in (NAMES[0], NAMES[2]))
     numbers = {image.split()[-1]: image.split()[0] for image in (sparse / "images.txt").read_text().splitlines()[3::2]}
     assert numbers["cam2.png"] == "3"
@@ -100,9 +100,9 @@ def test_a_rigs_poses_are_the_images(sparse: Path) -> None:
     rig.write_text(f"5 2 CAMERA 1 CAMERA 3 1 {pose(second @ np.linalg.inv(first))}\n")
     (sparse / "frames.txt").write_text(f"9 5 {pose(first)} 2 CAMERA 1 1 CAMERA 3 3\n")
     assert_same(read_cameras(sparse), cameras())
-    moved = np.eye(4)
-    moved[0, 3] = 0.01
-    rig.write_text(f"5 2 CAMERA 1 CAMERA 3 1 {pose(moved @ second @ np.linalg.inv(first))}\n")
+    translation = np.eye(4)
+    translation[0, 3] = 0.01
+    rig.write_text(f"5 2 CAMERA 1 CAMERA 3 1 {pose(translation @ second @ np.linalg.inv(first))}\n")
     with pytest.raises(InputError, match="not that of its frame") as caught:
         read_cameras(sparse)
     assert "cam2.png" in str(caught.value)
@@ -161,7 +161,7 @@ def edit(file: str, old: str, new: str) -> Callable[[Path], None]:
     return change
 
 
-def test_where_a_text_file_is_malformed_is_named(sparse: Path) -> None:
+def test_errors_name_the_malformed_line_of_a_text_file(sparse: Path) -> None:
     damages = {
         "cameras.txt, line 3": [
             edit("cameras.txt", "PINHOLE 240", "PINHOLE wide"),

@@ -1,4 +1,4 @@
-"""What a spoiled copy differs in, measured on its files."""
+"""Differences between a capture and its degraded copy, measured on the files."""
 
 import shutil
 import tomllib
@@ -18,23 +18,32 @@ from registration.capture.scan import read_scan
 from registration.errors import InputError
 from registration.types import Capture, View
 from tests.conftest import SHARED, needs_shared
-from tests.registration.capture.small import CLASSES, DISTORTIONS, ball, camera, distorted, landmarks_68, make, picture
+from tests.registration.capture.small import (
+    CLASSES,
+    DISTORTIONS,
+    ball,
+    camera,
+    distorted,
+    landmarks_68,
+    make,
+    synthetic_view,
+)
 
-TURNS = (-1.2, -0.8, -0.3, 0.1, 0.4, 0.8, 1.1)
+YAWS_RAD = (-1.2, -0.8, -0.3, 0.1, 0.4, 0.8, 1.1)
 MANY = 1000  # landmarks of a second scheme, for statistics
 FOLDERS = ("images", "masks", "normals", "segmentation", "landmarks")
 
 
 @pytest.fixture(scope="module")
 def source(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Seven views of the ball, 240 x 320, in one lens each; two in a subfolder."""
+    """Seven views of the ball, 240 x 320, each with its own distortion; two in a subfolder."""
     sphere = np.random.default_rng(0).standard_normal((MANY, 3))
     sphere *= 0.09 / np.linalg.norm(sphere, axis=-1, keepdims=True)
     views = []
-    for number, turn in enumerate(TURNS):
+    for number, yaw_rad in enumerate(YAWS_RAD):
         lens = DISTORTIONS["OPENCV"] if number == 2 else ()
-        cam = camera(turn, distortion=lens, width_px=240, height_px=320)
-        view = picture(f"left/cam{number}" if number < 2 else f"cam{number}", cam)
+        cam = camera(yaw_rad, distortion=lens, width_px=240, height_px=320)
+        view = synthetic_view(f"left/cam{number}" if number < 2 else f"cam{number}", cam)
         many = np.column_stack([distorted(cam, sphere), np.where(np.arange(MANY) % 2, 1.0, 0.2)])
         views.append(replace(view, landmarks={**view.landmarks, "many": many}))
     root = tmp_path_factory.mktemp("source") / "capture"
@@ -46,12 +55,12 @@ def source(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module", params=["studio", "harsh"])
-def spoiled(request: pytest.FixtureRequest, source: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def degraded(request: pytest.FixtureRequest, source: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return degrade(source, tmp_path_factory.mktemp(request.param) / "capture", preset=PRESETS[request.param], seed=5)
 
 
-def amount(root: Path) -> int:
-    """How many times the figures of "studio" the copy should have."""
+def preset_factor(root: Path) -> int:
+    """The copy's expected errors as a multiple of the preset "studio"."""
     return 2 if "preset harsh" in native.read_capture(root).tags["spoiled"] else 1
 
 
@@ -61,7 +70,7 @@ def pairs(source: Path, target: Path) -> list[tuple[View, View]]:
 
 
 def load(path: Path | None) -> np.ndarray:
-    """Pixels in the file's own depth, BGR or gray."""
+    """Pixels in the file's bit depth, BGR or gray."""
     pixels = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
     assert pixels is not None
     return pixels
@@ -88,43 +97,43 @@ def boundary_band(regions: np.ndarray, radius_px: int) -> np.ndarray:
     return cv2.dilate(regions, disc) != cv2.erode(regions, disc)
 
 
-def test_cameras_are_off_by_what_the_preset_says(source: Path, spoiled: Path) -> None:
+def test_camera_errors_equal_those_of_the_preset(source: Path, degraded: Path) -> None:
     points = read_scan(source / "scan.ply").vertices
-    turns, moves, zooms = [], [], []
-    for before, after in pairs(source, spoiled):
+    angles, distances, zooms = [], [], []
+    for before, after in pairs(source, degraded):
         old, new = before.camera, after.camera
         plain = [distorted(replace(cam, distortion=()), points) for cam in (old, new)]
-        off_px = np.sqrt(((plain[1] - plain[0]) ** 2).sum(-1).mean())
-        assert off_px == pytest.approx(0.3 * amount(spoiled), rel=0.03)
+        error_px = np.sqrt(((plain[1] - plain[0]) ** 2).sum(-1).mean())
+        assert error_px == pytest.approx(0.3 * preset_factor(degraded), rel=0.03)
         assert new.distortion == pytest.approx(old.distortion)
         assert (new.width_px, new.height_px) == (old.width_px, old.height_px)
         np.testing.assert_array_equal(new.intrinsics[:2, 2], old.intrinsics[:2, 2])
         zoom = new.intrinsics[[0, 1], [0, 1]] / old.intrinsics[[0, 1], [0, 1]]
         assert zoom[0] == pytest.approx(zoom[1])
         relative = new.T_cam_world[:3, :3] @ old.T_cam_world[:3, :3].T
-        turns.append(np.arccos(np.clip((np.trace(relative) - 1) / 2, -1, 1)))
-        moves.append(np.linalg.norm(new.centre - old.centre))
+        angles.append(np.arccos(np.clip((np.trace(relative) - 1) / 2, -1, 1)))
+        distances.append(np.linalg.norm(new.centre - old.centre))
         zooms.append(zoom[0] - 1)
-    # A pixel at this focal length is 2 mrad or 0.9 mm; a zoom of 1 % moves the ball's rim by less than a pixel.
-    assert 1e-5 < min(turns) and max(turns) < 5e-3
-    assert 1e-6 < min(moves) and max(moves) < 3e-3
+    # A pixel at this focal length is 2 mrad or 0.9 mm; a zoom of 1 % moves the ball's outline by less than a pixel.
+    assert 1e-5 < min(angles) and max(angles) < 5e-3
+    assert 1e-6 < min(distances) and max(distances) < 3e-3
     assert 1e-6 < np.abs(zooms).max() < 1e-2 and np.std(zooms) > 1e-6
 
 
-def test_landmarks_tell_where_the_subject_is_without_a_scan(tmp_path: Path) -> None:
+def test_without_a_scan_landmarks_give_the_position_of_the_subject(tmp_path: Path) -> None:
     bare = make(tmp_path / "bare")
     (bare / "scan.ply").unlink()
     degrade(bare, tmp_path / "out", preset=DegradationPreset(name="cameras", camera_rms_px=1.0))
     for before, after in pairs(bare, tmp_path / "out"):
-        moved = after.camera.project(landmarks_68())[0] - before.camera.project(landmarks_68())[0]
-        assert np.sqrt((moved**2).sum(-1).mean()) == pytest.approx(1.0, rel=0.02)
+        displacement_px = after.camera.project(landmarks_68())[0] - before.camera.project(landmarks_68())[0]
+        assert np.sqrt((displacement_px**2).sum(-1).mean()) == pytest.approx(1.0, rel=0.02)
 
 
-def test_normals_turn_smoothly_and_some_are_wrong(source: Path, spoiled: Path) -> None:
-    times = amount(spoiled)
-    correlation_px = 8 * times
+def test_normals_have_smooth_rotations_and_outliers(source: Path, degraded: Path) -> None:
+    factor = preset_factor(degraded)
+    correlation_px = 8 * factor
     squares, wrong, count, products = 0.0, 0, 0, {lag: [] for lag in (1, correlation_px, 3 * correlation_px)}
-    for before, after in pairs(source, spoiled):
+    for before, after in pairs(source, degraded):
         if after.normals is None:
             continue
         assert load(after.normals).dtype == np.uint16
@@ -133,123 +142,126 @@ def test_normals_turn_smoothly_and_some_are_wrong(source: Path, spoiled: Path) -
         np.testing.assert_array_equal(load(after.normals).any(-1), subject)
         assert np.abs(np.linalg.norm(new[subject], axis=-1) - 1).max() < 1e-3
         angle = np.degrees(np.arctan2(np.linalg.norm(np.cross(old, new), axis=-1), (old * new).sum(-1)))
-        good = subject & (angle < 15 * times)  # of Rayleigh's distribution 1e-4 is above three times its rms
+        # In a Rayleigh distribution a fraction of 1e-4 exceeds three times the rms.
+        good = subject & (angle < 15 * factor)
         wrong += (subject & ~good).sum()
         assert new[subject & ~good][:, 2].max() < 0  # towards the camera
         count += subject.sum()
         squares += (angle[good] ** 2).sum()
         error = new - old
-        for lag, found in products.items():
-            both = good[:, lag:] & good[:, :-lag]
-            found.append((error[:, lag:] * error[:, :-lag]).sum(-1)[both].mean())
+        for lag, covariances in products.items():
+            both_good = good[:, lag:] & good[:, :-lag]
+            covariances.append((error[:, lag:] * error[:, :-lag]).sum(-1)[both_good].mean())
     variance = squares / count * np.radians(1) ** 2
-    assert np.sqrt(squares / count) == pytest.approx(5 * times, rel=0.08)
-    # Of random directions towards the camera one in thirty, and with 30 degrees one in eight, lies near.
-    assert 0.75 * 0.02 * times < wrong / count < 0.02 * times
-    near, at, far = (np.mean(found) / variance for found in products.values())
-    assert near > 0.93 and 0.22 < at < 0.48 and abs(far) < 0.12
+    assert np.sqrt(squares / count) == pytest.approx(5 * factor, rel=0.08)
+    # A random direction towards the camera is within the limit by chance in 1 of 30 cases (at 30 degrees 1 of 8).
+    assert 0.75 * 0.02 * factor < wrong / count < 0.02 * factor
+    near, middle, far = (np.mean(covariances) / variance for covariances in products.values())
+    assert near > 0.93 and 0.22 < middle < 0.48 and abs(far) < 0.12
 
 
-def test_landmarks_have_noise_and_confident_outliers(source: Path, spoiled: Path) -> None:
-    times = amount(spoiled)
-    moved = []
-    for before, after in pairs(source, spoiled):
+def test_landmarks_have_noise_and_confident_outliers(source: Path, degraded: Path) -> None:
+    factor = preset_factor(degraded)
+    displacements = []
+    for before, after in pairs(source, degraded):
         assert set(after.landmarks) == {"68", "many"}
         for scheme, points in after.landmarks.items():
             np.testing.assert_array_equal(points[:, 2], before.landmarks[scheme][:, 2])
-        moved.append((after.landmarks["many"] - before.landmarks["many"])[:, :2])
-    off = np.concatenate(moved)
-    distance = np.linalg.norm(off, axis=-1)
+        displacements.append((after.landmarks["many"] - before.landmarks["many"])[:, :2])
+    errors = np.concatenate(displacements)
+    distance = np.linalg.norm(errors, axis=-1)
     outlier = distance > 19.9
-    assert outlier.mean() == pytest.approx(0.05 * times, rel=0.25)
+    assert outlier.mean() == pytest.approx(0.05 * factor, rel=0.25)
     assert distance.max() < 80.001 and 45 < distance[outlier].mean() < 55
-    assert np.abs(off[outlier].mean(0)).max() < 12  # in all directions
-    np.testing.assert_allclose(off[~outlier].std(0), 2.0 * times, rtol=0.06)
-    np.testing.assert_allclose(off[~outlier].mean(0), 0, atol=0.2 * times)
-    assert abs(np.corrcoef(moved[0][:, 0], moved[1][:, 0])[0, 1]) < 0.15  # views by themselves
+    assert np.abs(errors[outlier].mean(0)).max() < 12  # in all directions
+    np.testing.assert_allclose(errors[~outlier].std(0), 2.0 * factor, rtol=0.06)
+    np.testing.assert_allclose(errors[~outlier].mean(0), 0, atol=0.2 * factor)
+    assert abs(np.corrcoef(displacements[0][:, 0], displacements[1][:, 0])[0, 1]) < 0.15  # views are independent
 
 
-def test_masks_grow_and_shrink(source: Path, spoiled: Path) -> None:
-    most_px = 2.0 * amount(spoiled)
+def test_masks_grow_and_shrink(source: Path, degraded: Path) -> None:
+    max_px = 2.0 * preset_factor(degraded)
     grown = []
-    for before, after in pairs(source, spoiled):
+    for before, after in pairs(source, degraded):
         old, new = load(before.mask), load(after.mask)
         assert new.dtype == np.uint8 and new.max() == 255 and new.min() == 0
-        assert (old == new)[~boundary_band(old, int(most_px) + 1)].all()
+        assert (old == new)[~boundary_band(old, int(max_px) + 1)].all()
         areas = old.sum() / 255, new.sum() / 255
         grown.append((areas[1] - areas[0]) / (2 * np.sqrt(np.pi * np.mean(areas))))  # over a circle's perimeter
-    assert np.abs(grown).max() < 1.1 * most_px  # the image of a ball at the side is an ellipse
-    assert np.abs(grown).max() > 0.3 * most_px and np.std(grown) > 0.2 * most_px
+    assert np.abs(grown).max() < 1.1 * max_px  # the image of a ball at the side is an ellipse
+    assert np.abs(grown).max() > 0.3 * max_px and np.std(grown) > 0.2 * max_px
 
 
-def test_labels_move_by_class(source: Path, spoiled: Path) -> None:
-    most_px = 2 * amount(spoiled)
-    rim, middle = [], []
-    for before, after in pairs(source, spoiled):
+def test_labels_move_by_class(source: Path, degraded: Path) -> None:
+    max_px = 2 * preset_factor(degraded)
+    outline, middle = [], []
+    for before, after in pairs(source, degraded):
         old, new = load(before.segmentation), load(after.segmentation)
         assert new.dtype == np.uint8 and set(np.unique(new)) == set(np.unique(old))
-        assert (old == new)[~boundary_band(old, most_px + 1)].all()
+        assert (old == new)[~boundary_band(old, max_px + 1)].all()
         areas = [(labels > 0).sum() for labels in (old, new)]
-        rim.append((areas[1] - areas[0]) / (2 * np.sqrt(np.pi * np.mean(areas))))
-        inner = cv2.erode((old > 0).astype(np.uint8), np.ones((4 * most_px + 1,) * 2)) > 0
+        outline.append((areas[1] - areas[0]) / (2 * np.sqrt(np.pi * np.mean(areas))))
+        inner = cv2.erode((old > 0).astype(np.uint8), np.ones((4 * max_px + 1,) * 2)) > 0
         line_px = (np.diff((old == 2).astype(int), axis=1) != 0)[inner[:, 1:]].sum()
-        if line_px > 50:  # columns of right next to left
+        if line_px > 50:  # columns at the border between right and left
             middle.append(((new == 2) & inner).sum() / line_px - ((old == 2) & inner).sum() / line_px)
-    for moved in (rim, middle):
-        assert 0.2 * most_px < np.abs(moved).max() < 1.15 * most_px
-    assert np.std(rim) > 0.15 * most_px
+    for offsets_px in (outline, middle):
+        assert 0.2 * max_px < np.abs(offsets_px).max() < 1.15 * max_px
+    assert np.std(outline) > 0.15 * max_px
 
 
-def test_light_has_another_gain_and_noise(source: Path, spoiled: Path) -> None:
-    times = amount(spoiled)
+def test_images_have_different_gains_and_noise(source: Path, degraded: Path) -> None:
+    factor = preset_factor(degraded)
     gains = []
-    for before, after in pairs(source, spoiled):
+    for before, after in pairs(source, degraded):
         assert load(after.image).dtype == np.uint8
         old, new = linear(before.image), linear(after.image)
         gain = new.mean((0, 1)) / old.mean((0, 1))
         gains.append(gain)
         noise = (new - gain * old) / np.sqrt(gain * old)
-        assert noise.std() == pytest.approx(0.02 * times, rel=0.05)
+        assert noise.std() == pytest.approx(0.02 * factor, rel=0.05)
         assert abs((noise[:, 1:] * noise[:, :-1]).mean()) < 0.05 * noise.var()
-    spread = np.array(gains)
-    common = spread.mean(-1, keepdims=True)
-    assert np.abs(common - 1).max() < 0.1 * times + 0.02
-    assert common.std() > 0.02 * times
-    assert 0.001 < np.abs(spread / common - 1).max() < 0.04 * times
+    gains_rgb = np.array(gains)
+    common = gains_rgb.mean(-1, keepdims=True)
+    assert np.abs(common - 1).max() < 0.1 * factor + 0.02
+    assert common.std() > 0.02 * factor
+    assert 0.001 < np.abs(gains_rgb / common - 1).max() < 0.04 * factor
 
 
-def test_views_are_dropped_whole(source: Path, spoiled: Path) -> None:
-    kept = {view.name for view in native.read_capture(spoiled).views}
+def test_dropped_views_lose_all_their_files(source: Path, degraded: Path) -> None:
+    kept = {view.name for view in native.read_capture(degraded).views}
     all_names = {view.name for view in native.read_capture(source).views}
-    assert kept < all_names and len(kept) == len(all_names) - (1 if amount(spoiled) == 1 else 3)
-    normals = {str(path.relative_to(spoiled / "normals").with_suffix("")) for path in spoiled.glob("normals/**/*.png")}
+    assert kept < all_names and len(kept) == len(all_names) - (1 if preset_factor(degraded) == 1 else 3)
+    normals = {
+        str(path.relative_to(degraded / "normals").with_suffix("")) for path in degraded.glob("normals/**/*.png")
+    }
     for folder in FOLDERS:
-        names = {str(path.relative_to(spoiled / folder).with_suffix("")) for path in (spoiled / folder).rglob("*.*")}
+        names = {str(path.relative_to(degraded / folder).with_suffix("")) for path in (degraded / folder).rglob("*.*")}
         assert names == (normals if folder == "normals" else kept)
-    assert len(kept) - len(normals) == (0 if amount(spoiled) == 1 else 1)
-    told = native.read_capture(spoiled).tags["spoiled"]
-    assert all(name in told for name in all_names - kept)
+    assert len(kept) - len(normals) == (0 if preset_factor(degraded) == 1 else 1)
+    description = native.read_capture(degraded).tags["spoiled"]
+    assert all(name in description for name in all_names - kept)
 
 
-def test_the_truth_and_the_tags_stay_and_the_copy_is_sound(source: Path, spoiled: Path) -> None:
-    old, new = files(source), files(spoiled)
+def test_ground_truth_and_tags_are_kept_and_the_copy_is_valid(source: Path, degraded: Path) -> None:
+    old, new = files(source), files(degraded)
     for name in ("scan.ply", "ground_truth.npz"):
         assert new[name] == old[name]
     settings = tomllib.loads(new["capture.toml"].decode())
     assert settings.pop("spoiled").startswith("preset ")
     assert settings == tomllib.loads(old["capture.toml"].decode())
-    report = check_capture(spoiled)
+    report = check_capture(degraded)
     assert report.eye_distance_mm == pytest.approx(90, abs=4)
-    assert [path.name for path in spoiled.parent.iterdir()] == ["capture"]
+    assert [path.name for path in degraded.parent.iterdir()] == ["capture"]
 
 
 @pytest.mark.parametrize("bits", [8, 16])
-def test_none_changes_nothing(bits: int, tmp_path: Path) -> None:
+def test_the_preset_none_changes_nothing(bits: int, tmp_path: Path) -> None:
     source = make(tmp_path / "source", distortion=DISTORTIONS["FULL_OPENCV"], bits=bits)
     degrade(source, tmp_path / "copy", preset=PRESETS["none"], seed=3)
-    found = pairs(source, tmp_path / "copy")
-    assert len(found) == 5
-    for before, after in found:
+    view_pairs = pairs(source, tmp_path / "copy")
+    assert len(view_pairs) == 5
+    for before, after in view_pairs:
         for old, new in (
             (before.image, after.image),
             (before.mask, after.mask),
@@ -265,7 +277,7 @@ def test_none_changes_nothing(bits: int, tmp_path: Path) -> None:
     assert "0.03" in (tmp_path / "copy" / "sparse" / "points3D.txt").read_text()
 
 
-def test_deep_images_stay_deep(tmp_path: Path) -> None:
+def test_images_of_16_bits_stay_so(tmp_path: Path) -> None:
     source = make(tmp_path / "source", bits=16)
     degrade(source, tmp_path / "copy", preset=PRESETS["studio"])
     for before, after in pairs(source, tmp_path / "copy"):
@@ -274,7 +286,7 @@ def test_deep_images_stay_deep(tmp_path: Path) -> None:
         assert linear(after.image).mean() == pytest.approx(linear(before.image).mean(), rel=0.13)
 
 
-def test_one_seed_is_one_copy(tmp_path: Path) -> None:
+def test_equal_seeds_give_equal_copies(tmp_path: Path) -> None:
     source = make(tmp_path / "source")
     copies = [
         files(degrade(source, tmp_path / f"copy{i}", preset=PRESETS["studio"], seed=seed))
@@ -286,16 +298,16 @@ def test_one_seed_is_one_copy(tmp_path: Path) -> None:
             assert copies[0][name] != copies[2][name], name
 
 
-def test_a_view_can_be_broken(tmp_path: Path) -> None:
+def test_faults_of_single_views(tmp_path: Path) -> None:
     source = make(tmp_path / "source")
-    ramp = np.arange(100, 220, dtype=np.uint8)[:, None]  # over the image's width; beyond 167 it will be clipped
+    ramp = np.arange(100, 220, dtype=np.uint8)[:, None]  # over the image's width; values above 167 will be clipped
     cv2.imwrite(str(source / "images" / "cam2.png"), np.tile(ramp, (160, 1, 3)))
     faults = {"cam0": ["shifted"], "cam1": ["black"], "cam2": ["exposure"], "cam3": ["black", "shifted"]}
     degrade(source, tmp_path / "copy", preset=PRESETS["none"], faults=faults)
-    found = dict(
+    view_pairs = dict(
         zip((view.name for view in native.read_capture(source).views), pairs(source, tmp_path / "copy"), strict=True)
     )
-    for name, (before, after) in found.items():
+    for name, (before, after) in view_pairs.items():
         shift = 30 if "shifted" in faults.get(name, []) else 0
         np.testing.assert_allclose(after.landmarks["68"], before.landmarks["68"] + [shift, 0, 0], atol=1e-9)
         np.testing.assert_allclose(after.camera.T_cam_world, before.camera.T_cam_world, rtol=0, atol=1e-14)
@@ -308,15 +320,15 @@ def test_a_view_can_be_broken(tmp_path: Path) -> None:
             np.testing.assert_array_equal(load(new)[:, shift:], load(old)[:, : 120 - shift])
             assert (load(new)[:, :shift] == load(old)[:, :1]).all()
     for name in ("cam1", "cam3"):
-        assert load(found[name][1].image).max() == 0
-    old, new = (linear(view.image) for view in found["cam2"])
+        assert load(view_pairs[name][1].image).max() == 0
+    old, new = (linear(view.image) for view in view_pairs["cam2"])
     bright = 2.5 * old > 1.01
     assert 0.02 < bright.mean() < 0.98
     assert (new[bright] == 1).all()
     np.testing.assert_allclose(new[~bright], 2.5 * old[~bright], atol=0.006)  # half a step of 8 bits
 
 
-def test_a_broken_view_stays_and_leaves_the_others_alone(tmp_path: Path) -> None:
+def test_a_view_with_a_fault_is_kept_and_other_views_are_unchanged(tmp_path: Path) -> None:
     source = make(tmp_path / "source")
     names = [f"cam{i}" for i in range(5)]
     plain = files(degrade(source, tmp_path / "plain", preset=PRESETS["studio"], seed=2))
@@ -346,7 +358,9 @@ def test_a_broken_view_stays_and_leaves_the_others_alone(tmp_path: Path) -> None
         ({"seed": -1}, "seed is out of range", "-1"),
     ],
 )
-def test_bad_wishes_are_told_before_anything_is_written(options: dict, what: str, got: str, tmp_path: Path) -> None:
+def test_invalid_options_are_refused_before_anything_is_written(
+    options: dict, what: str, got: str, tmp_path: Path
+) -> None:
     source = make(tmp_path / "source")
     with pytest.raises(InputError) as error:
         degrade(source, tmp_path / "out" / "copy", **{"preset": PRESETS["studio"], **options})
@@ -354,7 +368,7 @@ def test_bad_wishes_are_told_before_anything_is_written(options: dict, what: str
     assert list(tmp_path.iterdir()) == [source]
 
 
-def test_bad_captures_are_told_before_anything_is_written(tmp_path: Path) -> None:
+def test_invalid_captures_are_refused_before_anything_is_written(tmp_path: Path) -> None:
     source = make(tmp_path / "source")
     copy = degrade(source, tmp_path / "copy", preset=PRESETS["studio"])
     before = files(tmp_path)
@@ -379,7 +393,7 @@ def test_bad_captures_are_told_before_anything_is_written(tmp_path: Path) -> Non
 @needs_shared
 @pytest.mark.parametrize("name", ["ict_dev/neutral", "gnm_identity_a/happy"])
 @pytest.mark.parametrize("preset", ["studio", "harsh"])
-def test_spoiled_heads_are_sound_captures(name: str, preset: str, tmp_path: Path) -> None:
+def test_degraded_heads_are_valid_captures(name: str, preset: str, tmp_path: Path) -> None:
     source = SHARED / "data" / "captures" / name
     report = check_capture(degrade(source, tmp_path / "copy", preset=PRESETS[preset], seed=1))
     capture: Capture = report.capture

@@ -20,13 +20,13 @@ from tests.conftest import SHARED, needs_shared
 from tests.registration.capture.small import (
     CLASSES,
     DISTORTIONS,
-    TURNS,
+    YAWS_RAD,
     ball,
     camera,
     data_lines,
     landmarks_68,
     make,
-    picture,
+    synthetic_view,
 )
 
 GREEN, MAGENTA, RED, YELLOW, BLUE = (70, 255, 90), (255, 90, 220), (255, 50, 40), (255, 210, 60), (60, 200, 255)
@@ -38,8 +38,8 @@ def test_the_report_of_a_good_capture(tmp_path: Path) -> None:
     assert report.schemes == {"68": (68, 68)}
     assert report.eye_distance_mm == pytest.approx(90, abs=1e-6)
     assert report.sheet is None and list(tmp_path.iterdir()) == [tmp_path / "capture"]
-    for view, turn in zip(report.views, TURNS, strict=True):
-        plain = picture(view.name, camera(turn, distortion=DISTORTIONS["OPENCV"]))
+    for view, yaw_rad in zip(report.views, YAWS_RAD, strict=True):
+        plain = synthetic_view(view.name, camera(yaw_rad, distortion=DISTORTIONS["OPENCV"]))
         assert plain.mask is not None and view.coverage == pytest.approx(plain.mask.mean(), abs=1e-6)
         assert view.landmarks == (plain.landmarks["68"][:, 2] > 0.5).sum() and view.residual_px < 1e-3
         assert view.outliers == ()
@@ -65,48 +65,48 @@ def test_the_report_says_when_the_topology_of_the_scan_is_not_checked(
     assert f"scan's topology: {NO_TOPOLOGY}" in str(check_capture(make(tmp_path / "capture")))
 
 
-def spoil_landmarks(root: Path, name: str, change: Callable[[np.ndarray], None]) -> None:
+def edit_landmarks(root: Path, name: str, change: Callable[[np.ndarray], None]) -> None:
     path = root / "landmarks" / f"{name}.json"
     rows = np.array(json.loads(path.read_text())["68"])
     change(rows)
     path.write_text(json.dumps({"68": rows.tolist()}))
 
 
-def test_landmarks_that_other_views_contradict_are_named(tmp_path: Path) -> None:
+def test_landmarks_that_contradict_other_views_are_reported(tmp_path: Path) -> None:
     def move(rows: np.ndarray) -> None:
         rows[[36, 37], 0] += 9
 
     root = make(tmp_path / "capture")
-    spoil_landmarks(root, "cam2", move)
+    edit_landmarks(root, "cam2", move)
     report = check_capture(root)
     assert report.warnings == ("cam2: landmarks that contradict the other views: 36, 37",)
     assert [view.outliers for view in report.views] == [(), (), (36, 37), (), ()]
     assert report.eye_distance_mm == pytest.approx(90, abs=1e-6)
 
 
-def test_a_jaw_in_the_wrong_order_is_told(tmp_path: Path) -> None:
-    def turn(rows: np.ndarray) -> None:
+def test_a_jaw_in_the_wrong_order_is_reported(tmp_path: Path) -> None:
+    def reverse(rows: np.ndarray) -> None:
         rows[2:7] = rows[2:7][::-1].copy()
 
     root = make(tmp_path / "capture")
-    for number in range(len(TURNS)):
-        spoil_landmarks(root, f"cam{number}", turn)
+    for number in range(len(YAWS_RAD)):
+        edit_landmarks(root, f"cam{number}", reverse)
     assert [warning for warning in check_capture(root).warnings if "2, 3, 4, 5, 6 go backwards" in warning]
 
 
-def test_landmarks_seen_once_are_told(tmp_path: Path) -> None:
+def test_landmarks_seen_by_one_view_are_reported(tmp_path: Path) -> None:
     def hide(rows: np.ndarray) -> None:
         rows[[45, 50], 2] = 0.5
 
     root = make(tmp_path / "capture")
-    for number in range(1, len(TURNS)):
-        spoil_landmarks(root, f"cam{number}", hide)
+    for number in range(1, len(YAWS_RAD)):
+        edit_landmarks(root, f"cam{number}", hide)
     report = check_capture(root)
     assert report.schemes == {"68": (68, 66)} and report.eye_distance_mm is None
     assert report.warnings == ("landmarks 68: not triangulated, no two views agree: 45, 50",)
 
 
-def test_missing_parts_are_told(tmp_path: Path) -> None:
+def test_missing_parts_are_reported(tmp_path: Path) -> None:
     root = make(tmp_path / "capture", drop=("normals", "landmarks"))
     (root / "masks" / "cam1.png").unlink()
     (root / "scan.ply").unlink()
@@ -121,10 +121,10 @@ def test_missing_parts_are_told(tmp_path: Path) -> None:
     assert (tmp_path / "sheet.png").is_file()
 
 
-def test_several_schemes_of_several_lengths(tmp_path: Path) -> None:
+def test_landmark_schemes_may_have_different_lengths(tmp_path: Path) -> None:
     views = []
-    for number, turn in enumerate(TURNS):
-        view = picture(f"cam{number}", camera(turn))
+    for number, yaw_rad in enumerate(YAWS_RAD):
+        view = synthetic_view(f"cam{number}", camera(yaw_rad))
         views.append(replace(view, landmarks={"5": view.landmarks["68"][:5], **view.landmarks}))
     root = write_capture(
         tmp_path / "capture", views, CaptureDescription(subject="s", expression="e", classes=CLASSES), scan=ball()
@@ -134,14 +134,14 @@ def test_several_schemes_of_several_lengths(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("scale", [1000.0, 0.01])
-def test_a_scan_in_other_units_is_told(tmp_path: Path, scale: float) -> None:
+def test_a_scan_in_other_units_is_reported(tmp_path: Path, scale: float) -> None:
     root = make(tmp_path / "capture")
     write_ply(root / "scan.ply", ball(scale).vertices, ball().triangles)
     (warning,) = check_capture(root).warnings
     assert "check its frame and unit" in warning
 
 
-def test_distortion_that_folds_is_told(tmp_path: Path) -> None:
+def test_distortion_that_folds_is_reported(tmp_path: Path) -> None:
     root = make(tmp_path / "capture")
     path = root / "sparse" / "cameras.txt"
     lines = data_lines(path)
@@ -160,14 +160,14 @@ def test_cheap_checks_of_all_views_come_before_any_decoding(tmp_path: Path) -> N
         check_capture(root)
 
 
-def test_png_files_with_bytes_behind_their_end_are_whole(tmp_path: Path) -> None:
+def test_png_files_with_trailing_bytes_are_valid(tmp_path: Path) -> None:
     root = make(tmp_path / "capture")
     for path in (root / "images").iterdir():
         path.write_bytes(path.read_bytes() + b"appended by a camera")
     assert check_capture(root).warnings == ()
 
 
-def test_captures_from_other_readers_are_checked_too(tmp_path: Path) -> None:
+def test_captures_from_other_readers_are_checked(tmp_path: Path) -> None:
     capture = native.read_capture(make(tmp_path / "capture"))
     first = capture.views[0]
     for name, value, what in (
@@ -189,14 +189,14 @@ def near(pixels: np.ndarray, x: float, y: float, colour: tuple[int, int, int], r
     return bool((np.abs(patch - colour).max(-1) < 30).any())
 
 
-def test_the_sheet_shows_everything_where_it_is(tmp_path: Path) -> None:
+def test_the_contact_sheet_shows_landmarks_scan_and_mask_in_position(tmp_path: Path) -> None:
     """Landmarks, scan points and mask outline, in a distorted capture, in the first tile."""
 
     def move(rows: np.ndarray) -> None:
         rows[36, 0] -= 9
 
     root = make(tmp_path / "capture", distortion=DISTORTIONS["OPENCV"])
-    spoil_landmarks(root, "cam0", move)
+    edit_landmarks(root, "cam0", move)
     report = check_capture(root, sheet=tmp_path / "new" / "sheet.png")
     assert list((tmp_path / "new").iterdir()) == [tmp_path / "new" / "sheet.png"] and report.sheet is not None
     sheet = cv2.imread(str(report.sheet))[..., ::-1]
@@ -221,7 +221,7 @@ def test_the_sheet_shows_everything_where_it_is(tmp_path: Path) -> None:
     assert sheet.shape[0] >= 72 + height + CAPTION_PX
 
 
-def test_a_point_cloud_is_drawn_too(tmp_path: Path) -> None:
+def test_the_contact_sheet_shows_a_point_cloud(tmp_path: Path) -> None:
     root = make(tmp_path / "capture")
     cloud: Scan = replace(ball(), triangles=np.zeros((0, 3), np.int64))
     write_ply(root / "scan.ply", cloud.vertices, cloud.triangles)

@@ -13,16 +13,25 @@ from registration.capture.scan import read_scan, read_truth
 from registration.errors import InputError
 from tests.conftest import SHARED, needs_shared
 from tests.registration.capture.binary_model import to_binary
-from tests.registration.capture.small import CLASSES, DISTORTIONS, TURNS, ball, camera, landmarks_68, make, picture
+from tests.registration.capture.small import (
+    CLASSES,
+    DISTORTIONS,
+    YAWS_RAD,
+    ball,
+    camera,
+    landmarks_68,
+    make,
+    synthetic_view,
+)
 
 
 def test_round_trip(tmp_path: Path) -> None:
     capture = native.read_capture(make(tmp_path / "capture", distortion=DISTORTIONS["OPENCV"]))
     assert (capture.subject, capture.expression, capture.classes) == ("ball", "neutral", CLASSES)
     assert capture.tags == {"age": 30, "notes": 'with "quotes"', "lists": [1.5, 2.5], "real": False}
-    assert [view.name for view in capture.views] == [f"cam{i}" for i in range(len(TURNS))]
-    for view, turn in zip(capture.views, TURNS, strict=True):
-        expected = picture(view.name, camera(turn, distortion=DISTORTIONS["OPENCV"]))
+    assert [view.name for view in capture.views] == [f"cam{i}" for i in range(len(YAWS_RAD))]
+    for view, yaw_rad in zip(capture.views, YAWS_RAD, strict=True):
+        expected = synthetic_view(view.name, camera(yaw_rad, distortion=DISTORTIONS["OPENCV"]))
         assert view.camera.distortion == expected.camera.distortion
         np.testing.assert_array_equal(view.camera.intrinsics, expected.camera.intrinsics)
         np.testing.assert_allclose(view.camera.T_cam_world, expected.camera.T_cam_world, atol=1e-14)
@@ -60,7 +69,7 @@ def test_every_camera_model_projects_as_in_colmap(tmp_path: Path, model: str, pa
     pycolmap = pytest.importorskip("pycolmap", reason="pycolmap is not installed: make setup-optional")
     root = make(tmp_path / "capture")
     (root / "sparse" / "cameras.txt").write_text(
-        "".join(f"{i} {model} 120 160 {parameters}\n" for i in range(1, 1 + len(TURNS)))
+        "".join(f"{i} {model} 120 160 {parameters}\n" for i in range(1, 1 + len(YAWS_RAD)))
     )
     ours = native.read_capture(root).views[0].camera
     points = np.random.default_rng(0).uniform([-0.1, -0.12, 0.9], [0.1, 0.12, 1.1], (50, 3))
@@ -75,7 +84,7 @@ def test_every_camera_model_projects_as_in_colmap(tmp_path: Path, model: str, pa
 
 def test_names_hold_subfolders_other_suffixes_and_natural_order(tmp_path: Path) -> None:
     names = ["right/cam10", "right/cam2", "left/cam1"]
-    views = [picture(name, camera(turn)) for name, turn in zip(names, TURNS, strict=False)]
+    views = [synthetic_view(name, camera(yaw_rad)) for name, yaw_rad in zip(names, YAWS_RAD, strict=False)]
     root = write_capture(tmp_path / "capture", views, CaptureDescription(subject="s", expression="e", classes=CLASSES))
     image = root / "images" / "right" / "cam2.png"
     cv2.imwrite(str(image.with_suffix(".jpg")), cv2.imread(str(image)))
@@ -89,7 +98,7 @@ def test_names_hold_subfolders_other_suffixes_and_natural_order(tmp_path: Path) 
     assert len(capture.views[1].landmarks["68"]) == 68
 
 
-def test_what_is_optional_may_be_missing(tmp_path: Path) -> None:
+def test_optional_parts_may_be_missing(tmp_path: Path) -> None:
     root = make(tmp_path / "capture")
     (root / "masks" / "cam1.png").unlink()
     shutil.rmtree(root / "normals")
@@ -121,15 +130,15 @@ def test_schemes_must_have_one_length(tmp_path: Path) -> None:
     assert caught.value.where == str(path)
 
 
-def test_the_writer_leaves_nothing_behind_when_it_fails(tmp_path: Path) -> None:
-    good = picture("cam0", camera())
+def test_a_failed_write_leaves_no_files(tmp_path: Path) -> None:
+    good = synthetic_view("cam0", camera())
     bad = replace(good, name="cam1", camera=camera(width_px=60))
     with pytest.raises(ValueError, match="images of cam1"):
         write_capture(tmp_path / "capture", [good, bad], CaptureDescription(subject="s", expression="e"))
     assert not list(tmp_path.iterdir())
 
 
-def test_the_writer_never_replaces(tmp_path: Path) -> None:
+def test_the_writer_never_replaces_a_folder(tmp_path: Path) -> None:
     root = make(tmp_path / "capture")
     before = (root / "capture.toml").read_bytes()
     with pytest.raises(InputError, match="exists already"):
@@ -137,7 +146,7 @@ def test_the_writer_never_replaces(tmp_path: Path) -> None:
     assert (root / "capture.toml").read_bytes() == before and len(list(tmp_path.iterdir())) == 1
 
 
-def test_srgb_integers_are_written_as_they_are(tmp_path: Path) -> None:
+def test_srgb_integers_are_written_unchanged(tmp_path: Path) -> None:
     rgb = np.random.default_rng(0).integers(0, 2**16, (160, 120, 3), dtype=np.uint16)
     view = ViewArrays(name="a", camera=camera(), rgb=rgb)
     root = write_capture(tmp_path / "capture", [view], CaptureDescription(subject="s", expression="e"))
@@ -145,7 +154,7 @@ def test_srgb_integers_are_written_as_they_are(tmp_path: Path) -> None:
 
 
 @needs_shared
-def test_shared_captures_read() -> None:
+def test_shared_captures_are_read() -> None:
     folders = sorted(path.parent for path in (SHARED / "data" / "captures").glob("*/*/capture.toml"))
     assert folders
     for folder in folders:

@@ -15,7 +15,7 @@ from registration.errors import InputError
 from registration.frames import srgb_to_linear
 from registration.types import Camera, Capture, ViewPixels
 from tests.conftest import SHARED, needs_shared
-from tests.registration.capture.small import CLASSES, DISTORTIONS, camera, landmarks_68, make, picture
+from tests.registration.capture.small import CLASSES, DISTORTIONS, camera, landmarks_68, make, synthetic_view
 
 
 def one_view(root: Path, view: ViewArrays, bits: int = 16) -> Capture:
@@ -23,37 +23,41 @@ def one_view(root: Path, view: ViewArrays, bits: int = 16) -> Capture:
     return native.read_capture(write_capture(root, [view], description, bits=bits))
 
 
-def place(share: np.ndarray) -> np.ndarray:
+def centroid_and_radius(coverage: np.ndarray) -> np.ndarray:
     """Centroid (x, y) and mean radius of a region, px: sub-pixel however ragged its edge is."""
-    row, column = np.mgrid[: share.shape[0], : share.shape[1]] + 0.5
-    area = share.sum()
-    return np.array([(share * column).sum() / area, (share * row).sum() / area, np.sqrt(area / np.pi)])
+    row, column = np.mgrid[: coverage.shape[0], : coverage.shape[1]] + 0.5
+    area = coverage.sum()
+    return np.array([(coverage * column).sum() / area, (coverage * row).sum() / area, np.sqrt(area / np.pi)])
 
 
 @pytest.mark.parametrize("model", DISTORTIONS)
 @pytest.mark.parametrize("downsample", [1, 4])
-def test_everything_is_undistorted_alike(tmp_path: Path, model: str, downsample: int) -> None:
-    """Against a picture that was traced without distortion."""
+def test_images_masks_labels_and_normals_are_undistorted_consistently(
+    tmp_path: Path, model: str, downsample: int
+) -> None:
+    """Compared with an image that was traced without distortion."""
     cam = camera(0.3, distortion=DISTORTIONS[model], width_px=240, height_px=320)
-    capture = one_view(tmp_path / "bent", picture("a", cam))
-    straight = one_view(tmp_path / "straight", picture("a", replace(cam, distortion=())))
-    moved = capture.views[0].landmarks["68"][:, :2] - straight.views[0].landmarks["68"][:, :2]
-    assert np.abs(moved).max() > 2.5  # or the test would pass without undistortion
-    found = read_view(capture.views[0], capture, downsample=downsample)
+    capture = one_view(tmp_path / "bent", synthetic_view("a", cam))
+    straight = one_view(tmp_path / "straight", synthetic_view("a", replace(cam, distortion=())))
+    displacement_px = capture.views[0].landmarks["68"][:, :2] - straight.views[0].landmarks["68"][:, :2]
+    assert np.abs(displacement_px).max() > 2.5  # or the test would pass without undistortion
+    actual = read_view(capture.views[0], capture, downsample=downsample)
     ideal = read_view(straight.views[0], straight, downsample=downsample)
-    assert found.camera.distortion == () and found.mask is not None and ideal.mask is not None
-    np.testing.assert_array_equal(found.camera.intrinsics, ideal.camera.intrinsics)
-    assert found.label_coverage is not None and ideal.label_coverage is not None
-    assert (found.valid[ideal.mask > 0] > 0.999).all()
+    assert actual.camera.distortion == () and actual.mask is not None and ideal.mask is not None
+    np.testing.assert_array_equal(actual.camera.intrinsics, ideal.camera.intrinsics)
+    assert actual.label_coverage is not None and ideal.label_coverage is not None
+    assert (actual.valid[ideal.mask > 0] > 0.999).all()
     tolerance_px = 0.1 / downsample
-    np.testing.assert_allclose(place(found.mask), place(ideal.mask), atol=tolerance_px)
+    np.testing.assert_allclose(centroid_and_radius(actual.mask), centroid_and_radius(ideal.mask), atol=tolerance_px)
     for index in (1, 2):
         np.testing.assert_allclose(
-            place(found.label_coverage[..., index]), place(ideal.label_coverage[..., index]), atol=tolerance_px
+            centroid_and_radius(actual.label_coverage[..., index]),
+            centroid_and_radius(ideal.label_coverage[..., index]),
+            atol=tolerance_px,
         )
-    inside = cv2.erode(np.minimum(found.mask, ideal.mask), np.ones((3, 3))) == 1
+    inside = cv2.erode(np.minimum(actual.mask, ideal.mask), np.ones((3, 3))) == 1
     assert inside.sum() > 15_000 / downsample**2
-    for part, expected in ((found.rgb, ideal.rgb), (found.normals, ideal.normals)):
+    for part, expected in ((actual.rgb, ideal.rgb), (actual.normals, ideal.normals)):
         assert part is not None and expected is not None
         by_row, by_column = np.gradient(expected, axis=(0, 1))
         system = np.column_stack([by_column[inside].ravel(), by_row[inside].ravel()])
@@ -67,13 +71,13 @@ def test_everything_is_undistorted_alike(tmp_path: Path, model: str, downsample:
 
 @pytest.mark.parametrize("distortion", [(), DISTORTIONS["OPENCV"]])
 @pytest.mark.parametrize("downsample", [1, 3, 7])
-def test_a_point_lands_where_the_reduced_camera_projects_it(
+def test_points_appear_where_the_downsampled_camera_projects_them(
     tmp_path: Path, distortion: tuple[float, ...], downsample: int
 ) -> None:
     """Bright dots on landmarks; 3 and 7 do not divide the image's sides."""
     cam = camera(0.2, distortion=distortion, width_px=241, height_px=323)
-    capture = one_view(tmp_path / "capture", picture("a", cam))
-    spread_px = max(2.5, 0.8 * downsample)  # a dot within one block would be found at the block's centre
+    capture = one_view(tmp_path / "capture", synthetic_view("a", cam))
+    spread_px = max(2.5, 0.8 * downsample)  # a dot inside a single block would be located at the block's centre
     for index in (8, 27, 36, 45):
         point = landmarks_68()[index : index + 1]
         x, y = capture.views[0].landmarks["68"][index, :2]
@@ -89,7 +93,7 @@ def test_a_point_lands_where_the_reduced_camera_projects_it(
 
 
 @pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
-def test_reduction_keeps_the_mean_of_light_not_of_srgb(tmp_path: Path, dtype: type) -> None:
+def test_downsampling_averages_linear_light_and_not_srgb(tmp_path: Path, dtype: type) -> None:
     top = np.iinfo(dtype).max
     rgb = np.random.default_rng(0).integers(0, top, (160, 120, 3), endpoint=True, dtype=dtype)
     capture = one_view(tmp_path / "capture", ViewArrays(name="a", camera=camera(), rgb=rgb))
@@ -104,8 +108,8 @@ def test_reduction_keeps_the_mean_of_light_not_of_srgb(tmp_path: Path, dtype: ty
         assert (view.valid == 1).all()
 
 
-def test_masks_labels_and_normals_reduce_by_share(tmp_path: Path) -> None:
-    plain = picture("a", camera(0.3))
+def test_masks_labels_and_normals_are_downsampled_by_coverage(tmp_path: Path) -> None:
+    plain = synthetic_view("a", camera(0.3))
     capture = one_view(tmp_path / "capture", plain)
     view = read_view(capture.views[0], capture, downsample=8)
     assert view.mask is not None and view.label_coverage is not None and view.normals is not None
@@ -124,7 +128,7 @@ def test_masks_labels_and_normals_reduce_by_share(tmp_path: Path) -> None:
     np.testing.assert_allclose(view.normals[blocks > 0], expected, atol=1e-4)
 
 
-def test_pixels_without_a_source_are_told_and_weigh_nothing(tmp_path: Path) -> None:
+def test_pixels_without_a_source_are_invalid_and_have_no_weight(tmp_path: Path) -> None:
     """A pincushion image has no source for the corners; a constant image stays constant up to the border."""
     cam = camera(distortion=(3.0, 0.0, 0.0, 0.0))
     shape = (cam.height_px, cam.width_px)
@@ -136,19 +140,19 @@ def test_pixels_without_a_source_are_told_and_weigh_nothing(tmp_path: Path) -> N
         labels=np.full(shape, 2, np.uint8),
     )
     capture = one_view(tmp_path / "capture", view)
-    found = read_view(capture.views[0], capture, downsample=4)
-    assert found.mask is not None and found.label_coverage is not None
-    assert found.valid[0, 0] == 0 and found.valid[20, 15] == 1 and 0.5 < found.valid.mean() < 0.98
-    partly = found.valid > 0.05
-    assert ((found.valid > 0.05) & (found.valid < 0.95)).sum() > 10
-    np.testing.assert_allclose(found.rgb[partly], srgb_to_linear(np.array(200 / 255)), rtol=1e-3)
-    np.testing.assert_allclose(found.mask[partly], 1, rtol=1e-3)
-    np.testing.assert_allclose(found.label_coverage[partly] @ [0, 0, 1], 1, rtol=1e-3)
-    assert (found.rgb[found.valid == 0] == 0).all() and (found.mask[found.valid == 0] == 0).all()
+    actual = read_view(capture.views[0], capture, downsample=4)
+    assert actual.mask is not None and actual.label_coverage is not None
+    assert actual.valid[0, 0] == 0 and actual.valid[20, 15] == 1 and 0.5 < actual.valid.mean() < 0.98
+    partly = actual.valid > 0.05
+    assert ((actual.valid > 0.05) & (actual.valid < 0.95)).sum() > 10
+    np.testing.assert_allclose(actual.rgb[partly], srgb_to_linear(np.array(200 / 255)), rtol=1e-3)
+    np.testing.assert_allclose(actual.mask[partly], 1, rtol=1e-3)
+    np.testing.assert_allclose(actual.label_coverage[partly] @ [0, 0, 1], 1, rtol=1e-3)
+    assert (actual.rgb[actual.valid == 0] == 0).all() and (actual.mask[actual.valid == 0] == 0).all()
 
 
-def test_strips_join_without_a_seam(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    capture = one_view(tmp_path / "capture", picture("a", camera(0.3, distortion=DISTORTIONS["FULL_OPENCV"])))
+def test_strips_of_an_image_join_without_a_seam(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    capture = one_view(tmp_path / "capture", synthetic_view("a", camera(0.3, distortion=DISTORTIONS["FULL_OPENCV"])))
 
     def arrays(view: ViewPixels) -> list[np.ndarray]:
         return [value for value in vars(view).values() if isinstance(value, np.ndarray)]
@@ -164,8 +168,8 @@ def save(path: Path, array: np.ndarray, mode: str) -> None:
 
 
 @pytest.mark.parametrize("kind", ["gray", "gray16", "gray alpha", "rgba", "palette", "jpeg", "tiff"])
-def test_kinds_of_images(tmp_path: Path, kind: str) -> None:
-    capture = one_view(tmp_path / "capture", picture("a", camera()))
+def test_supported_image_types(tmp_path: Path, kind: str) -> None:
+    capture = one_view(tmp_path / "capture", synthetic_view("a", camera()))
     view = capture.views[0]
     rng = np.random.default_rng(1)
     gray = cv2.GaussianBlur(rng.integers(0, 256, (160, 120), dtype=np.uint8), (0, 0), 3)
@@ -189,12 +193,12 @@ def test_kinds_of_images(tmp_path: Path, kind: str) -> None:
         view = replace(view, image=view.image.with_suffix(f".{kind}"))
         Image.fromarray(rgb).save(view.image, **({"quality": 100, "subsampling": 0} if kind == "jpeg" else {}))
         tolerance = 0.03 if kind == "jpeg" else tolerance
-    found = read_view(view, capture)
-    np.testing.assert_allclose(found.rgb, srgb_to_linear(expected), atol=tolerance)
+    actual = read_view(view, capture)
+    np.testing.assert_allclose(actual.rgb, srgb_to_linear(expected), atol=tolerance)
 
 
 def test_palette_label_maps_keep_their_indices(tmp_path: Path) -> None:
-    capture = one_view(tmp_path / "capture", picture("a", camera()))
+    capture = one_view(tmp_path / "capture", synthetic_view("a", camera()))
     path = capture.views[0].segmentation
     assert path is not None
     labels = np.random.default_rng(2).integers(0, 3, (160, 120), dtype=np.uint8)
@@ -204,11 +208,11 @@ def test_palette_label_maps_keep_their_indices(tmp_path: Path) -> None:
     np.testing.assert_array_equal(pixels.read_labels(path, capture.views[0].camera, CLASSES), labels)
 
 
-def test_exif_turns_are_ignored_because_the_calibration_ignores_them(tmp_path: Path) -> None:
-    capture = one_view(tmp_path / "capture", picture("a", camera()))
+def test_exif_rotations_are_ignored_as_by_the_calibration(tmp_path: Path) -> None:
+    capture = one_view(tmp_path / "capture", synthetic_view("a", camera()))
     image = capture.views[0].image.with_suffix(".jpg")
     exif = Image.Exif()
-    exif[0x0112] = 6  # turn by 90 degrees
+    exif[0x0112] = 6  # rotation by 90 degrees
     Image.fromarray(np.full((160, 120, 3), 77, np.uint8)).save(image, exif=exif)
     assert read_view(replace(capture.views[0], image=image), capture).rgb.shape == (160, 120, 3)
 
@@ -225,7 +229,7 @@ def test_damage_in_the_middle_of_a_file_is_an_error(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("downsample", [0, 121])
-def test_factors_that_leave_no_pixel_are_refused(tmp_path: Path, downsample: int) -> None:
+def test_downsampling_to_no_pixel_is_refused(tmp_path: Path, downsample: int) -> None:
     capture = native.read_capture(make(tmp_path / "capture"))
     with pytest.raises(InputError, match="cannot be reduced by this factor"):
         read_view(capture.views[0], capture, downsample=downsample)
@@ -245,7 +249,7 @@ print((resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) / 1024)
 @pytest.mark.slow
 @pytest.mark.parametrize("distortion", [(), (-0.1, 0.02, 0.001, 0.001)])
 def test_a_25_megapixel_view_needs_less_than_a_gigabyte(tmp_path: Path, distortion: tuple[float, ...]) -> None:
-    small = picture("a", camera(width_px=512, height_px=768))
+    small = synthetic_view("a", camera(width_px=512, height_px=768))
     cam: Camera = replace(small.camera.scaled(4096, 6144), distortion=distortion)
     big = ViewArrays(
         name="a",
@@ -269,4 +273,4 @@ def test_a_shared_view_at_half_size() -> None:
     assert view.mask is not None and view.normals is not None and view.label_coverage is not None
     np.testing.assert_allclose(view.mask, 1 - view.label_coverage[..., 0], atol=1e-5)
     facing = view.normals[view.mask == 1]
-    assert np.median(facing[:, 2]) < -0.5  # the camera looks along +z, at surfaces that look back
+    assert np.median(facing[:, 2]) < -0.5  # the camera looks along +z, at surfaces that face it

@@ -10,11 +10,11 @@ from registration.capture.doctor import eye_distance
 from registration.capture.triangulation import residuals, reversed_jaw_points, triangulate
 from registration.types import Camera, Capture, View
 from tests.conftest import SHARED, needs_shared
-from tests.registration.capture.small import DISTORTIONS, TURNS, camera, distorted, landmarks_68
+from tests.registration.capture.small import DISTORTIONS, YAWS_RAD, camera, distorted, landmarks_68
 
 
 def capture_of(cameras: list[Camera], edit: Callable[[int, np.ndarray], None] = lambda view, rows: None) -> Capture:
-    """Views that see the 68 landmarks exactly, then `edit` spoils their rows (x, y, confidence) in place."""
+    """Views with exact 68 landmarks, whose rows (x, y, confidence) `edit` then changes."""
     views = []
     for number, cam in enumerate(cameras):
         rows = np.column_stack([distorted(cam, landmarks_68()), np.ones(68)])
@@ -24,20 +24,22 @@ def capture_of(cameras: list[Camera], edit: Callable[[int, np.ndarray], None] = 
 
 
 @pytest.mark.parametrize("distortion", [(), *DISTORTIONS.values()])
-def test_exact_landmarks_come_back(distortion: tuple[float, ...]) -> None:
-    points, used, residual = triangulate(capture_of([camera(turn, distortion=distortion) for turn in TURNS]), "68")
+def test_exact_landmarks_are_recovered(distortion: tuple[float, ...]) -> None:
+    points, used, residual = triangulate(
+        capture_of([camera(yaw_rad, distortion=distortion) for yaw_rad in YAWS_RAD]), "68"
+    )
     np.testing.assert_allclose(points, landmarks_68(), atol=1e-8)
-    assert (used == len(TURNS)).all() and (residual < 1e-4).all()
+    assert (used == len(YAWS_RAD)).all() and (residual < 1e-4).all()
 
 
 @pytest.mark.parametrize("count", [3, 5])
-def test_one_broken_view_spoils_nothing(count: int) -> None:
+def test_one_wrong_view_is_an_outlier(count: int) -> None:
     def swap_sides(view: int, rows: np.ndarray) -> None:
         if view == 1:
             rows[:, 0] = 120 - rows[:, 0]
             rows[:, 1] += 25
 
-    capture = capture_of([camera(turn) for turn in TURNS[:count]], swap_sides)
+    capture = capture_of([camera(yaw_rad) for yaw_rad in YAWS_RAD[:count]], swap_sides)
     points, used, residual = triangulate(capture, "68")
     np.testing.assert_allclose(points, landmarks_68(), atol=1e-8)
     assert (used == count - 1).all() and (residual < 1e-4).all()
@@ -45,13 +47,13 @@ def test_one_broken_view_spoils_nothing(count: int) -> None:
     assert (residuals(capture.views[0], "68", points) < 1e-4).all()
 
 
-def test_the_solution_minimises_reprojection_error() -> None:
+def test_the_solution_minimizes_the_reprojection_error() -> None:
     rng = np.random.default_rng(0)
 
     def blur(view: int, rows: np.ndarray) -> None:
         rows[:, :2] += rng.normal(0, 0.2, (68, 2))
 
-    capture = capture_of([camera(turn) for turn in np.linspace(-1.2, 1.2, 12)], blur)
+    capture = capture_of([camera(yaw_rad) for yaw_rad in np.linspace(-1.2, 1.2, 12)], blur)
     points, used, residual = triangulate(capture, "68")
     assert (used == 12).all()
 
@@ -70,36 +72,36 @@ def test_confidence_and_number_of_views() -> None:
         rows[4, 2] = 0.6 if view < 2 else 0.0
         rows[5, 2] = 1.0 if view == 0 else 0.0
 
-    points, used, residual = triangulate(capture_of([camera(turn) for turn in TURNS], hide), "68")
+    points, used, residual = triangulate(capture_of([camera(yaw_rad) for yaw_rad in YAWS_RAD], hide), "68")
     assert used[3] == 0 and used[4] == 2 and used[5] == 0
     assert np.isnan(points[[3, 5]]).all() and np.isnan(residual[[3, 5]]).all()
     np.testing.assert_allclose(points[4], landmarks_68()[4], atol=1e-8)
 
 
-def test_cameras_at_one_place_determine_no_depth() -> None:
+def test_cameras_at_one_position_determine_no_depth() -> None:
     points, used, _ = triangulate(capture_of([camera(0.2), camera(0.2, width_px=240, height_px=320)]), "68")
     assert np.isnan(points).all() and (used == 0).all()
 
 
-def test_a_scheme_that_no_view_has_is_empty() -> None:
-    points, used, residual = triangulate(capture_of([camera(turn) for turn in TURNS]), "478")
+def test_a_scheme_that_no_view_has_gives_no_points() -> None:
+    points, used, residual = triangulate(capture_of([camera(yaw_rad) for yaw_rad in YAWS_RAD]), "478")
     assert points.shape == (0, 3) and used.shape == residual.shape == (0,)
 
 
-def test_views_without_the_scheme_are_passed_over() -> None:
-    capture = capture_of([camera(turn) for turn in TURNS])
+def test_views_without_the_scheme_are_skipped() -> None:
+    capture = capture_of([camera(yaw_rad) for yaw_rad in YAWS_RAD])
     capture = replace(capture, views=(replace(capture.views[0], landmarks={}), *capture.views[1:]))
     points, used, _ = triangulate(capture, "68")
     np.testing.assert_allclose(points, landmarks_68(), atol=1e-8)
-    assert (used == len(TURNS) - 1).all()
+    assert (used == len(YAWS_RAD) - 1).all()
 
 
 def test_jaw_order() -> None:
     points = landmarks_68()
     assert reversed_jaw_points(points) == []
-    turned = points.copy()
-    turned[2:7] = turned[2:7][::-1]
-    assert reversed_jaw_points(turned) == [2, 3, 4, 5, 6]
+    reversed_points = points.copy()
+    reversed_points[2:7] = reversed_points[2:7][::-1]
+    assert reversed_jaw_points(reversed_points) == [2, 3, 4, 5, 6]
     mirrored = points.copy()
     mirrored[:17] = mirrored[:17][::-1]
     assert reversed_jaw_points(mirrored) == list(range(17))

@@ -150,7 +150,7 @@ def overlap_with(rotation: np.ndarray, asked: list[InitialGuess]):
 
 
 @pytest.mark.parametrize("roll", [0.0, 90.0])
-def test_masks_give_a_pose_at_their_centre(roll: float) -> None:
+def test_masks_give_poses_at_their_centre(roll: float) -> None:
     """Upright cameras in front of the subject need 24 poses; rolled ones more."""
     targets = masks([camera_at(yaw, roll) for yaw in (-40, 0, 40)])
     asked: list[InitialGuess] = []
@@ -162,7 +162,7 @@ def test_masks_give_a_pose_at_their_centre(roll: float) -> None:
     assert len(asked) == 24 + 5 if roll == 0 else len(asked) > 24 + 5
 
 
-def test_refinement_decides_between_the_best_poses() -> None:
+def test_refinement_selects_among_the_best_poses() -> None:
     targets = masks([camera_at(yaw) for yaw in (-40, 0, 40)])
     rotation = Rotation.from_euler("y", 20, degrees=True).as_matrix()
     guess = from_masks(
@@ -197,8 +197,8 @@ def test_candidates_are_rated_by_masks_normals_and_classes() -> None:
     assert rate_candidate(guess, exact, replace(targets, mask_weight=torch.zeros(len(normals)))).overlap == 0.0
 
 
-def test_spread_views_are_far_apart() -> None:
+def test_selected_views_are_far_apart() -> None:
     cameras = [camera_at(yaw) for yaw in (0, 2, 90, 92, 180, 182, 270)]
     assert select_spread_views(cameras, 2) in ([0, 4], [0, 5])
-    assert [view // 2 for view in select_spread_views(cameras, 4)] == [0, 1, 2, 3]  # one of each close pair
+    assert [view // 2 for view in select_spread_views(cameras, 4)] == [0, 1, 2, 3]  # a single view of each close pair
     assert select_spread_views(cameras, 20) == list(range(7)) and select_spread_views(cameras, 1) == [0]

@@ -7,14 +7,14 @@ from registration.fit.optimizer import AdamBlock, AdamUniformBlock, minimize
 from registration.fit.recipes import Rate
 
 
-def test_a_rate_is_held_and_then_falls_by_equal_ratios():
+def test_a_rate_is_constant_and_then_decays_exponentially():
     rate = Rate(start=0.1, end=0.001, hold=0.5)
     assert [rate.value(p) for p in (0.0, 0.3, 0.5, 0.75, 1.0)] == pytest.approx([0.1, 0.1, 0.1, 0.01, 0.001])
     assert Rate(start=2.0, end=0.5).value(0.5) == pytest.approx(1.0)
     assert Rate(start=0.3, end=0.1, hold=1.0).value(1.0) == pytest.approx(0.3)
 
 
-def test_adam_steps_by_its_rate():
+def test_the_first_adam_step_equals_the_rate():
     """Adam's first step is the rate, whatever the gradient's size."""
     for progress, size in ((0.0, 0.1), (1.0, 0.01)):
         tensor = torch.zeros(3, requires_grad=True)
@@ -35,7 +35,7 @@ def paper_updates(gradients: list[torch.Tensor], rate: float, b1: float, b2: flo
     return total
 
 
-def test_adam_uniform_is_the_papers_where_one_coordinate_leads(monkeypatch):
+def test_adam_uniform_equals_the_papers_for_one_dominant_coordinate(monkeypatch):
     """Ours measures a vertex' gradient by its length and averages the largest; the paper's the largest average
     coordinate. For one dominant vertex along one axis they are equal."""
     monkeypatch.setattr(AdamUniformBlock, "QUANTILE", 1.0)
@@ -51,7 +51,7 @@ def test_adam_uniform_is_the_papers_where_one_coordinate_leads(monkeypatch):
     torch.testing.assert_close(latent.detach(), paper_updates(gradients, 0.02, 0.9, 0.99), rtol=1e-5, atol=1e-9)
 
 
-def test_adam_uniform_keeps_directions():
+def test_adam_uniform_preserves_directions():
     """Unlike Adam's, a step is a multiple of the gradient field."""
     gradient = torch.randn(40, 3, generator=torch.Generator().manual_seed(1))
     latent = torch.zeros(40, 3, requires_grad=True)
@@ -63,7 +63,7 @@ def test_adam_uniform_keeps_directions():
     assert latent.detach().norm(dim=1).max() == pytest.approx(0.1, rel=0.15)
 
 
-def test_one_wild_vertex_does_not_rule():
+def test_one_large_gradient_does_not_dominate_the_step():
     gradient = torch.randn(2000, 3, generator=torch.Generator().manual_seed(1))
     steps = []
     for wild in (1.0, 1e4):
@@ -75,7 +75,7 @@ def test_one_wild_vertex_does_not_rule():
     assert steps[1] > 0.9 * steps[0]
 
 
-def test_a_quadratic_is_solved():
+def test_a_quadratic_problem_is_solved():
     """Two blocks, one of each rule, coupled through one residual."""
     rng = torch.Generator().manual_seed(0)
     target = torch.randn(30, 3, generator=rng)
@@ -95,7 +95,7 @@ def test_a_quadratic_is_solved():
     torch.testing.assert_close((field + shift).detach(), target, atol=0.01, rtol=0)
 
 
-def test_the_rate_follows_the_steps():
+def test_the_rate_follows_its_schedule():
     progress: list[float] = []
 
     class Recorder:
@@ -111,7 +111,7 @@ def test_the_rate_follows_the_steps():
     assert progress[5:] == [0.0]
 
 
-def test_gradients_do_not_add_up_over_steps():
+def test_gradients_do_not_accumulate_over_steps():
     tensor = torch.zeros(1, requires_grad=True)
     seen: list[float] = []
     minimize(
@@ -125,7 +125,7 @@ def test_gradients_do_not_add_up_over_steps():
 
 @pytest.mark.parametrize("bad", [float("nan"), float("inf")])
 def test_a_term_that_is_not_finite_stops_the_loop(bad):
-    """It is named, it is in the history, and the parameters are those before that step."""
+    """The term is named and in the history, and the parameters are those before that step."""
     tensor = torch.ones(2, requires_grad=True)
     states: list[torch.Tensor] = []
 

@@ -16,7 +16,7 @@ RNG = np.random.default_rng(5)
 
 
 def _fitted(plain: bool = False) -> tuple[Variables, GNM]:
-    """Variables away from rest; unless `plain`, of a model with pose correctives, and with offsets everywhere."""
+    """Variables with non-zero values; unless `plain`, of a model with pose correctives, and with offsets everywhere."""
     data = tiny_model()
     correctives = RNG.normal(0, 0 if plain else 1e-3, data.pose_correctives_regressor.shape)
     data = replace(data, pose_correctives_regressor=correctives.astype(data.pose_correctives_regressor.dtype))
@@ -36,14 +36,14 @@ def _fitted(plain: bool = False) -> tuple[Variables, GNM]:
     return variables, model
 
 
-def test_saved_parameters_give_the_same_mesh() -> None:
+def test_saved_parameters_reproduce_the_mesh() -> None:
     variables, model = _fitted()
     parameters, offsets = variables.parameters()
     mesh = variables.vertices(variables.skin_offsets())
     torch.testing.assert_close(model(parameters, offsets), mesh, rtol=0, atol=2e-6)
 
 
-def test_a_fit_begins_where_a_registration_ended() -> None:
+def test_a_fit_starts_from_a_saved_registration() -> None:
     variables, model = _fitted()
     parameters, offsets = variables.parameters()
     again = Variables(model, tiny_model(), initial_guess_from(parameters, offsets.numpy(), model, tiny_model()))
@@ -51,7 +51,7 @@ def test_a_fit_begins_where_a_registration_ended() -> None:
     torch.testing.assert_close(after, before, rtol=0, atol=2e-6)
 
 
-def test_freeing_offsets_keeps_the_mesh_and_gradients_reach_exactly_the_free() -> None:
+def test_freeing_offsets_keeps_the_mesh_and_only_free_variables_have_gradients() -> None:
     variables, model = _fitted()
     before = variables.vertices(variables.skin_offsets())
     triangles = skin_triangles(tiny_model().triangles, variables.skin, len(before))
@@ -80,7 +80,7 @@ def test_eyeballs_keep_their_shape() -> None:
     torch.testing.assert_close(sizes[1], sizes[0] * float(np.exp(0.05)), rtol=1e-3, atol=1e-6)
 
 
-def test_where_parts_touch_offsets_and_tongue_yield_and_nothing_else() -> None:
+def test_contact_gradients_reach_only_offsets_and_tongue() -> None:
     variables, _ = _fitted()
     data = tiny_model()
     variables.set_free(list(variables.tensors))

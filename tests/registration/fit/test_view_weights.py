@@ -25,18 +25,18 @@ def errors(outline=None, landmarks=None, brightness=None) -> ViewErrors:
     )
 
 
-def test_views_alike_are_all_trusted():
+def test_consistent_views_have_full_weight():
     weights = ViewWeights.from_errors(errors())
     assert not weights.notes and (weights.geometry == 1).all() and (weights.colour == 1).all()
 
 
-def test_a_fit_that_is_off_everywhere_blames_no_view():
+def test_a_fit_that_is_bad_in_all_views_excludes_none():
     everywhere = {view: 20.0 for view in range(8)}
     assert not ViewWeights.from_errors(errors(outline=everywhere, landmarks=everywhere)).notes
 
 
 @pytest.mark.parametrize("what", ["outline", "landmarks"])
-def test_a_shifted_view_is_named_and_hardly_counts(what):
+def test_a_shifted_view_is_named_and_has_little_weight(what):
     weights = ViewWeights.from_errors(errors(**{what: {3: 35.0}}))
     assert list(weights.notes) == ["cam03"] and "35 px off" in weights.notes["cam03"]
     assert weights.geometry[3] < 0.01 and weights.colour[3] < 0.01
@@ -44,17 +44,17 @@ def test_a_shifted_view_is_named_and_hardly_counts(what):
 
 
 @pytest.mark.parametrize("log_gain, message", [(-6.0, "times as bright"), (np.log(2.5), "2.5 times as bright")])
-def test_a_black_or_overexposed_view_keeps_its_shape(log_gain, message):
+def test_a_black_or_overexposed_view_keeps_its_shape_weights(log_gain, message):
     weights = ViewWeights.from_errors(errors(brightness={5: -1.0 + log_gain}))
     assert list(weights.notes) == ["cam05"] and message in weights.notes["cam05"]
     assert weights.colour[5] == 0 and weights.geometry[5] == 1
 
 
-def test_gains_of_ten_percent_are_no_reason():
+def test_gains_of_ten_percent_do_not_reduce_weights():
     assert not ViewWeights.from_errors(errors(brightness={i: -1.0 + 0.1 * (-1) ** i for i in range(8)})).notes
 
 
-def test_a_view_without_landmarks_or_mask_is_not_suspected():
+def test_a_view_without_landmarks_or_mask_has_full_weight():
     weights = ViewWeights.from_errors(errors(outline={2: float("nan")}, landmarks={2: float("nan")}))
     assert not weights.notes and torch.isfinite(weights.geometry).all()
 
@@ -104,7 +104,7 @@ def test_errors_of_a_shifted_silhouette():
     torch.testing.assert_close(measured.brightness, torch.full((2,), np.log(0.5), dtype=torch.float32))
 
 
-def test_weights_reach_the_targets_of_the_chosen_views():
+def test_weights_are_applied_to_the_targets_of_the_selected_views():
     weights = ViewWeights(
         geometry=torch.tensor([1.0, 0.01, 1.0]), colour=torch.tensor([1.0, 1.0, 0.0]), notes={"x": "y"}
     )

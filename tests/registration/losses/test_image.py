@@ -1,4 +1,4 @@
-"""Image terms on a few pixels: values by hand, gradients by differences, and silence where weights are zero."""
+"""Image terms on a few pixels: values by hand, gradients by differences, and no effect where weights are zero."""
 
 from dataclasses import replace
 
@@ -44,7 +44,7 @@ def targets(pixels: Pixels | None = None, seed: int = 0) -> Targets:
 
 
 def same(target: Targets) -> Rendered:
-    """A rendering that is what was target."""
+    """A rendering equal to the targets."""
     return Rendered(rgb=target.rgb, normals=target.normals, classes=target.classes, mask=target.mask)
 
 
@@ -67,7 +67,7 @@ WEIGHT = {"rgb": "rgb_weight", "ssim": "rgb_weight", "normals": "normal_weight"}
 
 
 @pytest.mark.parametrize("term", TERMS)
-def test_equal_images_cost_nothing_and_others_do(term):
+def test_only_equal_images_cost_nothing(term):
     target = targets()
     cost = TERMS[term](same(target), target, everywhere(target)).item()
     # The roots' rounding leaves a constant: 0.01 for each colour, 0.001 for a normal.
@@ -90,8 +90,8 @@ def test_gradients_against_differences(term):
 
 
 @pytest.mark.parametrize("term", TERMS)
-def test_what_has_no_weight_has_no_effect(term):
-    """Neither on the value nor on any gradient, whatever is rendered or target there."""
+def test_values_without_weight_have_no_effect(term):
+    """Neither on the value nor on any gradient, whatever the rendering and the targets are."""
     target = targets()
     hidden = torch.zeros(HEIGHT, WIDTH, dtype=torch.bool)
     hidden[4:9, 5:12] = True
@@ -178,7 +178,7 @@ def test_classes_by_hand():
     assert image.classes(rendered, target, weights).item() == pytest.approx(0.875 * 5 / len(target.mask))
 
 
-def test_surfaces_of_their_own_must_agree():
+def test_eyes_and_lips_are_compared_only_where_classes_agree():
     """An eye on skin, or a miss, is not compared; half a lip or a soft border is."""
     pixels = Pixels.from_mask([camera()], torch.arange(HEIGHT * WIDTH).reshape(1, HEIGHT, WIDTH) < 5)
     target = targets(pixels)
@@ -192,8 +192,8 @@ def test_surfaces_of_their_own_must_agree():
     assert image.pixel_agreement(missed, target, [1, 2]).tolist() == [False, False, True, True, False]
 
 
-def test_ssim_is_that_of_a_window_of_eleven():
-    """Against skimage's Gaussian SSIM in the middle of the image, where borders do not matter."""
+def test_ssim_equals_skimages_with_a_window_of_eleven():
+    """Against skimage's Gaussian SSIM in the centre of the image, where borders have no effect."""
     from skimage.metrics import structural_similarity
 
     target, other = targets(), targets(seed=1)
@@ -218,8 +218,8 @@ def test_ssim_is_that_of_a_window_of_eleven():
     assert value == pytest.approx(1 - full[7, 8].mean(), abs=1e-4)
 
 
-def test_a_few_pixels_or_all_of_them():
-    """Terms do not care how many pixels without weight are listed beside."""
+def test_losses_do_not_depend_on_pixels_without_weight():
+    """Terms do not depend on the number of listed pixels without weight."""
     chosen = torch.zeros(1, HEIGHT, WIDTH, dtype=torch.bool)
     chosen[0, 3:12, 4:13] = True
     whole, rendered = targets(), same(targets(seed=1))

@@ -11,18 +11,18 @@ from registration.types import Camera
 def cameras() -> tuple[Camera, ...]:
     pose = np.eye(4)
     pose[:3, 3] = [0.01, -0.02, 0.5]
-    turned = np.array([[0, 0, 1.0, 0], [0, 1, 0, 0], [-1, 0, 0, 0.6], [0, 0, 0, 1]])
+    rotated = np.array([[0, 0, 1.0, 0], [0, 1, 0, 0], [-1, 0, 0, 0.6], [0, 0, 0, 1]])
     intrinsics = np.array([[200.0, 0, 61.3], [0, 210.0, 48.9], [0, 0, 1]])
     return tuple(
         Camera(width_px=120, height_px=100, intrinsics=intrinsics, T_cam_world=T_cam_world)
-        for T_cam_world in (pose, turned)
+        for T_cam_world in (pose, rotated)
     )
 
 
 POINTS = 0.08 * np.random.default_rng(0).standard_normal((5, 3))
 
 
-def test_projection_is_the_cameras():
+def test_projection_equals_that_of_the_camera():
     projected = landmark.project(cameras(), torch.tensor(POINTS))
     for camera, image in zip(cameras(), projected, strict=True):
         np.testing.assert_allclose(image, camera.project(POINTS)[0], rtol=1e-12)
@@ -50,7 +50,7 @@ def test_robust_mean_by_hand():
     assert landmark.geman_mcclure(residual, torch.zeros(4), 3.0).item() == 0
 
 
-def test_an_outlier_hardly_pulls():
+def test_an_outlier_has_little_gradient():
     residual = torch.tensor([3.0, 300.0], dtype=torch.float64, requires_grad=True)
     landmark.geman_mcclure(residual, torch.ones(2), 3.0).backward()
     assert 0 < residual.grad[1] < 1e-5 * residual.grad[0]

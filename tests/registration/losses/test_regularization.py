@@ -12,7 +12,7 @@ EDGE_M = 0.0005
 
 def elasticity(columns: int, rows: int, half_gain_m: float, decay_m: float = 0.025) -> OffsetRegularizer:
     points, triangles = lattice(columns, rows)
-    # The lattice closes on itself, so its positions do not tell its edges' lengths: unfold one cell of it.
+    # The lattice closes on itself, so its positions do not give its edge lengths: unfold one cell of it.
     count = columns * rows
     flat = OffsetRegularizer(
         triangles,
@@ -101,7 +101,7 @@ def test_an_offset_without_data_decays_over_the_decay_length():
     assert apart / np.log(near / far) == pytest.approx(0.025, rel=0.03)
 
 
-def test_stiffness_is_per_place():
+def test_stiffness_depends_on_the_wavelength_at_each_vertex():
     """The same bump costs more where the half-gain wavelength is longer."""
     points, triangles = lattice(40, 40)
     count = 1600
@@ -121,7 +121,7 @@ def test_stiffness_is_per_place():
     assert costs[1] == pytest.approx(16 * costs[0], rel=1e-3)
 
 
-def test_prior():
+def test_gaussian_prior():
     coefficients = torch.tensor([1.0, -2.0, 0.0], requires_grad=True)
     value = gaussian_prior(coefficients)
     assert value.item() == pytest.approx(5 / 3)

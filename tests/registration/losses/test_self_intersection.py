@@ -60,8 +60,8 @@ def squeezed(data: GNMData) -> torch.Tensor:
     """Both ears pressed against the head."""
     inwards = np.zeros((len(data.template_vertex_positions), 3))
     inwards[:, 0] = -0.022 * np.sign(data.template_vertex_positions[:, 0])
-    away = np.abs(data.template_vertex_positions[:, 0])
-    return displaced(data, regions.ears(data) & (away > 0.083), inwards)
+    lateral = np.abs(data.template_vertex_positions[:, 0])
+    return displaced(data, regions.ears(data) & (lateral > 0.083), inwards)
 
 
 CROSSED: dict[str, Callable[[GNMData], torch.Tensor]] = {
@@ -77,7 +77,7 @@ CROSSED: dict[str, Callable[[GNMData], torch.Tensor]] = {
 
 
 @pytest.mark.parametrize("model", ["tiny", pytest.param("full", marks=needs_shared)])
-def test_a_template_costs_nothing_wherever_it_is(model, request):
+def test_a_template_costs_nothing_in_any_pose(model, request):
     data = tiny_model() if model == "tiny" else request.getfixturevalue("full")
     penalty = SelfIntersectionPenalty(data, CPU)
     for vertices in (template(data), posed(template(data), 1.0), posed(template(data), 1.3)):
@@ -99,7 +99,7 @@ def test_a_missing_part_is_named(name):
 
 
 @pytest.mark.parametrize("name", ["teeth", "tongue", "ears", "gums", "lower_lip", "upper_lip"])
-def test_a_part_without_vertices_touches_nothing(name):
+def test_a_part_without_vertices_has_no_contacts(name):
     data = tiny_model()
     groups = data.vertex_groups.copy()
     groups[[k for k, group in enumerate(data.vertex_group_names) if group in (name, f"{name}_region")]] = 0
@@ -107,7 +107,7 @@ def test_a_part_without_vertices_touches_nothing(name):
     assert not any(penalty(template(data)).values())
 
 
-def test_a_tooth_in_the_tongue_pushes_both():
+def test_a_tooth_in_the_tongue_displaces_both():
     data = tiny_model()
     penalty = SelfIntersectionPenalty(data, CPU)
     vertices = moved(data, regions.tongue(data), (0.0, -8.0, 0.0)).requires_grad_(True)
@@ -131,12 +131,12 @@ def test_gradients_of_every_pair(full, penalty, pair):
     along = 0.3 * torch.randn(at.shape, dtype=at.dtype, generator=generator) + at.grad / at.grad.abs().max()
     high, low = (penalty(vertices + sign * 1e-8 * along)[pair] for sign in (1, -1))
     assert float((at.grad * along).sum()) == pytest.approx(float(high - low) / 2e-8, rel=0.01)
-    # Moving everything alike changes nothing: what one side gets the other gives.
+    # A common translation changes nothing: the gradients of both sides cancel.
     assert at.grad.sum(0).abs().max() < 1e-6 * at.grad.abs().sum()
 
 
 @needs_shared
-def test_excess_is_in_millimetres_of_the_head_at_hand(full, penalty):
+def test_excess_depths_are_in_millimetres_of_the_scaled_head(full, penalty):
     vertices = CROSSED["tongue-teeth"](full)
     penalty.update_candidates(vertices)
     excess, cost = penalty.excess_mm(vertices)["tongue-teeth"], penalty(vertices)["tongue-teeth"]
@@ -150,7 +150,7 @@ def test_excess_is_in_millimetres_of_the_head_at_hand(full, penalty):
         assert float(penalty(elsewhere)["tongue-teeth"]) == pytest.approx(scale**2 * float(cost), rel=2e-3)
 
 
-def test_what_is_accepted_costs_nothing_in_its_pairs_alone():
+def test_accepted_rest_depths_cost_nothing_in_their_pairs_alone():
     data = tiny_model()
     penalty = SelfIntersectionPenalty(data, CPU)
     crossed = moved(data, regions.tongue(data), (0.0, -8.0, 0.0))
@@ -163,13 +163,13 @@ def test_what_is_accepted_costs_nothing_in_its_pairs_alone():
     penalty.set_rest_depths(posed(crossed, 1.2), ["lips-teeth"])
     assert cost("tongue-teeth") == before > 0
     penalty.set_rest_depths(posed(crossed, 1.2), ["tongue-teeth"])
-    assert cost("tongue-teeth") < 1e-6 * before  # what turning it did to its numbers
-    penalty.set_rest_depths(template(data))  # what was accepted before is forgotten
+    assert cost("tongue-teeth") < 1e-6 * before  # rounding by the rotation
+    penalty.set_rest_depths(template(data))  # previously accepted depths are discarded
     assert cost("tongue-teeth") == before
 
 
 def outside(data: GNMData, vertices: torch.Tensor, excess: torch.Tensor) -> np.ndarray:
-    """Whether each vertex with an excess depth lies outside the skin nevertheless."""
+    """Whether each vertex with an excess depth nevertheless lies outside the skin."""
     skin = data.triangles[(regions.components(data) == 0)[data.triangles].all(1)].astype(np.int64)
     deep = excess.nonzero()[:, 0]
     points = vertices[deep] + 5e-5 * vertex_normals(vertices, torch.as_tensor(skin))[deep]
@@ -177,8 +177,8 @@ def outside(data: GNMData, vertices: torch.Tensor, excess: torch.Tensor) -> np.n
 
 
 @needs_shared
-def test_skin_at_the_corners_of_the_mouth_is_not_in_the_other_lip(full, penalty):
-    """Pursed lips: behind the skin next to them, through the interior, lies the lining of the other lip."""
+def test_skin_at_the_mouth_corners_is_not_inside_the_other_lip(full, penalty):
+    """Pursed lips: behind the skin next to them, through the interior, lies the oral lining of the other lip."""
     vertices, random = template(full).numpy().astype(np.float64), np.random.default_rng(5)
     for basis, share in ((full.expression_basis[200:350], 0.5), (full.expression_basis[350:382], 0.3)):
         vertices = vertices + np.einsum("e,evc->vc", random.normal(size=len(basis)) * share, basis)
@@ -186,12 +186,12 @@ def test_skin_at_the_corners_of_the_mouth_is_not_in_the_other_lip(full, penalty)
     head = torch.as_tensor(vertices + np.einsum("e,evc->vc", random.normal(size=len(basis)), basis)).float()
     penalty.update_candidates(head)
     excess = penalty.excess_mm(head)["upper-lower lip"]
-    # By the closest surface alone, 16 vertices of the skin beside the mouth would be up to 7 mm too deep.
+    # By the closest surface alone, 16 vertices of the skin next to the mouth would be up to 7 mm too deep.
     assert 0 < excess.count_nonzero() < 10 and not outside(full, head, excess).any()
 
 
 @needs_shared
-def test_what_official_faces_do_by_themselves(full, penalty):
+def test_intersections_of_the_official_samples(full, penalty):
     """Every lip vertex that is too deep is indeed inside the head; a wide open mouth costs nothing."""
     samples = np.load(SHARED / "data" / "gnm" / "gnm_real_samples.npz")
     names = [*samples["identity_names"].tolist(), *samples["expression_names"].tolist()]
@@ -199,13 +199,13 @@ def test_what_official_faces_do_by_themselves(full, penalty):
     for name, delta in zip(names, [*samples["identity_deltas"], *samples["expression_deltas"]], strict=True):
         vertices = template(full) + torch.as_tensor(delta)
         penalty.update_candidates(vertices)
-        found = penalty.excess_mm(vertices)
-        deepest[name] = {pair: float(excess.max()) for pair, excess in found.items()}
-        assert not outside(full, vertices, found["upper-lower lip"]).any(), name
+        excess_by_pair = penalty.excess_mm(vertices)
+        deepest[name] = {pair: float(excess.max()) for pair, excess in excess_by_pair.items()}
+        assert not outside(full, vertices, excess_by_pair["upper-lower lip"]).any(), name
     assert 0 < deepest["surprise"].pop("tongue-gums") < 0.1 and not any(deepest["surprise"].values())
-    assert 0.4 < deepest["identity_a"]["upper-lower lip"] < 0.8  # lips that end before their lining give 1.7
+    assert 0.4 < deepest["identity_a"]["upper-lower lip"] < 0.8  # lip regions without the oral lining would give 1.7
     assert 0.8 < deepest["pucker"]["upper-lower lip"] < 1.4 and 2.5 < deepest["pucker"]["tongue-palate"] < 3.5
-    assert max(found["lips-teeth"] + found["ears-head"] for found in deepest.values()) == 0
+    assert max(depths["lips-teeth"] + depths["ears-head"] for depths in deepest.values()) == 0
 
 
 @needs_shared
@@ -218,9 +218,9 @@ def test_a_tongue_pushed_into_the_teeth(full, penalty, direction):
     for push in (0.0, 1.0, 2.0, 3.0, 4.0, 5.0):
         vertices = moved(full, tongue, tuple(push * axis for axis in direction))
         penalty.update_candidates(vertices)
-        found = penalty.excess_mm(vertices)["tongue-teeth"].numpy()[tongue]
+        excess = penalty.excess_mm(vertices)["tongue-teeth"].numpy()[tongue]
         points = vertices.numpy().astype(np.float64)
         truth = tooth_depths_mm(points[tongue], points, teeth)
-        np.testing.assert_allclose(found, np.maximum(truth - MARGIN_MM, 0), atol=0.01)
+        np.testing.assert_allclose(excess, np.maximum(truth - MARGIN_MM, 0), atol=0.01)
         deepest.append(truth.max())
     assert deepest[0] == 0 and deepest[-1] > 2 and np.all(np.diff(deepest) >= 0)

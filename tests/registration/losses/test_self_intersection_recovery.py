@@ -24,20 +24,20 @@ def data() -> GNMData:
     return gnm_npz.read(SHARED / "data" / "gnm" / "gnm_head_reconstructed.npz")
 
 
-def test_crossed_lips_come_apart(data):
+def test_crossed_lips_are_separated(data):
     rest = lip_depths_mm(data, torch.as_tensor(data.template_vertex_positions))
-    found = recover(data, raised_lower_lip(data, 2.0), steps=100, rate=2e-4)
-    assert (lip_depths_mm(data, found.before) - rest).max() > 1.2
-    assert (lip_depths_mm(data, found.after) - rest).max() < 0.1
-    assert found.moved_mm(cheeks(data)) < 0.3
-    assert found.moved_mm(np.logical_or(*regions.lips(data))) < 2.5
+    recovery = recover(data, raised_lower_lip(data, 2.0), steps=100, rate=2e-4)
+    assert (lip_depths_mm(data, recovery.before) - rest).max() > 1.2
+    assert (lip_depths_mm(data, recovery.after) - rest).max() < 0.1
+    assert recovery.moved_mm(cheeks(data)) < 0.3
+    assert recovery.moved_mm(np.logical_or(*regions.lips(data))) < 2.5
 
 
-def test_a_lid_comes_out_of_the_eyeball_and_no_further(data):
+def test_an_eyelid_is_moved_out_of_the_eyeball_and_no_further(data):
     rest = eyeball_depths_mm(data, torch.as_tensor(data.template_vertex_positions))
-    found = recover(data, pressed_lid(data, 1.0), steps=60, rate=4e-5)
-    pressed, freed = (eyeball_depths_mm(data, vertices) for vertices in (found.before, found.after))
+    recovery = recover(data, pressed_lid(data, 1.0), steps=60, rate=4e-5)
+    pressed, freed = (eyeball_depths_mm(data, vertices) for vertices in (recovery.before, recovery.after))
     assert (pressed - rest).max() > 0.7 and (freed - rest).max() < 0.1
-    # What lay in the eyeball at rest still does: contact is no fault.
+    # Vertices in the eyeball at rest remain there: contact is no intersection.
     assert (freed > 0.1).sum() > 0.8 * (rest > 0.1).sum()
-    assert found.moved_mm(regions.exterior(data)) < 1.3 and found.moved_mm(cheeks(data)) < 0.05
+    assert recovery.moved_mm(regions.exterior(data)) < 1.3 and recovery.moved_mm(cheeks(data)) < 0.05

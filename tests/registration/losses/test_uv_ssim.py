@@ -1,7 +1,7 @@
-"""The loss against sliding: on a ball with a smaller one in front of it, and on the official model's head.
+"""The loss against sliding: on a ball with a smaller ball in front of it, and on the official model's head.
 
-Values, gradients by differences, what must be ignored; then vertices that have slid must come back, and under a gain
-and a blush they must not move.
+Values, gradients by differences, ignored pixels; then slid vertices must be recovered, and must not move under a gain
+and a blush.
 """
 
 from dataclasses import replace
@@ -60,15 +60,15 @@ def cost(problem: Problem, vertices: np.ndarray, batch: Targets | None = None, *
     return loss(torch.as_tensor(vertices, dtype=torch.float32), batch or problem.batch).item()
 
 
-def test_equal_textures_cost_little_and_slid_ones_much(problem):
+def test_the_cost_of_sliding_exceeds_that_of_the_truth(problem):
     at_truth = cost(problem, problem.truth)
     assert 0 < at_truth < 0.03
     assert cost(problem, problem.start) > 5 * at_truth
-    # A uniform texture tells nothing.
+    # A uniform texture gives no information.
     assert cost(problem, problem.start, texture=torch.full_like(problem.texture, 0.3)) > 0.3
 
 
-def test_nothing_known_costs_nothing(problem):
+def test_unknown_textures_and_pixels_cost_nothing(problem):
     vertices = torch.tensor(problem.start, dtype=torch.float32, requires_grad=True)
     for silent in (
         replace(problem, weights=np.zeros(len(problem.truth))),
@@ -79,10 +79,10 @@ def test_nothing_known_costs_nothing(problem):
         assert value == 0 and not gradient.any()
 
 
-def test_gradient_against_differences(problem):
-    """Along random fields; in double, and by steps so small that no point crosses into another pixel.
+def test_gradient_equals_finite_differences(problem):
+    """Along random fields; in double precision, with steps so small that no point crosses into another pixel.
 
-    All pixels are compared: at the borders of what is not, texels come and go, which the gradient does not know.
+    All pixels are compared: at the borders of excluded pixels, texels appear and disappear, which the gradient ignores.
     """
     loss = problem.loss(SIZE_PX, torch.float64)
     rgb = problem.batch.rgb.double()
@@ -91,16 +91,16 @@ def test_gradient_against_differences(problem):
     (gradient,) = torch.autograd.grad(loss(start, batch), start)
     rng = np.random.default_rng(0)
     for _ in range(3):
-        way = torch.as_tensor(rng.standard_normal(start.shape))
+        direction = torch.as_tensor(rng.standard_normal(start.shape))
         step = 1e-8
         with torch.no_grad():
-            difference = (loss(start + step * way, batch) - loss(start - step * way, batch)) / (2 * step)
-        assert (gradient * way).sum().item() == pytest.approx(difference.item(), rel=1e-5)
-    unseen = torch.as_tensor(~problem.moves | (problem.truth[:, 2] < -0.06))
-    assert not gradient[unseen].any()
+            difference = (loss(start + step * direction, batch) - loss(start - step * direction, batch)) / (2 * step)
+        assert (gradient * direction).sum().item() == pytest.approx(difference.item(), rel=1e-5)
+    unobserved = torch.as_tensor(~problem.moves | (problem.truth[:, 2] < -0.06))
+    assert not gradient[unobserved].any()
 
 
-def test_equal_from_run_to_run(problem):
+def test_repeated_evaluations_are_equal(problem):
     threads = torch.get_num_threads()
     torch.set_num_threads(2)
     try:
@@ -115,31 +115,33 @@ def test_equal_from_run_to_run(problem):
         assert all(torch.equal(a, b) for a, b in zip(runs[0], run, strict=True))
 
 
-def test_pixels_without_weight_are_not_looked_at(problem):
+def test_pixels_without_weight_have_no_effect(problem):
     batch = problem.batch
     image = batch.pixels.x > 50  # the right half of every image
     weight = batch.rgb_weight * ~image
-    spoiled = torch.where(image[:, None], torch.rand(batch.rgb.shape), batch.rgb)
+    randomized = torch.where(image[:, None], torch.rand(batch.rgb.shape), batch.rgb)
     clean = cost(problem, problem.start, replace(batch, rgb_weight=weight))
-    assert cost(problem, problem.start, replace(batch, rgb=spoiled, rgb_weight=weight)) == clean
-    assert cost(problem, problem.start, replace(batch, rgb=spoiled)) > clean + 0.05
+    assert cost(problem, problem.start, replace(batch, rgb=randomized, rgb_weight=weight)) == clean
+    assert cost(problem, problem.start, replace(batch, rgb=randomized)) > clean + 0.05
 
 
-def test_what_is_hidden_is_not_looked_at(problem):
+def test_hidden_texels_are_not_compared(problem):
     """Without the small ball, its pixels are compared with the large ball's texture."""
     batch = replace(problem.batch, rgb_weight=torch.ones_like(problem.batch.rgb_weight))
     hidden = cost(problem, problem.truth, batch)
-    seen = cost(problem, problem.truth, batch, triangles=problem.triangles[:3072], corner_uvs=problem.corner_uvs[:3072])
-    assert hidden < 0.02 and seen > 2 * hidden
+    visible = cost(
+        problem, problem.truth, batch, triangles=problem.triangles[:3072], corner_uvs=problem.corner_uvs[:3072]
+    )
+    assert hidden < 0.02 and visible > 2 * hidden
 
 
-def test_a_new_look_follows_the_mesh(problem):
-    """Visibility is determined again when the mesh has moved: rotated by half a turn, the back is in front."""
+def test_visibility_is_updated_with_the_mesh(problem):
+    """Visibility is determined again when the mesh has moved: rotated by 180 degrees, the back is in front."""
     loss = problem.loss(SIZE_PX)
     loss(torch.as_tensor(problem.truth, dtype=torch.float32), problem.batch)
-    turned = torch.as_tensor(problem.truth * [-1, 1, -1], dtype=torch.float32)
-    again = loss(turned, problem.batch).item()
-    assert again == problem.loss(SIZE_PX)(turned, problem.batch).item()
+    rotated = torch.as_tensor(problem.truth * [-1, 1, -1], dtype=torch.float32)
+    updated = loss(rotated, problem.batch).item()
+    assert updated == problem.loss(SIZE_PX)(rotated, problem.batch).item()
 
 
 def test_resolutions_of_the_reference_agree(problem):
@@ -149,19 +151,19 @@ def test_resolutions_of_the_reference_agree(problem):
         assert cost(problem, problem.start, texture=texture) == pytest.approx(cost(problem, problem.start), rel=1e-4)
 
 
-def test_windows_hold_one_chart(problem):
+def test_windows_contain_one_chart(problem):
     """At every scale: texels with a weight are farther from all other charts than a window's radius."""
     loss = replace(problem, weights=np.ones(len(problem.truth))).loss(SIZE_PX)
     atlas = texels(problem.triangles, problem.corner_uvs, SIZE_PX)
     charts = atlas.image(atlas.chart, -1)
-    first = [places.min() // 4 * 4 for places in np.nonzero(eroded(charts, 2))]  # where the compared part begins
+    first = [axis.min() // 4 * 4 for axis in np.nonzero(eroded(charts, 2))]  # where the compared part begins
     charts = charts[first[0] :, first[1] :]
     for number, scale in enumerate(loss._scales):
         block, weight = 2**number, scale.weight.numpy()
-        places = np.argwhere(weight > 0)[:: 16 // block**2]
-        assert len(places) > 900
-        for row, column in places:
-            above, left = (max(0, block * (place - 5)) for place in (row, column))
+        compared_texels = np.argwhere(weight > 0)[:: 16 // block**2]
+        assert len(compared_texels) > 900
+        for row, column in compared_texels:
+            above, left = (max(0, block * (index - 5)) for index in (row, column))
             near = charts[above : block * (row + 6), left : block * (column + 6)]
             assert len(np.unique(near[near >= 0])) == 1
 
@@ -187,25 +189,25 @@ def rms(values: np.ndarray) -> float:
 STAGES = ((40, 20.0, 4e-3, 2e-3), (40, 8.0, 2e-3, 1e-4))
 
 
-def test_what_has_slid_comes_back(problem):
+def test_slid_vertices_are_recovered(problem):
     before = rms(problem.tangential_mm(problem.start))
     assert 1.5 < before < 2.5
     without = search(problem, problem.start, None, STAGES)
     assert rms(problem.tangential_mm(without)) > 0.7 * before
     back = search(problem, problem.start, problem.batch, STAGES)
     assert rms(problem.tangential_mm(back)) < 0.3
-    off = np.linalg.norm(back[problem.judged], axis=1) - np.linalg.norm(problem.truth[problem.judged], axis=1)
-    assert 1e3 * rms(off) < 0.1  # still on the surface
+    distance_m = np.linalg.norm(back[problem.judged], axis=1) - np.linalg.norm(problem.truth[problem.judged], axis=1)
+    assert 1e3 * rms(distance_m) < 0.1  # still on the surface
 
 
-def test_a_gain_and_a_blush_move_no_vertex(problem):
+def test_a_gain_and_a_blush_displace_no_vertex(problem):
     """A faint blush, for coarse images; the bench has three times as much in finer ones."""
     undisturbed = search(problem, problem.truth, problem.batch, STAGES[1:])
     disturbed = search(problem, problem.truth, problem.disturbed(1.2, 0.1), STAGES[1:])
     assert 1e3 * np.linalg.norm(disturbed - undisturbed, axis=1).max() < 0.1
 
 
-def test_trust_of_the_tiny_head():
+def test_confident_texels_of_the_tiny_head():
     data = tiny_model()
     confidence = np.full(len(data.template_vertex_positions), 0.5)
     confidence[:600] = 0.1
@@ -221,7 +223,7 @@ def test_trust_of_the_tiny_head():
 @needs_shared
 @pytest.mark.slow
 def test_an_expression_of_the_full_head():
-    """Small; `python -m bench.uv_ssim` does it at full size."""
+    """Small; `python -m bench.uv_ssim` measures it at full size."""
     data = gnm_npz.read(SHARED / "data" / "gnm" / "gnm_head_reconstructed.npz")
     coefficients = 0.8 * np.random.default_rng(3).standard_normal(60)
     views = ((-55, 0), (-25, -20), (0, 15), (20, -25), (50, 5))

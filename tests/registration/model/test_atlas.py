@@ -33,7 +33,7 @@ def data(request) -> gnm_npz.GNMData:
 
 
 @pytest.mark.parametrize("resolution", [256, 512, 1024])
-def test_charts_stay_apart_under_a_bilinear_lookup(data, resolution):
+def test_bilinear_lookups_do_not_mix_charts(data, resolution):
     uvs, part = texture_atlas(data), components(data)[data.triangles[:, 0]]
     assert uvs.shape == (len(data.triangles), 3, 2) and uvs.min() > 0 and uvs.max() < 1
     owners = np.zeros((resolution, resolution), int)
@@ -42,7 +42,7 @@ def test_charts_stay_apart_under_a_bilinear_lookup(data, resolution):
     assert owners.max() == 1 and (owners > 0).mean() > 0.9
 
 
-def test_nothing_is_flipped_or_lost(data):
+def test_no_triangle_is_flipped_or_missing(data):
     before, after = signed_areas(data.triangle_uvs.astype(float)), signed_areas(texture_atlas(data).astype(float))
     assert (np.sign(after) == np.sign(before)).all() and (np.abs(after) > 0).all()
     part = components(data)[data.triangles[:, 0]]

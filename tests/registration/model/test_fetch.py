@@ -78,7 +78,7 @@ def test_downloads_once(cache, site):
     gnm_npz.read(cache)
 
 
-def test_offline_tells_where_to_place_the_file(cache):
+def test_without_a_network_the_error_names_where_to_put_the_file(cache):
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         address = f"http://127.0.0.1:{free.getsockname()[1]}"  # bound but not listening: connections are refused
@@ -87,20 +87,20 @@ def test_offline_tells_where_to_place_the_file(cache):
     assert error.fix.endswith(str(cache))
 
 
-def test_unknown_host_tells_where_to_place_the_file(cache):
+def test_with_an_unknown_host_the_error_names_where_to_put_the_file(cache):
     assert refused(cache, "http://no-such-host.invalid").fix.endswith(str(cache))
 
 
-def test_a_file_that_is_not_there(cache, site):
+def test_a_missing_file_on_the_server_is_refused(cache, site):
     assert "404" in refused(cache, site[0]).got
 
 
-def test_a_file_that_is_no_model(cache, site):
+def test_a_download_that_is_no_model_is_refused(cache, site):
     site[1].write_bytes(b"<html>please log in</html>")
     assert "cannot be read" in refused(cache, site[0]).what
 
 
-def test_a_download_that_stops_halfway(cache):
+def test_an_incomplete_download_is_refused(cache):
     for address in serving(CutShort):
         assert "20000 of" in refused(cache, address).got
 

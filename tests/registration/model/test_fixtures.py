@@ -1,4 +1,4 @@
-"""The committed fixtures are what their script makes, and the tiny head is sound enough to render and register."""
+"""The committed fixtures equal the output of their script, and the tiny head can be rendered and registered."""
 
 import numpy as np
 import pytest
@@ -14,20 +14,20 @@ VERTICES = DATA.template_vertex_positions.astype(np.float64)
 def test_file_and_script_agree():
     stored = gnm_npz.read(HERE / "tiny_gnm.npz")
     for name in gnm_npz.AXES:
-        made, kept = getattr(DATA, name), getattr(stored, name)
-        assert made.dtype == kept.dtype
-        if made.dtype.kind == "f":  # the last bit may differ between machines
-            np.testing.assert_allclose(made, kept, rtol=2e-3 if made.dtype == np.float16 else 1e-5, atol=1e-7)
+        computed, saved = getattr(DATA, name), getattr(stored, name)
+        assert computed.dtype == saved.dtype
+        if computed.dtype.kind == "f":  # the last bit may differ between machines
+            np.testing.assert_allclose(computed, saved, rtol=2e-3 if computed.dtype == np.float16 else 1e-5, atol=1e-7)
         else:
-            np.testing.assert_array_equal(made, kept)
+            np.testing.assert_array_equal(computed, saved)
     assert gnm_npz.topology_hash(stored.triangles) == gnm_npz.topology_hash(DATA.triangles)
     rows = (HERE / "head_sparse_68.txt").read_text().splitlines()
-    made = np.array([row.split() for row in landmark_rows(DATA)], float)
-    np.testing.assert_allclose(made, np.array([row.split() for row in rows], float), atol=2e-4)
+    computed = np.array([row.split() for row in landmark_rows(DATA)], float)
+    np.testing.assert_allclose(computed, np.array([row.split() for row in rows], float), atol=2e-4)
     assert (HERE / "tiny_gnm.npz").stat().st_size < 300_000
 
 
-def test_parts_are_closed_or_open_as_they_should_and_turned_outwards():
+def test_parts_are_closed_or_open_as_specified_and_face_outwards():
     part = components(DATA)
     for k, name in enumerate(DATA.mesh_component_names.tolist()):
         triangles = DATA.triangles[part[DATA.triangles[:, 0]] == k]
@@ -66,7 +66,7 @@ def test_joints_follow_from_the_regressor():
     np.testing.assert_allclose(DATA.skinning_weights.sum(0), 1, atol=1e-6)
 
 
-def test_uvs_are_cut_down_the_back_and_nowhere_else():
+def test_uvs_have_one_seam_down_the_back():
     corner_uvs = {}
     for triangle, uvs in zip(DATA.triangles, DATA.triangle_uvs, strict=True):
         for vertex, uv in zip(triangle.tolist(), uvs.tolist(), strict=True):

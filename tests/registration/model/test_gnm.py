@@ -58,7 +58,7 @@ def micro_model() -> gnm_npz.GNMData:
 
 
 @pytest.mark.parametrize("correctives", [False, True])
-def test_agrees_with_the_plain_twin(correctives):
+def test_the_model_agrees_with_the_numpy_reference(correctives):
     data = with_correctives(tiny_model()) if correctives else tiny_model()
     model = GNM(data, torch.float64)
     offsets = 1e-3 * torch.randn(*data.template_vertex_positions.shape, dtype=torch.float64)
@@ -73,7 +73,7 @@ def test_agrees_with_the_plain_twin(correctives):
         assert np.abs(single.numpy() - expected).max() < 3e-6 * size
 
 
-def test_unequal_weight_sums_are_divided_out():
+def test_skinning_weights_are_normalized():
     """The paper's inverse homogeneous map: a vertex' weights count relative to their sum."""
     data = tiny_model()
     doubled = replace(data, skinning_weights=data.skinning_weights * np.float32(2))
@@ -81,14 +81,14 @@ def test_unequal_weight_sums_are_divided_out():
     torch.testing.assert_close(GNM(doubled, torch.float64)(p), GNM(data, torch.float64)(p))
 
 
-def test_at_rest_it_is_the_template():
+def test_the_rest_pose_is_the_template():
     data = tiny_model()
     model = GNM(data)
     expected = torch.from_numpy(data.template_vertex_positions)
     torch.testing.assert_close(model(model.neutral()), expected, rtol=0, atol=1e-6)
 
 
-def test_root_turns_about_the_neck_and_scale_comes_before_translation():
+def test_the_root_rotates_about_the_neck_and_scale_precedes_translation():
     data = tiny_model()
     model = GNM(data, torch.float64)
     turn = torch.zeros(4, 3, dtype=torch.float64)
@@ -102,7 +102,7 @@ def test_root_turns_about_the_neck_and_scale_comes_before_translation():
 
 
 def test_eyes_follow_the_head():
-    """Turning the head by a and the eyes by -a about parallel axes leaves an eye's orientation as it was."""
+    """Rotating the head by a and the eyes by -a about parallel axes keeps an eye's orientation."""
     data = tiny_model()
     model = GNM(data, torch.float64)
     turn = torch.zeros(4, 3, dtype=torch.float64)
@@ -120,13 +120,13 @@ def test_batch_equals_one_by_one():
     offsets = 1e-3 * torch.randn(len(model.weights), 3, dtype=torch.float64)
     together = model(p, offsets)
     assert together.shape == (2, 3, len(model.weights), 3)
-    one = Parameters(**{f.name: getattr(p, f.name)[1, 2] for f in fields(p)})
-    torch.testing.assert_close(together[1, 2], model(one, offsets))
+    single = Parameters(**{f.name: getattr(p, f.name)[1, 2] for f in fields(p)})
+    torch.testing.assert_close(together[1, 2], model(single, offsets))
     each = torch.randn(2, 3, len(model.weights), 3, dtype=torch.float64)
-    torch.testing.assert_close(model(p, each)[1, 2], model(one, each[1, 2]))
+    torch.testing.assert_close(model(p, each)[1, 2], model(single, each[1, 2]))
 
 
-def test_derivatives_agree_with_differences():
+def test_derivatives_agree_with_finite_differences():
     model = GNM(micro_model(), torch.float64)
     p = random_parameters(model, 2)
     values = [getattr(p, f.name).requires_grad_(True) for f in fields(p)]
@@ -139,20 +139,20 @@ def test_derivatives_agree_with_differences():
     assert torch.autograd.gradcheck(call, (offsets, *values))
 
 
-def test_derivatives_at_rest_are_finite_and_right():
+def test_derivatives_at_rest_are_finite_and_correct():
     model = GNM(micro_model(), torch.float64)
     rotations = torch.zeros(4, 3, dtype=torch.float64, requires_grad=True)
     assert torch.autograd.gradcheck(lambda r: model(replace(model.neutral(), rotations=r)), (rotations,))
 
 
-def test_zero_correctives_are_not_kept():
+def test_zero_pose_correctives_are_omitted():
     assert GNM(tiny_model()).corrective_basis is None
     model = GNM(tiny_model())
     assert not model.correctives(axis_angle_to_matrix(random_parameters(model, 2).rotations)).any()
 
 
-def test_recovers_the_parameters_of_a_sample():
-    """Sample, evaluate, fit by Gauss-Newton from rest: the same parameters come back."""
+def test_parameters_of_a_sample_are_recovered():
+    """Sample, evaluate, fit by Gauss-Newton from rest: the parameters are recovered."""
     model = GNM(tiny_model(), torch.float64)
     truth = random_parameters(model, seed=5)
     truth = replace(truth, rotations=0.5 * truth.rotations, scale=torch.ones((), dtype=torch.float64))
@@ -174,8 +174,8 @@ def test_recovers_the_parameters_of_a_sample():
 
 
 @needs_shared
-def test_the_real_posed_example_comes_back():
-    """A head turned by 0.32 rad with eyes turned back by 0.16 rad, from the original model: 0.001 mm."""
+def test_the_real_posed_example_is_reproduced():
+    """A head rotated by 0.32 rad and eyes by -0.16 rad, from the original model: within 0.001 mm."""
     folder = SHARED / "data" / "gnm"
     data, real = gnm_npz.read(folder / "gnm_head_reconstructed.npz"), np.load(folder / "gnm_real_samples.npz")
     who = int(real["posed_identity_index"])

@@ -46,7 +46,7 @@ def test_table_and_annotations_agree():
 
 
 def test_round_trip_is_exact(tmp_path, arrays):
-    arrays |= {"provenance": np.array("made by hand"), "rounds": np.arange(3, dtype=np.uint8)}
+    arrays |= {"provenance": np.array("written by hand"), "rounds": np.arange(3, dtype=np.uint8)}
     data = gnm_npz.read(save(tmp_path, arrays))
     assert set(data.extra) == {"provenance", "rounds"}
     gnm_npz.write(data, tmp_path / "deep" / "again.npz")
@@ -55,7 +55,7 @@ def test_round_trip_is_exact(tmp_path, arrays):
     assert [p.name for p in (tmp_path / "deep").iterdir()] == ["again.npz"]
 
 
-def test_equal_models_make_equal_files(tmp_path):
+def test_equal_models_give_equal_files(tmp_path):
     for name in ("a.npz", "b.npz"):
         gnm_npz.write(tiny_model(), tmp_path / name)
     assert (tmp_path / "a.npz").read_bytes() == (tmp_path / "b.npz").read_bytes()
@@ -139,7 +139,7 @@ def test_files_that_are_no_archive_are_refused(tmp_path, arrays):
     assert "The head model is missing" in refusal(tmp_path / "absent.npz")
 
 
-def test_damaged_and_foreign_members_are_named(tmp_path):
+def test_damaged_and_unknown_members_are_named(tmp_path):
     damaged = bytearray(TINY.read_bytes())
     with zipfile.ZipFile(TINY) as archive:
         entry = archive.getinfo("expression_basis.npy")
@@ -153,7 +153,7 @@ def test_damaged_and_foreign_members_are_named(tmp_path):
     assert "field 'notes.txt' cannot be read" in refusal(path)
 
 
-def test_nothing_is_left_when_writing_fails(tmp_path):
+def test_a_failed_write_leaves_no_file(tmp_path):
     data = tiny_model()
     data.skinning_weights[:] = 0
     with pytest.raises(InputError, match="skinning_weights"):
@@ -165,7 +165,7 @@ def test_nothing_is_left_when_writing_fails(tmp_path):
     assert [p.name for p in tmp_path.iterdir()] == ["taken.npz"]
 
 
-def test_hashes_see_what_they_should():
+def test_hashes_depend_on_topology_and_content():
     a, b = tiny_model(), tiny_model()
     assert gnm_npz.content_hash(a) == gnm_npz.content_hash(b)
     b.expression_basis[2, 5, 1] += 1e-3

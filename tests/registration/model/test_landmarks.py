@@ -26,14 +26,14 @@ def test_points_are_weighted_means(tmp_path):
     assert scheme.points(vertices.astype(np.float32)).dtype == np.float32
 
 
-def test_rounded_weights_are_made_to_sum_to_one(tmp_path):
+def test_rounded_weights_are_normalized_to_sum_to_one(tmp_path):
     path = tmp_path / "head_sparse_a.txt"
     path.write_text("0 0.333 1 0.333 2 0.333\n")
     np.testing.assert_allclose(landmarks.read_scheme(path, 3).weights.sum(1), 1)
 
 
 @pytest.mark.parametrize(
-    ("text", "told"),
+    ("text", "message"),
     [
         ("", "is empty"),
         ("0 1 1 0\n", "row 0"),
@@ -46,12 +46,12 @@ def test_rounded_weights_are_made_to_sum_to_one(tmp_path):
         ("\xe9", "cannot be read"),
     ],
 )
-def test_bad_files_are_refused(tmp_path, text, told):
+def test_bad_files_are_refused(tmp_path, text, message):
     path = tmp_path / "head_sparse_x.txt"
     path.write_text(text, encoding="utf-8")
     with pytest.raises(InputError) as caught:
         landmarks.read_scheme(path, 9)
-    assert told in str(caught.value) and str(path) in str(caught.value)
+    assert message in str(caught.value) and str(path) in str(caught.value)
 
 
 def test_a_missing_file_is_refused(tmp_path):
@@ -59,7 +59,7 @@ def test_a_missing_file_is_refused(tmp_path):
         landmarks.read_scheme(tmp_path / "head_sparse_x.txt", 9)
 
 
-def test_schemes_beside_a_model(tmp_path):
+def test_schemes_in_the_folder_of_a_model(tmp_path):
     assert landmarks.schemes_beside(tmp_path / "model.npz", 10) == {}
     for name in ("5", "68"):
         (tmp_path / f"head_sparse_{name}.txt").write_text("0 1 1 0 2 0\n")
@@ -68,7 +68,7 @@ def test_schemes_beside_a_model(tmp_path):
 
 
 def check_68(points: np.ndarray) -> None:
-    """What the 68-point scheme means: the subject's right first, and this anatomy."""
+    """The order of the 68-point scheme: the subject's right first, and the expected anatomy."""
     x, y, z = points.T
     assert x[0] < 0 < x[16] and x[36] < x[39] < x[42] < x[45]
     assert y[8] < y[57] < y[33] < y[27] < y[24] and z[30] > z[27]
@@ -84,7 +84,7 @@ def test_tiny_head():
 
 @needs_shared
 def test_full_head_keeps_the_file_order():
-    """The official file lists rows 2-6 of the jaw from chin to ear; the reader must not repair that in silence."""
+    """The official file lists rows 2-6 of the jaw from chin to ear; the reader must not reorder them silently."""
     folder = SHARED / "data" / "gnm"
     with np.load(folder / "gnm_head_reconstructed.npz") as archive:
         vertices = archive["template_vertex_positions"]

@@ -25,7 +25,7 @@ def without(data: gnm_npz.GNMData, name: str) -> gnm_npz.GNMData:
     return replace(data, vertex_groups=data.vertex_groups[keep], vertex_group_names=data.vertex_group_names[keep])
 
 
-def test_classes_are_shares_of_the_groups(tiny):
+def test_class_weights_are_fractions_of_the_groups(tiny):
     names, shares = regions.vertex_classes(tiny)
     assert names == ("skin", "left_eye", "right_eye", "upper_lip", "lower_lip", "ears", "mouth_interior")
     np.testing.assert_allclose(shares.sum(1), 1, atol=1e-6)
@@ -61,7 +61,7 @@ def test_a_missing_source_group_is_named(tiny, name):
     ("role", "name"),
     [(regions.neck_other, "hockey_mask"), (regions.exterior, "skin_exterior"), (regions.components, "tongue")],
 )
-def test_roles_name_the_group_they_lack(tiny, role, name):
+def test_a_missing_group_of_a_role_is_named(tiny, role, name):
     with pytest.raises(InputError, match=f"no vertex group '{name}'"):
         role(without(tiny, name))
 
@@ -79,7 +79,7 @@ def test_components_are_the_connected_parts(tiny):
     assert np.bincount(part).tolist() == [889, 98, 98, 26, 26, 26]
 
 
-def test_vertices_of_no_component_are_told(tiny):
+def test_vertices_of_no_component_are_refused(tiny):
     groups = tiny.vertex_groups.copy()
     groups[:, 11] = 0
     with pytest.raises(InputError, match="no mesh component") as caught:
@@ -117,7 +117,7 @@ def test_lids_inner_lips_and_cheeks_are_weights_on_the_exterior(tiny):
         weight = role(tiny)
         assert weight.dtype == np.float32 and 0 <= weight.min() and weight.max() <= 1
         assert regions.exterior(tiny)[weight > 0].all()
-    # This head has no lining behind its lips, and lids of four vertices.
+    # This head has no oral lining behind its lips, and lids of four vertices.
     assert not regions.inner_lips(tiny).any() and np.count_nonzero(regions.lids(tiny)) == 4
 
 
@@ -125,7 +125,7 @@ def test_lids_inner_lips_and_cheeks_are_weights_on_the_exterior(tiny):
     ("role", "name"),
     [(regions.lids, "left_eye"), (regions.inner_lips, "mouth_sock"), (regions.blush, "right_zygomatic_region")],
 )
-def test_where_texture_is_not_trusted_needs_its_groups(tiny, role, name):
+def test_masks_of_unreliable_texture_need_their_groups(tiny, role, name):
     with pytest.raises(InputError, match=f"no vertex group '{name}'"):
         role(without(tiny, name))
 
@@ -141,14 +141,14 @@ def test_lids_inner_lips_and_cheeks_of_the_full_head(full):
     assert not lids[~exterior].any() and 1100 < np.count_nonzero(lids) < 1300
     vermilion = regions.group(full, "upper_lip") + regions.group(full, "lower_lip")
     assert (vermilion[lips > 0] > 0).all() and 50 < (lips == 1).sum() < np.count_nonzero(lips) < vermilion.sum()
-    assert points[lips == 1, 2].mean() < points[(vermilion > 0) & (lips < 0.5), 2].mean()  # further in
+    assert points[lips == 1, 2].mean() < points[(vermilion > 0) & (lips < 0.5), 2].mean()  # further inside
     blush = regions.blush(full)
     mirrored = blush[full.mirror_indices]
     np.testing.assert_array_equal(blush, mirrored)
     assert blush.sum() == 816 and not blush[regions.group(full, "ears") > 0].any()
 
 
-def test_solids_share_out_the_triangles(tiny):
+def test_solids_partition_the_triangles(tiny):
     solids = regions.solids(tiny)
     assert list(solids) == ["skin", "left eye", "right eye", "teeth", "tongue"]
     part = dict(zip(tiny.mesh_component_names.tolist(), range(6), strict=True))
@@ -210,14 +210,14 @@ def test_parts_that_touch_of_the_full_head(full):
 
 
 def test_stabilization_regions_are_exterior_and_mirrored(tiny):
-    found = regions.stabilization_regions(tiny)
-    assert list(found) == ["left_periocular", "right_periocular", "nose", "mouth", "neck_back"]
-    assert set(regions.REFERENCE_REGIONS) < set(found)
+    masks = regions.stabilization_regions(tiny)
+    assert list(masks) == ["left_periocular", "right_periocular", "nose", "mouth", "neck_back"]
+    assert set(regions.REFERENCE_REGIONS) < set(masks)
     exterior, mirror = regions.exterior(tiny), tiny.mirror_indices
-    for mask in found.values():
+    for mask in masks.values():
         assert mask.any() and exterior[mask].all()
-    np.testing.assert_array_equal(found["left_periocular"][mirror], found["right_periocular"])
-    assert not found["neck_back"][regions.group(tiny, "hockey_mask") > 0].any()
+    np.testing.assert_array_equal(masks["left_periocular"][mirror], masks["right_periocular"])
+    assert not masks["neck_back"][regions.group(tiny, "hockey_mask") > 0].any()
     skull = regions.skull_skin(tiny)
     assert skull.any() and exterior[skull].all() and not skull[regions.neck_other(tiny)].any()
     assert not skull[regions.lips(tiny)[0] | (regions.group(tiny, "chin_region") > 0)].any()
@@ -234,25 +234,25 @@ def test_stabilization_regions_need_their_groups(tiny, name):
 def test_the_heads_skin_has_no_neck_and_its_regions_are_mirrored(tiny):
     skin, mirror = regions.head_skin(tiny), tiny.mirror_indices
     assert skin.any() and regions.exterior(tiny)[skin].all() and not skin[regions.neck_other(tiny)].any()
-    found = regions.head_regions(tiny)
-    assert {"face", "nose", "mouth", "ears", "forehead", "chin", "back"} < set(found)
-    for name, mask in found.items():
+    masks = regions.head_regions(tiny)
+    assert {"face", "nose", "mouth", "ears", "forehead", "chin", "back"} < set(masks)
+    for name, mask in masks.items():
         assert mask.any() and skin[mask].all()
         twin = {"left_periocular": "right_periocular", "right_periocular": "left_periocular"}.get(name, name)
-        np.testing.assert_array_equal(mask[mirror], found[twin])
+        np.testing.assert_array_equal(mask[mirror], masks[twin])
 
 
 @needs_shared
 def test_expression_regions_are_components_with_their_mask(full, tiny):
-    found = regions.expression_regions(full)
-    assert {name: len(members) for name, (members, _) in found.items()} == {
+    masks = regions.expression_regions(full)
+    assert {name: len(members) for name, (members, _) in masks.items()} == {
         "left_eye": 100,
         "right_eye": 100,
         "lower_face": 150,
     }
-    np.testing.assert_array_equal(found["left_eye"][1][full.mirror_indices], found["right_eye"][1])
-    inside = found["left_eye"][1] > 0
-    energy = (full.expression_basis[found["left_eye"][0]].astype(np.float32) ** 2).sum((0, 2))
+    np.testing.assert_array_equal(masks["left_eye"][1][full.mirror_indices], masks["right_eye"][1])
+    inside = masks["left_eye"][1] > 0
+    energy = (full.expression_basis[masks["left_eye"][0]].astype(np.float32) ** 2).sum((0, 2))
     assert energy[inside].sum() > 0.9 * energy.sum()
     names = np.array(["pupils" if n.startswith("left_eye") else n for n in tiny.expression_names.tolist()])
     assert set(regions.expression_regions(replace(tiny, expression_names=names))) == {"right_eye", "lower_face"}

@@ -1,4 +1,4 @@
-"""Requests that must be refused before any compute, and what the refusals must say."""
+"""Requests that must be refused before any computation, with the expected messages."""
 
 import json
 import os
@@ -24,7 +24,7 @@ from registration.types import Registration
 
 @dataclass(kw_only=True)
 class Request:
-    """The arguments of one `register` call, in a folder of its own."""
+    """The arguments of one `register` call, in a separate folder."""
 
     folder: Path
     capture: Path
@@ -45,16 +45,16 @@ class Request:
         np.savez(self.model, **{name: array for name, array in arrays_of_model.items() if array is not None})
 
 
-Spoil = Callable[[Request], None]
-BAD: dict[str, tuple[Spoil, str, str, str, str]] = {}  # name -> spoil, what, where, got, fix
+Damage = Callable[[Request], None]
+BAD: dict[str, tuple[Damage, str, str, str, str]] = {}  # name -> damage, what, where, got, fix
 
 
-def bad(what: str, *, where: str, got: str, fix: str) -> Callable[[Spoil], Spoil]:
+def bad(what: str, *, where: str, got: str, fix: str) -> Callable[[Damage], Damage]:
     """Add a case to the table: a phrase of each part of the expected message."""
 
-    def add(spoil: Spoil) -> Spoil:
-        BAD[spoil.__name__] = (spoil, what, where, got, fix)
-        return spoil
+    def add(damage: Damage) -> Damage:
+        BAD[damage.__name__] = (damage, what, where, got, fix)
+        return damage
 
     return add
 

@@ -1,4 +1,4 @@
-"""Registrations that several tests share; each is computed once, some in a process of their own."""
+"""Registrations that several tests share; each is computed once, some in a separate process."""
 
 import shutil
 import subprocess
@@ -49,7 +49,7 @@ class Run:
 
 
 class Beside:
-    """`gnmreg register` in a process of its own."""
+    """`gnmreg register` in a separate process."""
 
     def __init__(self, truth: Truth, out: Path, *options: str):
         self.truth, self.out = truth, out
@@ -61,7 +61,7 @@ class Beside:
         self.stdout = ""
 
     def run(self) -> Run:
-        """Wait for the process; the notes are the lines of its log."""
+        """Wait for the process; the messages are the lines of its log."""
         if self._ended is None:
             self.stdout, log = self._process.communicate(timeout=600)
             assert self._process.returncode == 0, log

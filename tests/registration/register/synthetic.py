@@ -72,13 +72,13 @@ def make(root: Path, expression: str = "neutral") -> Truth:
     vertices = GNM(data)(parameters, torch.as_tensor(offsets, dtype=torch.float32)).numpy()
     scheme = read_scheme(FIXTURES / "head_sparse_68.txt", len(vertices))
     cameras = [_camera(*row, number) for number, row in enumerate(RIG)]
-    pictures = _images(data, vertices, cameras)
+    images = _images(data, vertices, cameras)
     views = []
-    for number, (camera, picture) in enumerate(zip(cameras, pictures, strict=True)):
+    for number, (camera, image) in enumerate(zip(cameras, images, strict=True)):
         points = scheme.points(vertices)
         seen = visible(points, vertices, data.triangles, camera, 2e-3)
         landmarks = np.column_stack([camera.project(points)[0], np.where(seen, 1.0, 0.2)])
-        views.append(_view(f"cam{number}", camera, picture, GAINS[number], landmarks))
+        views.append(_view(f"cam{number}", camera, image, GAINS[number], landmarks))
     write_capture(
         root,
         views,
@@ -154,8 +154,8 @@ def _texture(size: int = 512) -> torch.Tensor:
     return torch.tensor(texture.clip(0.02, 0.85), dtype=torch.float32)
 
 
-def _view(name: str, camera: Camera, picture: np.ndarray, gain: float, landmarks: np.ndarray) -> ViewArrays:
-    rgb, world, mask, classes = np.split(picture, [3, 6, 7], -1)
+def _view(name: str, camera: Camera, image: np.ndarray, gain: float, landmarks: np.ndarray) -> ViewArrays:
+    rgb, world, mask, classes = np.split(image, [3, 6, 7], -1)
     mask = mask[..., 0]
     normals = world @ camera.T_cam_world[:3, :3].T
     length = np.linalg.norm(normals, axis=-1, keepdims=True)

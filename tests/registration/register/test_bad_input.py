@@ -30,9 +30,11 @@ def request_(neutral: Truth, tmp_path: Path) -> Request:
 
 
 @pytest.mark.parametrize("name", BAD)
-def test_refused_before_any_compute(name: str, request_: Request, monkeypatch: pytest.MonkeyPatch):
-    spoil, what, where, got, fix = BAD[name]
-    spoil(request_)
+def test_invalid_requests_are_refused_before_any_computation(
+    name: str, request_: Request, monkeypatch: pytest.MonkeyPatch
+):
+    damage, what, where, got, fix = BAD[name]
+    damage(request_)
     before = state(request_.folder)
     monkeypatch.setattr(backend, "activate", lambda *a, **k: pytest.fail("the renderer was started"))
     with pytest.raises(InputError) as caught:
@@ -50,7 +52,7 @@ def test_there_are_at_least_twenty_cases():
     assert len(BAD) >= 20
 
 
-def test_the_request_itself_is_good(request_: Request, monkeypatch: pytest.MonkeyPatch):
+def test_the_unmodified_request_is_valid(request_: Request, monkeypatch: pytest.MonkeyPatch):
     """Without the changes of the table the registration starts to compute."""
 
     class Started(Exception):
@@ -65,7 +67,7 @@ def test_the_request_itself_is_good(request_: Request, monkeypatch: pytest.Monke
     assert not request_.out.exists()
 
 
-def test_a_former_result_stays(request_: Request, monkeypatch: pytest.MonkeyPatch):
+def test_a_previous_result_is_kept(request_: Request, monkeypatch: pytest.MonkeyPatch):
     write_neutral(request_.out, gnm_npz.read(request_.model))
     image_missing(request_)
     before = state(request_.folder)
@@ -75,8 +77,8 @@ def test_a_former_result_stays(request_: Request, monkeypatch: pytest.MonkeyPatc
     assert state(request_.folder) == before
 
 
-def test_no_head_in_the_masks(request_: Request):
-    """Without landmarks the pose is estimated from the masks; thin stripes are no head. Nothing is written either."""
+def test_masks_without_a_head_are_refused(request_: Request):
+    """Without landmarks the pose is estimated from the masks; thin stripes are no head. Nothing is written."""
     shutil.rmtree(request_.capture / "landmarks")
     stripes = np.zeros((200, 160), np.uint8)
     stripes[:, 30:34] = stripes[:, 120:123] = 255

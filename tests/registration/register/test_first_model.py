@@ -25,7 +25,7 @@ def model() -> Path:
     return build.bootstrap()
 
 
-def test_neutral(model: Path, tmp_path: Path) -> None:
+def test_the_error_of_a_registered_neutral(model: Path, tmp_path: Path) -> None:
     """The demo's bound: scan to mesh on the face, mean, mm."""
     root = synthesize_capture(tmp_path / "capture", seed=8)
     register(root, model, tmp_path / "out")

@@ -56,14 +56,14 @@ def test_memory_of_22_large_views(tmp_path: Path):
     enlarge(CAPTURE, capture)
     size_gb = sum(file.stat().st_size for file in capture.rglob("*") if file.is_file()) / 1e9
     command = [sys.executable, "-m", "workflows.cli", "register", str(capture), "--model", str(MODEL)]
-    begun = time.perf_counter()
+    start_s = time.perf_counter()
     process = subprocess.Popen([*command, "--out", str(out), "--recipe", "draft"])
     status, usage = os.wait4(process.pid, 0)[1:]
     peak_gb = usage.ru_maxrss * 1024 / 1e9
     manifest = json.loads((out / "manifest.json").read_text())
     face = manifest["figures"]["scan_to_mesh"]["face"]
     print(
-        f"22 x {HEIGHT_PX} x {WIDTH_PX} ({size_gb:.1f} GB on disk): {time.perf_counter() - begun:.0f} s, "
+        f"22 x {HEIGHT_PX} x {WIDTH_PX} ({size_gb:.1f} GB on disk): {time.perf_counter() - start_s:.0f} s, "
         f"peak {peak_gb:.2f} GB, {manifest['status']}, {face}, {manifest['seconds']}"
     )
     assert os.waitstatus_to_exitcode(status) == 0

@@ -54,7 +54,7 @@ def test_surface_vertices_and_status(registered: Run):
     assert skin.mean() < 0.45
 
 
-def test_offsets_were_needed(registered: Run):
+def test_the_fit_needs_offsets(registered: Run):
     """The ground truth has bumps of a millimetre on the model: a fit without offsets must miss them."""
     result = registered.result
     model = GNM(read(MODEL))
@@ -65,7 +65,7 @@ def test_offsets_were_needed(registered: Run):
     assert normal_error.mean() > 2 * registered.error_mm[face(registered)].mean()
 
 
-def test_gains_of_the_cameras(registered: Run):
+def test_camera_gains_are_recovered(registered: Run):
     gains = np.array(registered.result.figures["camera_gains"])
     assert gains.shape == (VIEWS, 3)
     relative = gains / np.exp(np.log(gains).mean(0))
@@ -75,12 +75,12 @@ def test_gains_of_the_cameras(registered: Run):
     assert error.max() < 0.06
 
 
-def test_parameters_make_the_vertices(registered: Run, smile: Run):
+def test_parameters_reproduce_the_vertices(registered: Run, smile: Run):
     for run in (registered, smile):
         assert same_mesh(run.result, run.result.vertices) < 1e-5
 
 
-def test_what_lies_on_disk(registered: Run):
+def test_files_of_the_registration_folder(registered: Run):
     out, result, data = registered.out, registered.result, read(MODEL)
     assert sorted(file.name for file in out.iterdir()) == sorted(FILES)
     stored = load_registration(out)
@@ -92,7 +92,7 @@ def test_what_lies_on_disk(registered: Run):
     assert mesh.faces.tolist() == data.triangles.tolist()
 
 
-def test_manifest_tells_how_it_was_made(registered: Run):
+def test_the_manifest_records_inputs_and_configuration(registered: Run):
     manifest = json.loads((registered.out / "manifest.json").read_text())
     stages = [stage["name"] for stage in manifest["config"]["recipe"]["stages"]]
     assert manifest["config"]["seed"] == 0
@@ -107,7 +107,7 @@ def test_manifest_tells_how_it_was_made(registered: Run):
     assert registered.progress.stages == ["reading views", *stages]
 
 
-def test_report_needs_nothing_else(registered: Run):
+def test_the_report_is_self_contained(registered: Run):
     page = (registered.out / "report.html").read_text()
     assert page.count("data:image/") >= 3 * VIEWS
     links = re.findall(r'(?:src|href)\s*=\s*"([^"]*)"', page)
@@ -131,7 +131,7 @@ def contents(folder: Path) -> dict[str, tuple[int, bytes]]:
     return {file.name: (file.stat().st_mtime_ns, file.read_bytes()) for file in folder.iterdir()}
 
 
-def test_same_inputs_return_at_once(registered: Run, no_compute: None):
+def test_equal_inputs_return_the_existing_result(registered: Run, no_compute: None):
     before = contents(registered.out)
     result = register(registered.truth.root, MODEL, registered.out)
     np.testing.assert_array_equal(result.vertices, registered.result.vertices)
@@ -141,7 +141,7 @@ def test_same_inputs_return_at_once(registered: Run, no_compute: None):
 @pytest.mark.parametrize(
     "change", [{"force": True}, {"seed": 1}, {"views": 4}, {"recipe": "studio"}, {"deterministic": True}]
 )
-def test_force_and_other_settings_compute(change: dict, registered: Run, no_compute: None):
+def test_force_and_changed_settings_compute_again(change: dict, registered: Run, no_compute: None):
     before = contents(registered.out)
     with pytest.raises(Computing):
         force = "force" in change
@@ -149,13 +149,13 @@ def test_force_and_other_settings_compute(change: dict, registered: Run, no_comp
     assert contents(registered.out) == before
 
 
-def test_one_seed_one_result(registered: Run, again: Run):
+def test_equal_seeds_give_equal_results(registered: Run, again: Run):
     motion = 1e3 * np.linalg.norm(registered.result.vertices - again.result.vertices, axis=1)
     print(f"two runs: vertices {motion.max():.5f} mm apart at most")
     assert motion.max() < 0.01
 
 
-def test_deterministic_runs_are_equal_to_the_last_bit(deterministic: list[Beside]):
+def test_deterministic_runs_are_bitwise_equal(deterministic: list[Beside]):
     first, second = (beside.run().out for beside in deterministic)
     with np.load(first / "registration.npz") as a, np.load(second / "registration.npz") as b:
         assert a.files == b.files
@@ -167,7 +167,7 @@ def test_deterministic_runs_are_equal_to_the_last_bit(deterministic: list[Beside
     assert len(ids) == 1
 
 
-def test_command_tells_and_uses_the_views_asked_for(deterministic: list[Beside]):
+def test_the_command_prints_and_uses_the_requested_views(deterministic: list[Beside]):
     ended = deterministic[0].run()
     result, log = ended.result, "\n".join(ended.progress.notes)
     assert deterministic[0].stdout == f"{result.status}: {result.reason}\n{ended.out}\n"
@@ -178,7 +178,7 @@ def test_command_tells_and_uses_the_views_asked_for(deterministic: list[Beside])
     assert scan_to_mesh(ended)["mean_mm"] < 0.5
 
 
-def test_evaluate_tells_and_stores_the_drift(registered: Run, smile: Run, tmp_path: Path, capsys):
+def test_evaluate_prints_and_stores_the_drift(registered: Run, smile: Run, tmp_path: Path, capsys):
     out = shutil.copytree(smile.out, tmp_path / "smile")
     neutral = ["--neutral", str(registered.out), "--neutral-capture", str(registered.truth.root)]
     assert main(["evaluate", str(out), "--capture", str(smile.truth.root), *neutral]) == 0

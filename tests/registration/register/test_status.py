@@ -14,18 +14,18 @@ STILL, MOVING = FitTrace(motion_mm=0.01), FitTrace(motion_mm=0.2)
 GOOD = {"68": 0.5, "oral": float("nan")}
 
 
-def test_converged_says_how_still_it_was() -> None:
+def test_the_reason_of_convergence_states_the_last_motion() -> None:
     status, reason = _status(STILL, GOOD, ["oral"], TORN)
     assert status == "converged" and "0.010 mm" in reason and "views" not in reason
 
 
-def test_landmarks_on_the_skin_fail_it() -> None:
+def test_wrong_skin_landmarks_fail_the_registration() -> None:
     status, reason = _status(STILL, {"68": 3.5, "dense": 8.0, "oral": 20.0}, ["oral"], TORN)
     assert status == "failed" and reason.index("dense are 8.0 px") < reason.index("68 are 3.5 px")
     assert "oral" not in reason and "landmarks off by 40 px in views b" in reason
 
 
-def test_landmarks_on_teeth_are_told_but_fail_nothing() -> None:
+def test_wrong_teeth_landmarks_are_reported_without_failing() -> None:
     status, reason = _status(STILL, {"68": 0.5, "oral": 5.5}, ["oral"], CALM)
     assert status == "converged"
     assert reason.endswith("; landmarks of scheme oral are 5.5 px off in the median (limit 3.0)")
@@ -33,10 +33,10 @@ def test_landmarks_on_teeth_are_told_but_fail_nothing() -> None:
 
 
 @pytest.mark.parametrize("landmarks, status", [(GOOD, "stopped"), ({"68": 5.0}, "failed")])
-def test_a_fit_that_still_moves_has_stopped(landmarks: dict[str, float], status: str) -> None:
+def test_a_fit_that_still_moves_has_not_converged(landmarks: dict[str, float], status: str) -> None:
     assert _status(MOVING, landmarks, ["oral"], CALM)[0] == status
 
 
-def test_what_broke_the_fit_is_the_reason() -> None:
+def test_the_failure_of_the_fit_is_the_reason() -> None:
     broken = FitTrace(failure="the loss is not finite")
     assert _status(broken, {"68": 50.0}, [], TORN) == ("failed", "the loss is not finite")

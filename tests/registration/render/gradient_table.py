@@ -1,7 +1,7 @@
 """The renderer's gradient against central differences: moving parts of a scene x groups of channels.
 
 Differences average many rays per pixel; the gradient averages seeds until its standard error is small. The adjoint
-image of a cell is what a motion does to its channels, so that contributions do not cancel. Run it by hand:
+image of a cell is the change of its channels under the motion, so that contributions do not cancel. Run it with:
 
     python -m tests.registration.render.gradient_table
 """
@@ -26,7 +26,7 @@ PIXEL_SAMPLES = 64  # of the differences
 STANDARD_ERROR = 0.005
 SWEEP_PX = 2.0  # half step of the difference that becomes the adjoint: more than a pixel, so that edges stay inside
 NEAR_PX = 0.4  # half step of the difference that is compared
-SEEDS = (4, 40)  # at least and at most
+SEEDS = (4, 40)  # minimum and maximum
 CHANNELS: dict[str, Callable[[Rendered], torch.Tensor]] = {
     "rgb": lambda image: image.rgb,
     "normal": lambda image: image.normals,
@@ -97,7 +97,7 @@ class Cell:
 
 
 def head(file: Path, name: str) -> Scene:
-    """A model at rest between two cameras, one before and one behind it: all sides and the open neck are seen."""
+    """A model at rest between two cameras, one before and one behind it: all sides and the open neck are visible."""
     data = gnm_npz.read(file)
     vertices = data.template_vertex_positions
     centre, span = (vertices.min(0) + vertices.max(0)) / 2, float(np.ptp(vertices, 0).max())

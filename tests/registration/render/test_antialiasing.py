@@ -1,4 +1,4 @@
-"""What several rays per pixel are worth: a mask that does not flicker when the mesh moves by less than a pixel."""
+"""Several rays per pixel: the mask does not flicker when the mesh moves by less than a pixel."""
 
 import numpy as np
 import pytest
@@ -64,7 +64,7 @@ class Scene:
 @pytest.mark.parametrize("side_px", [256, 512])
 @pytest.mark.parametrize("mesh", [head, disc])
 def test_a_moving_mesh_keeps_its_area(mesh, side_px, capsys):
-    """Over a sweep of one pixel in tenths, either way."""
+    """For a translation by one pixel in steps of a tenth, in both directions."""
     scene = Scene(mesh(), side_px)
     renderer = scene.renderer(SAMPLES)
     for name, way in (("x", [1, 0]), ("y", [0, 1])):
@@ -90,7 +90,7 @@ def coverage_of_disc(scene: Scene, shift_px: np.ndarray) -> torch.Tensor:
 
 @pytest.mark.parametrize("side_px", [256, 512])
 @pytest.mark.parametrize("mesh", [head, disc])
-def test_silhouettes_are_covered_as_many_samples_have_it(mesh, side_px, capsys):
+def test_silhouette_coverage_equals_that_of_many_samples(mesh, side_px, capsys):
     scene, shift = Scene(mesh(), side_px), np.array([0.37, 0.21])
     mask = scene.mask(scene.renderer(SAMPLES), shift)
     references = {f"{MANY} samples": scene.mask(scene.renderer(MANY), shift)}

@@ -1,4 +1,4 @@
-"""Curves in which parts of a mesh run through one another: a ball half sunk into a board, against its formula."""
+"""Intersection curves between parts of a mesh: a ball half sunk into a board, against its formula."""
 
 import numpy as np
 import pytest
@@ -27,7 +27,7 @@ def vertices(centre_m: float) -> torch.Tensor:
 
 
 def pixels() -> Pixels:
-    """One camera on +z that looks down, its axis off the middle of a pixel."""
+    """One camera on +z that looks down, its axis not at a pixel's centre."""
     intrinsics = np.array([[FOCAL_PX, 0, SIDE_PX / 2 + 0.3], [0, FOCAL_PX, SIDE_PX / 2 - 0.2], [0, 0, 1]])
     pose = np.diag([1.0, -1, -1, 1])
     pose[2, 3] = DISTANCE_M
@@ -45,8 +45,8 @@ def shown_area(centre_m: float, **settings) -> tuple[float, torch.Tensor]:
 
 
 @pytest.mark.parametrize("rays", [1, 4])
-def test_a_ball_rising_from_a_board(rays):
-    """Sunk to below its middle, it shows the disc of radius sqrt(R^2 - h^2) in which it meets the board."""
+def test_gradients_of_a_ball_rising_from_a_board(rays):
+    """Sunk below its centre, it shows the disc of radius sqrt(R^2 - h^2) in which it meets the board."""
     depth = 0.02
     area, gradient = shown_area(-depth, pixel_samples=rays)
     px_per_m = FOCAL_PX / DISTANCE_M
@@ -57,12 +57,12 @@ def test_a_ball_rising_from_a_board(rays):
     # The board sinks: the same, and the disc comes farther from the camera.
     farther = 2 * area / DISTANCE_M
     assert -gradient[:4, 2].sum().item() == pytest.approx(rising - farther, rel=0.03)
-    # A move aside moves the disc, and does not change its size.
+    # A sideways translation moves the disc and does not change its size.
     assert gradient[4:, :2].sum(0).abs().max() < 0.03 * rising
 
 
-def test_what_hides_without_touching_has_no_crossing():
-    """A ball before the board: silhouettes alone, whether or not the two are said to be parts."""
+def test_occlusion_without_contact_has_no_intersection_curve():
+    """A ball before the board: silhouettes alone, whether or not the two are declared as parts."""
     _, apart = shown_area(0.06)
     _, together = shown_area(0.06, parts=np.zeros(len(TRIANGLES), int))
     torch.testing.assert_close(apart, together, rtol=0, atol=0)

@@ -15,26 +15,26 @@ needs_old = pytest.mark.skipif(not OLD, reason="no libLLVM 14 or 15 on this mach
 
 @pytest.fixture(autouse=True)
 def fresh(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    """No library named, nothing remembered; what a test sets is undone after it."""
+    """No library set, nothing cached; settings of a test are undone after it."""
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     monkeypatch.setenv(llvm.ENVIRONMENT, "")
     monkeypatch.delenv(llvm.ENVIRONMENT)
 
 
 def prefer_an_old_library(monkeypatch: pytest.MonkeyPatch, folder: Path) -> None:
-    """Make Dr.Jit's own choice one that aborts the process: it asks the loader for `libLLVM.so` first."""
+    """Make Dr.Jit's default library one that aborts the process: it asks the loader for `libLLVM.so` first."""
     folder.mkdir()
     (folder / "libLLVM.so").symlink_to(OLD[-1])
     monkeypatch.setenv("LD_LIBRARY_PATH", str(folder))
 
 
-def test_finds_a_library_and_names_it_to_drjit() -> None:
+def test_a_library_is_located_and_set_for_drjit() -> None:
     library = llvm.ensure_usable()
     assert library.is_file() and "libLLVM" in library.name
     assert os.environ[llvm.ENVIRONMENT] == str(library)
 
 
-def test_remembers_the_proof_until_the_library_changes(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_the_check_is_cached_until_the_library_changes(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     library = llvm.ensure_usable()
     monkeypatch.setattr(llvm, "_PROBE", "raise SystemExit('probed again')")
     assert llvm.ensure_usable() == library, "named in the environment by the first call"
@@ -51,7 +51,7 @@ def test_remembers_the_proof_until_the_library_changes(monkeypatch: pytest.Monke
 
 
 @pytest.mark.parametrize("content", ["", "[]", "{}", '{"": {"library": "/nowhere"}}'])
-def test_a_broken_memory_is_rebuilt(content: str, tmp_path: Path) -> None:
+def test_a_corrupt_cache_is_rebuilt(content: str, tmp_path: Path) -> None:
     cache = tmp_path / "cache" / "gnm-registration" / "llvm.json"
     cache.parent.mkdir(parents=True)
     cache.write_text(content)
@@ -59,7 +59,7 @@ def test_a_broken_memory_is_rebuilt(content: str, tmp_path: Path) -> None:
     assert json.loads(cache.read_text())[""]["library"] == str(library)
 
 
-def test_an_unwritable_memory_is_no_error(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_an_unwritable_cache_is_no_error(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "file"))
     assert llvm.ensure_usable().is_file()
@@ -77,7 +77,7 @@ def test_a_named_library_that_kills_the_process_is_an_error(library: Path, monke
     assert llvm.ENVIRONMENT in error.value.fix
 
 
-def test_a_named_library_that_is_not_there_is_an_error(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_a_named_library_that_is_missing_is_an_error(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setenv(llvm.ENVIRONMENT, str(tmp_path / "libLLVM.so"))
     with pytest.raises(InputError) as error:
         llvm.ensure_usable()
@@ -85,7 +85,7 @@ def test_a_named_library_that_is_not_there_is_an_error(monkeypatch: pytest.Monke
 
 
 @needs_old
-def test_falls_back_on_a_newer_library(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_a_newer_library_replaces_an_unusable_library(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     prefer_an_old_library(monkeypatch, tmp_path / "lib")
     _, failure = llvm._probe(None)
     assert "fminimum" in failure or "too old" in failure
@@ -95,7 +95,9 @@ def test_falls_back_on_a_newer_library(monkeypatch: pytest.MonkeyPatch, tmp_path
 
 
 @needs_old
-def test_without_any_library_the_error_has_the_command(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_without_any_library_the_error_contains_the_install_command(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
     prefer_an_old_library(monkeypatch, tmp_path / "lib")
     monkeypatch.setattr(llvm, "_installed", list)
     with pytest.raises(InputError) as error:
@@ -104,7 +106,7 @@ def test_without_any_library_the_error_has_the_command(monkeypatch: pytest.Monke
     assert llvm.ENVIRONMENT not in os.environ
 
 
-def test_setup_command_tells_the_library_and_imports_no_renderer() -> None:
+def test_the_setup_command_prints_the_library_and_imports_no_renderer() -> None:
     code = "import sys; from registration.render import llvm; print(*sys.modules)"
     modules = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout.split()
     assert {"mitsuba", "drjit", "torch", "numpy"}.isdisjoint(modules)
@@ -113,7 +115,7 @@ def test_setup_command_tells_the_library_and_imports_no_renderer() -> None:
 
 
 @needs_old
-def test_setup_command_stops_with_code_1(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_setup_command_fails_with_exit_code_1(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv(llvm.ENVIRONMENT, str(OLD[-1]))
     command = [sys.executable, "-m", "registration.render.llvm", "--install"]
     run = subprocess.run(command, capture_output=True, text=True)

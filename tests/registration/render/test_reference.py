@@ -1,7 +1,7 @@
-"""The renderer against its readable twin: values, and gradients of every group of channels, of a few tiny scenes.
+"""The renderer against the reference renderer: values and gradients of all channels, in a few tiny scenes.
 
-Two things that the twin knows are not asked of the renderer's gradient: that the colour is constant beyond the
-outermost texels' centres, and that it jumps at a seam that is seen from the inner side.
+Two effects of the reference are not required of the renderer's gradient: the colour is constant beyond the
+outermost texels' centres, and it jumps at a seam that is visible from the inner side.
 """
 
 from dataclasses import dataclass, replace
@@ -22,7 +22,7 @@ GROUPS = ("rgb", "normals", "mask", "classes")
 
 @pytest.fixture(autouse=True)
 def llvm():
-    """One thread for the twin: its operations are too small to share, and idle threads that spin would slow others."""
+    """One thread for the reference: its operations are too small to split, and spinning threads would slow others."""
     backend.activate()
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
@@ -39,7 +39,7 @@ class Scene:
 
     @property
     def mesh(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """What both renderers are built of; three random classes."""
+        """Arguments of both renderers; three random classes."""
         classes = np.random.default_rng(1).dirichlet([1, 1, 1], len(self.vertices)).astype(np.float32)
         return self.triangles, self.corner_uvs.astype(np.float32), classes
 
@@ -49,7 +49,7 @@ class Scene:
 
     @property
     def pixels(self) -> Pixels:
-        """A tenth is left out: no gradient comes from there."""
+        """A tenth of the pixels is omitted: they give no gradient."""
         shape = (len(self.cameras), self.cameras[0].height_px, self.cameras[0].width_px)
         return Pixels.from_mask(self.cameras, torch.rand(shape, generator=torch.Generator().manual_seed(2)) < 0.9)
 
@@ -87,8 +87,8 @@ def balls() -> Scene:
 
 
 def bowl() -> Scene:
-    """An open bowl seen from inside, over its rim, and from outside. Its faces look inwards: what folds away from the
-    camera hides what faces it."""
+    """An open bowl seen from inside, over its boundary, and from outside. Its faces look inwards: faces that are
+    turned from the camera hide those that face it."""
     ball = trimesh.creation.icosphere(subdivisions=2)
     triangles = np.array(ball.faces)
     triangles = triangles[(ball.vertices[triangles][..., 1] < 0.3).all(1)]
@@ -111,14 +111,14 @@ def random_texture(size: int = 12) -> torch.Tensor:
 
 
 def random_adjoint(image: Rendered, group: str) -> Rendered:
-    """Of one group of channels; the loss does not look at the others."""
+    """For one group of channels; the loss ignores the others."""
     adjoint = Rendered(**{name: torch.zeros_like(values) for name, values in vars(image).items()})
     generator = torch.Generator().manual_seed(3)
     return replace(adjoint, **{group: torch.randn(getattr(image, group).shape, generator=generator)})
 
 
 def gradients(image: Rendered, adjoint: Rendered, group: str, inputs: list[torch.Tensor]) -> list[torch.Tensor]:
-    """Of the inputs, zero where the image does not depend on one."""
+    """With respect to the inputs; zero where the image does not depend on an input."""
     outputs, grads = getattr(image, group), getattr(adjoint, group).to(getattr(image, group).dtype)
     if not outputs.requires_grad:
         return [torch.zeros_like(values) for values in inputs]
@@ -128,22 +128,22 @@ def gradients(image: Rendered, adjoint: Rendered, group: str, inputs: list[torch
 
 
 def mean_of_offsets(renderer: Renderer, reference: ReferenceRenderer, *scene) -> Rendered:
-    """The twin's image, with the renderer's rays."""
+    """The reference's image, with the renderer's rays."""
     images = [reference(*scene, offset) for offset in renderer._pixel_offsets]
     return Rendered(**{name: sum(getattr(image, name) for image in images) / len(images) for name in GROUPS})
 
 
-def assert_close(found: torch.Tensor, expected: torch.Tensor, share: float) -> None:
-    """Within a share of the norm, and no row farther off than twice that share of the longest."""
-    wrong, expected = (found - expected).flatten(0, -2), expected.flatten(0, -2)
+def assert_close(actual: torch.Tensor, expected: torch.Tensor, tolerance: float) -> None:
+    """Within a fraction of the norm, and no row's error above twice that fraction of the longest row."""
+    error, expected = (actual - expected).flatten(0, -2), expected.flatten(0, -2)
     assert expected.norm() > 0
-    assert wrong.norm() < share * expected.norm()
-    assert wrong.norm(dim=1).max() < 2 * share * expected.norm(dim=1).max()
+    assert error.norm() < tolerance * expected.norm()
+    assert error.norm(dim=1).max() < 2 * tolerance * expected.norm(dim=1).max()
 
 
 @SCENES
 @pytest.mark.parametrize("pixel_samples", [1, 16])
-def test_values(make, pixel_samples):
+def test_values_equal_the_reference_renderers(make, pixel_samples):
     scene = make()
     renderer, reference = Renderer(*scene.mesh, pixel_samples=pixel_samples), ReferenceRenderer(*scene.mesh)
     inputs = scene.positions, random_texture(), scene.pixels
@@ -168,7 +168,7 @@ def test_the_texture_is_clamped_at_its_border():
 
 @pytest.mark.parametrize("pixel_samples", [1, 4])
 @pytest.mark.parametrize("group", ["rgb", "normals", "classes"])
-def test_inside_a_ball(group, pixel_samples):
+def test_values_and_gradients_inside_a_ball(group, pixel_samples):
     """Values and gradients of pixels that hold no silhouette: nothing is sampled, so that only rounding differs."""
     scene = balls()
     half = slice(len(scene.triangles) // 2, None)
@@ -176,16 +176,16 @@ def test_inside_a_ball(group, pixel_samples):
     renderer, reference = Renderer(*scene.mesh, pixel_samples=pixel_samples), ReferenceRenderer(*scene.mesh)
     everywhere = Pixels.full(scene.cameras)
     mask = everywhere.image(reference(scene.positions, None, everywhere).mask[:, None])[..., 0]
-    # What is convex and covers the centres around a pixel covers it all.
+    # A convex shape that covers the centres around a pixel covers it completely.
     pixels = Pixels.from_mask(scene.cameras, torch.nn.functional.avg_pool2d(mask, 3, 1, 1) > 0.99)
     assert len(pixels.view) > 300
     inputs = [scene.positions.requires_grad_(), random_texture().requires_grad_()]
-    image, twin = renderer(*inputs, pixels), mean_of_offsets(renderer, reference, *inputs, pixels)
-    assert (getattr(image, group) - getattr(twin, group)).abs().max() < 5e-5
+    image, reference_image = renderer(*inputs, pixels), mean_of_offsets(renderer, reference, *inputs, pixels)
+    assert (getattr(image, group) - getattr(reference_image, group)).abs().max() < 5e-5
     adjoint = random_adjoint(image, group)
-    found, expected = (gradients(drawn, adjoint, group, inputs) for drawn in (image, twin))
+    actual, expected = (gradients(rendered, adjoint, group, inputs) for rendered in (image, reference_image))
     for number in range(2 if group == "rgb" else 1):
-        assert_close(found[number], expected[number], 1e-4)
+        assert_close(actual[number], expected[number], 1e-4)
 
 
 @SCENES
@@ -199,15 +199,15 @@ def test_gradients(make, group):
     adjoint = random_adjoint(image, group)
     positions, texture = gradients(reference(*inputs, scene.pixels), adjoint, group, inputs)
     silhouettes = reference.silhouette_gradient(*inputs, scene.pixels, adjoint, points=16)
-    found = [gradients(image, adjoint, group, inputs) for _ in range(3)]
-    assert_close(torch.stack([seed[0] for seed in found]).mean(0), positions + silhouettes, 0.015)
+    samples = [gradients(image, adjoint, group, inputs) for _ in range(3)]
+    assert_close(torch.stack([seed[0] for seed in samples]).mean(0), positions + silhouettes, 0.015)
     assert silhouettes.norm() > 0.2 * positions.norm()
     if group == "rgb":
-        assert_close(found[0][1], texture, 1e-4)
+        assert_close(samples[0][1], texture, 1e-4)
 
 
-def test_the_twins_silhouettes_by_hand():
-    """A square's share of the image is the area of its projection (the shoelace formula)."""
+def test_the_reference_silhouette_gradient_by_hand():
+    """The part of the image that a square covers is the area of its projection (the shoelace formula)."""
     scene = squares()
     scene = replace(scene, triangles=scene.triangles[:2], corner_uvs=scene.corner_uvs[:2], cameras=scene.cameras[:1])
     reference, view, pixels = ReferenceRenderer(*scene.mesh), scene.cameras[0], Pixels.full(scene.cameras[:1])
@@ -219,6 +219,6 @@ def test_the_twins_silhouettes_by_hand():
     area = (x * y.roll(-1) - y * x.roll(-1)).sum().abs() / 2
     (expected,) = torch.autograd.grad(area, vertices)
     adjoint = replace(random_adjoint(reference(vertices, None, pixels), "mask"), mask=torch.ones(len(pixels.view)))
-    found = reference.silhouette_gradient(vertices, None, pixels, adjoint)
+    gradient = reference.silhouette_gradient(vertices, None, pixels, adjoint)
     assert area > 100
-    torch.testing.assert_close(found, expected, rtol=1e-6, atol=1e-6)
+    torch.testing.assert_close(gradient, expected, rtol=1e-6, atol=1e-6)

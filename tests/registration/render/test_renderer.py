@@ -1,6 +1,6 @@
-"""What the renderer draws: by hand, against formulas and against the NumPy rasteriser; and how it behaves over time.
+"""The renderer's images: by hand, against formulas and the NumPy rasterizer; and its behaviour over many calls.
 
-Gradients have a table of their own: test_gradients.py.
+Gradients are tested in test_gradients.py.
 """
 
 import gc
@@ -33,7 +33,7 @@ SQUARE_UVS = np.array([[[0, 0], [1, 0], [1, 1]], [[0, 0], [1, 1], [0, 1]]], np.f
 
 @pytest.fixture(autouse=True)
 def llvm(request):
-    """The CPU's variant, but for the tests of the GPU's."""
+    """The CPU variant, except in the GPU tests."""
     if "cuda" not in request.keywords:
         backend.activate()
 
@@ -51,7 +51,7 @@ def camera(position, target=(0, 0, 0), *, focal_px=150.0, width_px=60, height_px
 
 
 def square(**settings) -> Renderer:
-    """A square of 10 cm on z = 0 that faces +z, its map upright; two classes grow from left to right."""
+    """A square of 10 cm on z = 0 that faces +z, its texture upright; two classes grow from left to right."""
     classes = np.array([[1, 0], [0, 1], [0, 1], [1, 0]], np.float32)
     return Renderer(SQUARE_TRIANGLES, SQUARE_UVS, classes, **settings)
 
@@ -98,7 +98,7 @@ def test_a_square_by_hand():
     np.testing.assert_allclose(image.rgb[linear], expected, atol=5e-5)
 
 
-def test_the_inner_side_shows_its_own_normal():
+def test_the_inner_side_of_a_face_has_its_own_normal():
     view = camera((0.05, 0.05, -0.3), (0.05, 0.05, 0))
     image = square()(torch.tensor(SQUARE), None, Pixels.full([view]))
     assert image.mask.sum() > 400
@@ -129,7 +129,7 @@ def test_normals_of_a_sphere():
 
 
 def test_a_head_against_the_numpy_rasteriser():
-    """Faces and barycentrics from there, the channels mixed here in NumPy."""
+    """Faces and barycentrics from the rasterizer, channels interpolated in NumPy."""
     renderer, vertices, pixels = tiny()
     texture = random_texture(64)
     image = renderer(vertices, texture, pixels)
@@ -138,8 +138,8 @@ def test_a_head_against_the_numpy_rasteriser():
     per_view = pixels.index[0].numel()
     for number, view in enumerate(pixels.cameras):
         here = slice(per_view * number, per_view * (number + 1))
-        place = (pixels.y[here].numpy(), pixels.x[here].numpy())
-        face, weight = (a[place] for a in rasterize(positions, TINY.triangles, view))
+        pixel_index = (pixels.y[here].numpy(), pixels.x[here].numpy())
+        face, weight = (a[pixel_index] for a in rasterize(positions, TINY.triangles, view))
         part = {name: values[here].numpy() for name, values in vars(image).items()}
         corners = TINY.triangles[face]
         a, b, c = (positions[corners[:, k]] for k in range(3))
@@ -170,8 +170,8 @@ def looked_up(texture: np.ndarray, uv: np.ndarray) -> np.ndarray:
     return top * (1 - fy) + bottom * fy
 
 
-def test_some_pixels_are_those_of_all():
-    """In values and, summed over a partition, in gradients."""
+def test_a_subset_of_pixels_equals_the_whole_image():
+    """Values are equal, and gradients, summed over a partition."""
     texture = random_texture(64)
     renderer, vertices, everywhere = tiny(edge_samples=64.0)
     whole = renderer(vertices, texture, everywhere)
@@ -197,22 +197,22 @@ def test_some_pixels_are_those_of_all():
 
 
 def test_a_loss_of_one_pixel_moves_the_mesh():
-    """Sums are in fixed point, their unit taken from a sample of the adjoint: a sparse one must not be lost."""
+    """Sums are in fixed point, their unit taken from a sample of the adjoint: a sparse adjoint must not vanish."""
     size = 200
     view = camera((0.05, 0.05, 0.3), (0.05, 0.05, 0), focal_px=600.0, width_px=size, height_px=size)
     pixels, attached = Pixels.full([view]), torch.tensor(SQUARE, requires_grad=True)
     classes = square()(attached, None, pixels).classes[:, 1]
-    one = int(pixels.index[0, 101, 93])
-    assert 0.1 < classes[one] < 0.9
-    (gradient,) = torch.autograd.grad(classes[one], attached)
-    # A point that is seen slides by -1 m when the square slides by 1 m; the class grows by 1 in 0.1 m.
+    pixel = int(pixels.index[0, 101, 93])
+    assert 0.1 < classes[pixel] < 0.9
+    (gradient,) = torch.autograd.grad(classes[pixel], attached)
+    # A visible point slides by -1 m when the square slides by 1 m; the class grows by 1 in 0.1 m.
     assert gradient[:, 0].sum().item() == pytest.approx(-10, rel=1e-3)
 
 
-def test_no_pixel_shows_the_mesh():
-    away = camera((0, 0, 1), (0, 0, 2))
+def test_a_mesh_outside_the_image_gives_zeros():
+    facing_away = camera((0, 0, 1), (0, 0, 2))
     vertices = torch.tensor(SQUARE, requires_grad=True)
-    image = square()(vertices, random_texture(8), Pixels.full([away]))
+    image = square()(vertices, random_texture(8), Pixels.full([facing_away]))
     assert all(values.abs().max() == 0 for values in vars(image).values())
     (image.rgb.sum() + image.normals.sum() + image.mask.sum()).backward()
     assert vertices.grad.abs().max() == 0
@@ -238,28 +238,28 @@ def test_unwrap_is_the_transpose_of_the_look_up():
     torch.testing.assert_close(attached.grad, total, atol=1e-4, rtol=1e-4)
 
 
-def test_unwrap_reuses_what_was_just_drawn_and_nothing_else():
-    """The same result whether faces are remembered or met again; other vertices or pixels are never taken for them."""
+def test_unwrap_reuses_only_the_faces_of_the_same_scene():
+    """The same result whether faces are cached or computed again; the cache never serves other vertices or pixels."""
     renderer, vertices, pixels = tiny()
     fewer = Pixels.full(pixels.cameras[:1])
     generator = torch.Generator().manual_seed(3)
     values = torch.rand(len(pixels.view), 3, generator=generator)
     weights = torch.rand(len(pixels.view), generator=generator)
-    fresh = renderer.unwrap(vertices, values, weights, pixels, 32)
-    for drawn, where in ((vertices, pixels), (vertices * 1.05, pixels), (vertices, fewer)):
-        renderer(drawn, None, where)
+    expected = renderer.unwrap(vertices, values, weights, pixels, 32)
+    for rendered_vertices, rendered_pixels in ((vertices, pixels), (vertices * 1.05, pixels), (vertices, fewer)):
+        renderer(rendered_vertices, None, rendered_pixels)
         again = renderer.unwrap(vertices, values, weights, pixels, 32)
-        torch.testing.assert_close(again, fresh, atol=1e-4, rtol=1e-4)
-    # The adjoint of an older picture moves the mesh back under the faces of the newer.
+        torch.testing.assert_close(again, expected, atol=1e-4, rtol=1e-4)
+    # The adjoint of an older image moves the mesh back under the faces of the newer image.
     older = renderer(vertices.clone().requires_grad_(), None, fewer)
     renderer(vertices * 1.05, None, pixels)
     older.mask.sum().backward()
     again = renderer.unwrap(vertices, values, weights, pixels, 32)
-    torch.testing.assert_close(again, fresh, atol=1e-4, rtol=1e-4)
+    torch.testing.assert_close(again, expected, atol=1e-4, rtol=1e-4)
 
 
-def test_a_place_that_is_no_number_reads_the_texture_and_nothing_else():
-    """Barycentrics of rays that miss are anything; a texel far outside the texture would end the process."""
+def test_invalid_coordinates_are_clamped_to_the_texture():
+    """Barycentrics of rays that miss are arbitrary; a texel far outside the texture would crash the process."""
     size = 7
     for u, v in ((np.nan, 0.5), (0.5, np.nan), (np.inf, -np.inf), (1e30, -1e30)):
         footprint = TexelFootprint.from_uv(mi.Point2f(mi.Float([u, 0.3]), mi.Float([v, 0.3])), size)
@@ -268,7 +268,7 @@ def test_a_place_that_is_no_number_reads_the_texture_and_nothing_else():
 
 
 def test_another_forward_between_forward_and_backward():
-    """A drawing's gradient belongs to its own vertices, texture and pixels."""
+    """A rendering's gradient belongs to its vertices, texture and pixels."""
     texture = random_texture(64)
 
     def gradients(disturb: bool) -> tuple[torch.Tensor, torch.Tensor]:
@@ -293,7 +293,7 @@ def fit_step(renderer: Renderer, vertices: torch.Tensor, texture: torch.Tensor, 
     (image.rgb.square().sum() + image.normals[:, 1].sum() + image.mask.sum() + image.classes[:, 0].sum()).backward()
 
 
-def test_moving_geometry_compiles_nothing_new():
+def test_moving_geometry_compiles_no_new_kernel():
     """Other vertices, other numbers of silhouettes, hits and pixels: the same kernels."""
     import drjit as dr
 
@@ -334,13 +334,13 @@ def test_memory_does_not_grow():
         gc.collect()
         return resident_mb()
 
-    begun = run(60)
+    baseline_mb = run(60)
     # A leak of every step's images alone would be 2.6 MB x 200.
-    assert run(200) < begun + 20
+    assert run(200) < baseline_mb + 20
 
 
 def test_many_rays_per_pixel_measure_an_area():
-    """A disc's mask sums up to its projected area; its rim is grey."""
+    """A disc's mask sums up to its projected area; its outline is grey."""
     corners = 256
     angle = 2 * np.pi * np.arange(corners) / corners
     rim = 0.06 * np.stack([np.cos(angle), np.sin(angle), 0 * angle], 1)
@@ -361,11 +361,11 @@ def test_many_rays_per_pixel_measure_an_area():
 
 
 def test_cameras_of_two_sizes_or_with_distortion_are_refused():
-    one, vertices = camera((0, 0, 0.5)), torch.tensor(SQUARE)
-    pixels = Pixels.full([one, one])
-    for other in (replace(one, width_px=30), replace(one, distortion=(0.1, 0.0, 0.0, 0.0))):
+    view, vertices = camera((0, 0, 0.5)), torch.tensor(SQUARE)
+    pixels = Pixels.full([view, view])
+    for other in (replace(view, width_px=30), replace(view, distortion=(0.1, 0.0, 0.0, 0.0))):
         with pytest.raises(ValueError, match="one image size and no distortion"):
-            square()(vertices, None, replace(pixels, cameras=(one, other)))
+            square()(vertices, None, replace(pixels, cameras=(view, other)))
 
 
 def test_a_mesh_with_fins_is_refused():

@@ -11,7 +11,7 @@ from registration.errors import InputError
 from registration.render.studio.rig import HEAD_FRACTION, MAX_SIDE_PX, SPREAD_DEG, RigOptions, make_rig
 
 
-def test_the_rig_frames_the_head_from_where_it_should():
+def test_the_rig_frames_the_head_from_its_specified_angles():
     cameras = make_rig(RigOptions(cameras=22, size_px=(480, 720), seed=4))
     out = np.stack([camera.centre for camera in cameras])
     yaw, pitch = (
@@ -32,8 +32,8 @@ def test_the_rig_frames_the_head_from_where_it_should():
         == len({camera.intrinsics[0, 2] for camera in cameras})
         == 22
     )
-    turned = make_rig(RigOptions(cameras=1), R_world_head=np.diag([-1.0, 1, -1]), centre=np.array([1.0, 2, 3]))[0]
-    assert (turned.centre - (1, 2, 3))[2] < -1.1
+    rotated = make_rig(RigOptions(cameras=1), R_world_head=np.diag([-1.0, 1, -1]), centre=np.array([1.0, 2, 3]))[0]
+    assert (rotated.centre - (1, 2, 3))[2] < -1.1
 
 
 @pytest.mark.parametrize("count", [1, 2, 3, 5, 8, 22, 40])
@@ -41,7 +41,7 @@ def test_rigs_of_any_size(count):
     assert len(make_rig(RigOptions(cameras=count, size_px=(64, 48)))) == count
 
 
-def test_the_lens_moves_corners_by_a_few_pixels():
+def test_the_lens_displaces_corners_by_a_few_pixels():
     for camera in make_rig(RigOptions(cameras=6, size_px=(480, 720), seed=1, distortion=True)):
         corners = np.array([[1.0, 1], [479, 1], [1, 719], [479, 719]])
         straight = cv2.undistortPoints(
@@ -62,7 +62,7 @@ def test_the_lens_moves_corners_by_a_few_pixels():
         {"spread_deg": (400.0, 10.0)},
     ],
 )
-def test_rigs_that_cannot_be(settings):
+def test_invalid_rigs_are_refused(settings):
     with pytest.raises(InputError) as caught:
         make_rig(RigOptions(**settings))
     assert "expected" in str(caught.value) and "fix" in str(caught.value)

@@ -1,4 +1,4 @@
-"""The studio against Mitsuba's own path tracer, the NumPy rasteriser and formulas."""
+"""The studio against Mitsuba's path tracer, the NumPy rasterizer and formulas."""
 
 from dataclasses import replace
 
@@ -74,7 +74,7 @@ def plain_camera(yaw: float, *, width=90, height=120, distance=0.8, focal=280.0,
 
 
 def path_traced(surface: StudioSurface, camera: Camera, sky: Sky, samples: int) -> np.ndarray:
-    """The same scene by Mitsuba's `path` integrator: its own meshes, textures, environment and camera."""
+    """The same scene by Mitsuba's `path` integrator: with separate meshes, textures, environment and camera."""
     import mitsuba as mi
 
     kept = np.ones(len(surface.triangles), bool) if surface.transparent is None else ~surface.transparent
@@ -139,20 +139,20 @@ def rms_255(view, reference: np.ndarray) -> float:
 
 
 @pytest.mark.parametrize("yaw", [0.2, -1.1])
-def test_pictures_equal_full_path_tracing(yaw):
+def test_images_equal_full_path_tracing(yaw):
     surface, sky, camera = head(), Sky(), plain_camera(yaw)
     [view] = render_views(
         [surface], [camera], sky=sky, quality=Quality(pixel_samples=6, light_rays=512, subdivisions=2)
     )
     reference = path_traced(surface, camera, sky, 512)
     assert rms_255(view, reference) < 5
-    # The picture is no constant that any light would pass.
+    # The image is not constant: a constant would pass with any light.
     dimmer = path_traced(surface, camera, replace(sky, towards=(-1.0, -0.5, 0.1)), 64)
     assert rms_255(view, dimmer) > 10
 
 
 @pytest.mark.slow
-def test_pictures_of_eyes_under_corneas_equal_full_path_tracing():
+def test_images_of_eyes_under_corneas_equal_full_path_tracing():
     try:
         data = gnm_npz.read(bootstrap())
     except InputError as error:
@@ -166,7 +166,7 @@ def test_pictures_of_eyes_under_corneas_equal_full_path_tracing():
         assert difference < 5
 
 
-def test_light_on_a_ball_is_a_formula():
+def test_light_on_a_ball_equals_its_formula():
     """Nothing shades a ball: its irradiance over pi is brightness (1 + 2/3 contrast cos)."""
     sky = Sky(brightness=0.7, contrast=0.6, towards=(0.0, 2.0, 1.0), tint=(1.0, 0.8, 0.5))
     scene = StudioScene([ball()])
@@ -176,8 +176,8 @@ def test_light_on_a_ball_is_a_formula():
     assert np.abs(light - expected).max() < 0.01
 
 
-def test_light_between_surfaces_bounces():
-    """Inside a closed, white-free shell of albedo a no sky is seen; near a grey ball light of its colour arrives."""
+def test_light_is_reflected_between_surfaces():
+    """Inside a closed shell of albedo a no sky is visible; near a grey ball, light of its colour arrives."""
     alone = bake_light(StudioScene([ball()]), Sky(contrast=0.0, brightness=1.0))
     red = np.broadcast_to(np.array([0.9, 0.0, 0.0], np.float32), (4, 4, 3))
     scene = StudioScene([ball(), ball(0.5, (0.0, 0.0, -0.61), red)])
@@ -187,8 +187,8 @@ def test_light_between_surfaces_bounces():
     assert np.abs(light[scene.vertices[: len(alone), 2] > 0.099] - 1).max() < 0.01
 
 
-def test_normals_are_the_meshs():
-    """At pixel centres, within one degree of angle-weighted normals at what the NumPy rasteriser finds there."""
+def test_normals_equal_those_of_the_mesh():
+    """At pixel centres, within one degree of angle-weighted normals at the faces of the NumPy rasterizer."""
     surface = head()
     cameras = make_rig(RigOptions(cameras=3, size_px=(150, 200), seed=5, spread_deg=(80, 30)), centre=HEAD_CENTRE)
     corners = surface.vertices[surface.triangles]
@@ -221,19 +221,19 @@ def test_normals_are_the_meshs():
 
 
 def test_the_mask_is_coverage_through_the_lens():
-    """A ball's silhouette is a cone: its share of the image is known, and its outline bends as OpenCV says."""
+    """A ball's silhouette is a cone: its coverage is known, and its outline bends as OpenCV says."""
     camera = replace(
         make_rig(RigOptions(cameras=1, size_px=(200, 200)), head_height_m=0.24)[0], distortion=(0.6, -2.0, 0.02, -0.01)
     )
     [view] = render_views([ball(fineness=6)], [camera], quality=Quality(pixel_samples=4, light_rays=4, subdivisions=0))
-    away = -camera.centre
-    distance = np.linalg.norm(away)
-    axis = away / distance
+    to_ball = -camera.centre
+    distance = np.linalg.norm(to_ball)
+    axis = to_ball / distance
     side = np.cross(axis, [0.0, 1, 0])
     side /= np.linalg.norm(side)
-    turn = np.linspace(0, 2 * np.pi, 400, endpoint=False)[:, None]
+    angle = np.linspace(0, 2 * np.pi, 400, endpoint=False)[:, None]
     radius = np.tan(np.arcsin(0.1 / distance))
-    outline = camera.centre + axis + radius * (np.cos(turn) * side + np.sin(turn) * np.cross(axis, side))
+    outline = camera.centre + axis + radius * (np.cos(angle) * side + np.sin(angle) * np.cross(axis, side))
     xy = distorted_pixels(camera, outline)
     expected = 0.5 * abs(area_2d(xy))
     assert view.mask.sum() == pytest.approx(expected, rel=1e-3)
@@ -241,7 +241,7 @@ def test_the_mask_is_coverage_through_the_lens():
     assert abs(straight / expected - 1) > 0.005
 
 
-def test_clear_faces_show_in_masks_and_labels_alone():
+def test_transparent_faces_appear_only_in_masks_and_labels():
     inner, outer = ball(0.08, texture=np.full((4, 4, 3), 0.5, np.float32)), ball(0.1)
     inner = replace(inner, classes=np.tile([1.0, 0.0], (len(inner.vertices), 1)).astype(np.float32))
     outer = replace(
@@ -264,15 +264,15 @@ def test_landmarks_are_hidden_behind_the_head_and_outside_the_image():
     np.testing.assert_allclose(view.landmarks["four"][:, :2], camera.project(points)[0], atol=1e-9)
 
 
-def test_equal_seeds_give_equal_pictures():
+def test_equal_seeds_give_equal_images():
     surface = head()
     cameras = make_rig(RigOptions(cameras=2, size_px=(60, 80), spread_deg=(40, 0)), centre=HEAD_CENTRE)
     sensor = Sensor(shot_noise=0.02, read_noise=0.005, exposure_spread=0.1, colour_spread=0.05)
 
-    def pictures(seed):
+    def rendered_views(seed):
         return render_views([surface], cameras, sensor=sensor, quality=Quality(light_rays=64), seed=seed)
 
-    first, again, other = pictures(1), pictures(1), pictures(2)
+    first, again, other = rendered_views(1), rendered_views(1), rendered_views(2)
     for a, b, c in zip(first, again, other, strict=True):
         for name in ("rgb", "mask", "normals", "labels"):
             assert (getattr(a, name) == getattr(b, name)).all()
@@ -281,7 +281,7 @@ def test_equal_seeds_give_equal_pictures():
     assert (first == again).all() and (first != other).any()
 
 
-def test_noise_and_gains_are_as_told():
+def test_noise_and_gains_equal_the_sensor_settings():
     camera = plain_camera(0.0, centre=np.zeros(3))
     quality = Quality(pixel_samples=1, light_rays=4)
 
@@ -298,7 +298,7 @@ def test_noise_and_gains_are_as_told():
     assert (gains / gains.mean(1, keepdims=True)).std() == pytest.approx(0.03 * np.sqrt(2 / 3), rel=0.4)
 
 
-def test_subdivision_keeps_shape_and_everything_on_it():
+def test_subdivision_preserves_shape_and_attributes():
     surface = head()
     fine = subdivide(surface)
     assert len(fine.triangles) == 4 * len(surface.triangles) and len(fine.transparent) == len(fine.triangles)
@@ -328,43 +328,43 @@ def test_noise_is_a_function_of_space():
 
 
 def test_the_texture_has_no_seams():
-    """Faces on both sides of a cut in the map show one colour along it."""
+    """Faces on both sides of a seam of the texture map have equal colours along it."""
     texture = paint_head(TINY, make_canvas(TINY, 1024), SkinAppearance(freckles=0.0, stubble=0.0))
     surface = replace(head(), texture=cv2.blur(texture, (5, 5)))
     scene = StudioScene([surface])
     from registration.geometry.topology import edges
 
-    own = edges(TINY.triangles)
+    mesh_edges = edges(TINY.triangles)
     uvs = surface.corner_uvs.reshape(-1, 2)
-    inner = own.faces[:, 1] >= 0
-    ends = own.corners[inner]
+    inner = mesh_edges.faces[:, 1] >= 0
+    ends = mesh_edges.corners[inner]
     cut = np.abs(uvs[ends[:, 0]] - uvs[ends[:, 1]]).max((1, 2)) > 0.02
     assert cut.sum() > 10
 
-    def colours(corner):  # slightly inside the face, in the middle of the edge
+    def colours(corner):  # slightly inside the face, at the midpoint of the edge
         face = corner[:, 0] // 3
-        place = 0.49 * uvs[corner[:, 0]] + 0.49 * uvs[corner[:, 1]] + 0.02 * uvs.reshape(-1, 3, 2)[face].mean(1)
+        uv = 0.49 * uvs[corner[:, 0]] + 0.49 * uvs[corner[:, 1]] + 0.02 * uvs.reshape(-1, 3, 2)[face].mean(1)
         size = surface.texture.shape[0]
-        x, y = (place * (1, -1) + (0, 1)).T * size
+        x, y = (uv * (1, -1) + (0, 1)).T * size
         return surface.texture[y.astype(int), x.astype(int)]
 
     first, second = colours(ends[cut, 0]), colours(ends[cut, 1])
-    skin = group(TINY, "skin")[own.vertices[inner][cut]].min(1) > 0.5
+    skin = group(TINY, "skin")[mesh_edges.vertices[inner][cut]].min(1) > 0.5
     assert np.abs(first - second)[skin].mean() < 0.15 * first[skin].std(0).max() + 0.02
     assert scene.vertex_albedo().shape == TINY.template_vertex_positions.shape
 
 
-def test_the_face_is_painted_where_it_is():
+def test_facial_features_are_painted_at_their_vertices():
     """Iris, pupil, brows and lips have their colours at their vertices; the two eyes look alike."""
     surface = head(texels=512)
     albedo = StudioScene([surface]).vertex_albedo()
     frame = eye_frame(TINY, "left_eye")
     points = TINY.template_vertex_positions.astype(np.float64)
-    _, away, _ = frame.cylindrical(points)
+    _, radius, _ = frame.cylindrical(points)
     eye = group(TINY, "left_eye") > 0.5
     front = eye & (points[:, 2] > frame.centre[2])
-    assert albedo[front & (away < 0.5 * frame.pupil_radius)].max() < 0.1
-    assert albedo[front & (away > 1.5 * frame.iris_radius)].min() > 0.3
+    assert albedo[front & (radius < 0.5 * frame.pupil_radius)].max() < 0.1
+    assert albedo[front & (radius > 1.5 * frame.iris_radius)].min() > 0.3
     cheek = albedo[group(TINY, "left_cheek_region") > 0.5].mean(0)
     lip = albedo[group(TINY, "lower_lip") > 0.5].mean(0)
     assert lip[1] / lip[0] < 0.8 * cheek[1] / cheek[0]
@@ -372,14 +372,14 @@ def test_the_face_is_painted_where_it_is():
     assert dark.mean() < 0.6 * surface.texture.mean() and dark.min() >= 0 and surface.texture.max() <= 1
 
 
-def test_the_hairline_leaves_face_and_ears_free():
+def test_the_hairline_does_not_cover_face_and_ears():
     reach = depth_inside_hairline(TINY)
     points = TINY.template_vertex_positions
     assert (reach[(group(TINY, "hockey_mask") > 0.5) | (group(TINY, "ears") > 0.5)] < 0).all()
     assert reach[points[:, 1].argmax()] > 0.02 and (reach[points[:, 1] < 0.2] < 0).all()
 
 
-def test_looks_differ_and_stay_possible():
+def test_sampled_appearances_differ_and_are_plausible():
     looks = [SkinAppearance.sample(seed) for seed in range(30)]
     assert looks[3] == SkinAppearance.sample(3) and len({look.melanin for look in looks}) == 30
     for look in looks:
@@ -387,7 +387,7 @@ def test_looks_differ_and_stay_possible():
         assert all(0 < value < 0.5 for value in (*look.hair, *look.iris))
 
 
-def test_canvas_covers_every_face_and_fills_the_rest():
+def test_the_canvas_covers_every_face_and_fills_the_remaining_texels():
     page = make_canvas(TINY, 256)
     points = page.interpolate(TINY.template_vertex_positions)
     assert np.isfinite(points).all() and (page.weights.sum(1) == pytest.approx(1, abs=1e-5))

@@ -1,4 +1,4 @@
-"""Atomic writes: the new content or the old, never a part of either, and nothing left beside it."""
+"""Atomic writes: the new content or the old, never a part of either, and no temporary files remain."""
 
 import json
 
@@ -8,7 +8,7 @@ from registration.errors import InputError
 from registration.storage import files
 
 
-def test_a_failing_write_leaves_the_old_file_and_nothing_else(tmp_path):
+def test_a_failed_write_keeps_the_previous_file_alone(tmp_path):
     target = tmp_path / "model.npz"
     files.atomic_write_bytes(target, b"old")
     with pytest.raises(OSError, match="disk full"):
@@ -26,7 +26,7 @@ def test_json_has_null_for_numbers_that_are_not_finite(tmp_path):
     assert json.loads((tmp_path / "a.json").read_text()) == {"mm": [1.5, None]}
 
 
-def test_a_folder_appears_whole_or_not_at_all(tmp_path):
+def test_a_folder_is_created_atomically(tmp_path):
     out = tmp_path / "below" / "out"
     with pytest.raises(OSError, match="disk full"):
         with files.atomic_directory(out) as temporary:
@@ -51,7 +51,7 @@ def test_a_folder_appears_whole_or_not_at_all(tmp_path):
         ({"page": ""}, True),
     ],
 )
-def test_only_our_folders_may_be_written_to(tmp_path, content, refused):
+def test_only_folders_with_our_manifest_may_be_replaced(tmp_path, content, refused):
     for name, text in content.items():
         (tmp_path / name).write_text(text)
     arguments = dict(kind="ours", command="stabilize", files=("manifest.json", "page"))

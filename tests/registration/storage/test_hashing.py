@@ -1,4 +1,4 @@
-"""Digests of nested values tell apart what differs and nothing else; arrays go in by their bytes."""
+"""Digests of nested values differ exactly when the values differ; arrays are hashed by their bytes."""
 
 import time
 
@@ -12,7 +12,7 @@ def digest(value) -> str:
     return hashing.input_hash({}, {"value": value})
 
 
-def test_equal_values_have_one_digest_wherever_they_lie_in_memory():
+def test_digests_do_not_depend_on_memory_layout():
     array = np.arange(12.0).reshape(3, 4)
     assert hashing.hash_arrays(array) == hashing.hash_arrays(array.copy(order="F"))
     assert hashing.hash_arrays(array[:, ::2]) == hashing.hash_arrays(array[:, ::2].copy())
@@ -30,22 +30,22 @@ def test_equal_values_have_one_digest_wherever_they_lie_in_memory():
     ],
     ids=["shape", "precision", "type", "a last bit", "a list"],
 )
-def test_other_arrays_have_other_digests(other):
+def test_different_arrays_have_different_digests(other):
     array = np.arange(12.0).reshape(3, 4)
     assert digest(array) != digest(other)
     assert digest({"deep": [1, {"er": array}]}) != digest({"deep": [1, {"er": other}]})
 
 
-def test_order_and_number_of_arrays_count():
+def test_digests_depend_on_order_and_number_of_arrays():
     a, b = np.zeros(3), np.ones(3)
     assert (
         len({hashing.hash_arrays(a, b), hashing.hash_arrays(b, a), hashing.hash_arrays(a), hashing.hash_arrays()}) == 4
     )
 
 
-def test_large_arrays_are_quick():
+def test_large_arrays_are_hashed_quickly():
     """A 2048 x 2048 texture; written out as JSON it took 20 s."""
     texture = np.zeros((2048, 2048, 3), np.float32)
-    begun = time.process_time()
+    start_s = time.process_time()
     hashing.hash_arrays(texture)
-    assert time.process_time() - begun < 3
+    assert time.process_time() - start_s < 3

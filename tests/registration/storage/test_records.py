@@ -52,7 +52,7 @@ def example() -> Example:
     )
 
 
-def test_what_is_written_is_read_back_equal(tmp_path):
+def test_records_are_read_back_equal(tmp_path):
     example().write(tmp_path / "record.json")
     assert Example.read(tmp_path / "record.json") == example()
     assert Example.is_ours(tmp_path / "record.json") and not Example.is_ours(tmp_path / "other.json")

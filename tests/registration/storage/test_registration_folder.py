@@ -1,4 +1,4 @@
-"""Registration <-> folder: nothing lost, nothing half-written, nothing foreign touched."""
+"""Registration <-> folder: lossless, atomic, and without changing other files."""
 
 import json
 import os
@@ -99,7 +99,7 @@ def test_meshes_keep_the_vertices(tmp_path):
     assert cv2.imread(str(tmp_path / "r" / "texture.png"), -1).dtype == np.uint16
 
 
-def test_a_folder_of_ours_is_replaced_whole(tmp_path):
+def test_an_existing_registration_is_replaced_completely(tmp_path):
     save_registration(a_registration(0), tmp_path / "r", report_html="old")
     save_registration(a_registration(1), tmp_path / "r")
     np.testing.assert_array_equal(load_registration(tmp_path / "r").identity, a_registration(1).identity)
@@ -107,7 +107,7 @@ def test_a_folder_of_ours_is_replaced_whole(tmp_path):
     assert [p.name for p in tmp_path.iterdir()] == ["r"]
 
 
-def test_replacing_without_an_atomic_exchange(tmp_path, monkeypatch):
+def test_replacement_without_an_atomic_exchange(tmp_path, monkeypatch):
     monkeypatch.setattr(files.ctypes, "CDLL", lambda *a, **k: object())  # as on a system without renameat2
     save_registration(a_registration(0), tmp_path / "r")
     save_registration(a_registration(1), tmp_path / "r")
@@ -116,7 +116,7 @@ def test_replacing_without_an_atomic_exchange(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize("failing", ["write_obj", "exchange"])
-def test_a_crash_while_writing_leaves_the_former_result(tmp_path, monkeypatch, failing):
+def test_a_crash_while_writing_keeps_the_previous_result(tmp_path, monkeypatch, failing):
     save_registration(a_registration(0), tmp_path / "r")
 
     def crash(*_):
@@ -158,7 +158,7 @@ def below_a_file(root: Path) -> Path:
 
 
 @pytest.mark.parametrize("make", [foreign_folder, foreign_manifest, ours_with_a_guest, a_file, below_a_file])
-def test_foreign_output_is_refused_and_left_alone(tmp_path, make):
+def test_output_that_is_no_registration_is_refused_and_unchanged(tmp_path, make):
     out = make(tmp_path)
     before = {p: p.read_bytes() for p in tmp_path.rglob("*") if p.is_file()}
     with pytest.raises(InputError, match="output folder"):
@@ -168,7 +168,7 @@ def test_foreign_output_is_refused_and_left_alone(tmp_path, make):
     assert {p: p.read_bytes() for p in tmp_path.rglob("*") if p.is_file()} == before
 
 
-def test_new_and_empty_folders_are_fine(tmp_path):
+def test_new_and_empty_folders_are_accepted(tmp_path):
     (tmp_path / "empty").mkdir()
     for out in (tmp_path / "empty", tmp_path / "a" / "b"):
         check_output_folder(out)
@@ -208,16 +208,16 @@ BROKEN = {
 
 
 @pytest.mark.parametrize("case", BROKEN)
-def test_a_broken_folder_names_what_is_wrong(tmp_path, case):
+def test_errors_name_the_defect_of_a_damaged_folder(tmp_path, case):
     save_registration(a_registration(), tmp_path / "r")
-    wanted = input_hash(a_registration().inputs, a_registration().config)
-    assert find_existing(tmp_path / "r", wanted) is not None
+    expected_hash = input_hash(a_registration().inputs, a_registration().config)
+    assert find_existing(tmp_path / "r", expected_hash) is not None
     breaks, message = BROKEN[case]
     breaks(tmp_path / "r")
     with pytest.raises(InputError) as caught:
         load_registration(tmp_path / "r")
     assert re.search(message, str(caught.value)), str(caught.value)
-    assert find_existing(tmp_path / "r", wanted) is None
+    assert find_existing(tmp_path / "r", expected_hash) is None
 
 
 def test_non_finite_results_are_written_only_for_debugging(tmp_path):
@@ -239,7 +239,7 @@ def test_find_existing_depends_on_inputs_and_configuration(tmp_path):
     assert find_existing(tmp_path / "nothing", "") is None
 
 
-def test_update_figures_keeps_the_rest(tmp_path):
+def test_update_figures_keeps_the_other_keys(tmp_path):
     save_registration(a_registration(), tmp_path / "r", report_html="old")
     update_figures(tmp_path / "r", {"drift": {"mean_mm": np.float32(0.5), "max_mm": float("inf")}}, report_html="new")
     got = load_registration(tmp_path / "r")
@@ -259,7 +259,7 @@ def a_capture(root: Path) -> Capture:
     return Capture(root=root, subject="s", expression="e", views=tuple(views))
 
 
-def test_capture_hash_sees_content_and_not_place(tmp_path):
+def test_the_capture_hash_depends_on_content_and_not_on_location(tmp_path):
     a, b = a_capture(tmp_path / "a"), a_capture(tmp_path / "b")
     assert hash_capture(a) == hash_capture(b)
     os.utime(b.views[0].image, (0, 0))

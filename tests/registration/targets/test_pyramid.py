@@ -28,8 +28,8 @@ def labels_of(direction: np.ndarray) -> np.ndarray:
     return np.where((x - 0.35) ** 2 + (y - 0.1) ** 2 + np.minimum(z, 0) < 0.04, 4, labels)
 
 
-def picture(name: str, turn: float, distortion: tuple[float, ...] = ()) -> ViewArrays:
-    view = small.picture(name, small.camera(turn, distortion=distortion))
+def labelled_view(name: str, yaw_rad: float, distortion: tuple[float, ...] = ()) -> ViewArrays:
+    view = small.synthetic_view(name, small.camera(yaw_rad, distortion=distortion))
     world = view.normals @ view.camera.T_cam_world[:3, :3]
     return replace(view, labels=np.where(view.mask, labels_of(world), 0).astype(np.uint8))
 
@@ -41,7 +41,7 @@ def capture_of(root: Path, views: list[ViewArrays]):
 
 @pytest.fixture(scope="module")
 def capture(tmp_path_factory):
-    views = [picture(f"cam{i}", turn, small.DISTORTIONS["OPENCV"]) for i, turn in enumerate(small.TURNS)]
+    views = [labelled_view(f"cam{i}", yaw_rad, small.DISTORTIONS["OPENCV"]) for i, yaw_rad in enumerate(small.YAWS_RAD)]
     return capture_of(tmp_path_factory.mktemp("targets") / "ball", views)
 
 
@@ -51,7 +51,7 @@ def pyramid(capture):
 
 
 def images(level: Targets, name: str) -> np.ndarray:
-    """One channel laid out as images (N, H, W, D)."""
+    """One channel as images (N, H, W, D)."""
     values = getattr(level, name).float()
     return level.pixels.image(values.reshape(len(values), -1)).numpy()
 
@@ -68,7 +68,7 @@ def world_directions(camera) -> tuple[np.ndarray, np.ndarray]:
 
 
 @pytest.mark.parametrize("level", range(LEVELS))
-def test_cameras_follow_windows_and_levels(pyramid, level):
+def test_cameras_match_windows_and_levels(pyramid, level):
     """Values at a pixel are those of the ball's point that the level's own camera sees there."""
     targets = pyramid[level]
     channels = {name: images(targets, name) for name in (*VALUES, *WEIGHTS)}
@@ -86,7 +86,7 @@ def test_cameras_follow_windows_and_levels(pyramid, level):
         np.testing.assert_allclose(channels["normals"][number][safe], world[safe], atol=0.02)
         colour = (0.3 + 0.1 * np.sin(6 * world + [0, 1, 2]))[safe]
         np.testing.assert_allclose(channels["rgb"][number][safe], colour, atol=0.015)
-        # Labels, away from their borders: in every direction by a pixel the label is the same.
+        # Labels, except at their borders: all neighbouring pixels have the same label.
         label = labels_of(world)
         shifted = [np.roll(label, step, axis) for axis in (0, 1) for step in (-1, 1)]
         pure = safe & np.all([s == label for s in shifted], axis=0) & (label != 3)
@@ -95,17 +95,17 @@ def test_cameras_follow_windows_and_levels(pyramid, level):
     assert compared > 2000 / 4**level
 
 
-def test_landmarks_follow_their_cameras(pyramid, capture):
+def test_landmarks_match_the_cameras_of_the_levels(pyramid, capture):
     points = small.landmarks_68()
     for targets in pyramid:
-        seen = targets.landmarks["68"].numpy()
-        assert seen.shape == (5, 68, 3)
-        for camera, view in zip(targets.pixels.cameras, seen, strict=True):
+        landmarks = targets.landmarks["68"].numpy()
+        assert landmarks.shape == (5, 68, 3)
+        for camera, view in zip(targets.pixels.cameras, landmarks, strict=True):
             np.testing.assert_allclose(view[:, :2], camera.project(points)[0], atol=0.02)
-        np.testing.assert_allclose(np.unique(seen[..., 2]), [0.2, 1.0], rtol=1e-6)
+        np.testing.assert_allclose(np.unique(landmarks[..., 2]), [0.2, 1.0], rtol=1e-6)
 
 
-def test_windows_hold_the_head_and_a_margin(pyramid):
+def test_windows_contain_the_head_and_a_margin(pyramid):
     """The ball's outline is inside every crop, pixels far from it are not; all crops have one size."""
     finest = pyramid[0]
     assert len({(c.width_px, c.height_px) for c in finest.pixels.cameras}) == 1
@@ -137,7 +137,7 @@ def test_a_level_is_the_block_mean_of_the_one_before(pyramid):
             np.testing.assert_allclose(after[whole], blocks[whole], atol=2e-3)
 
 
-def test_reducing_while_decoding_gives_the_same_level(capture, pyramid):
+def test_downsampling_while_decoding_gives_the_same_level(capture, pyramid):
     """At half the resolution: crops may start elsewhere, as their cameras say."""
     half = build_pyramid(capture, class_map(CLASSES), finest_head_px=int(pyramid[1].px_per_head) - 2, levels=1)[0]
     assert half.px_per_head == pytest.approx(pyramid[1].px_per_head, abs=1)
@@ -161,7 +161,7 @@ def test_reducing_while_decoding_gives_the_same_level(capture, pyramid):
 
 
 @pytest.mark.parametrize("level", range(LEVELS))
-def test_hair_and_outlines_that_are_not_the_heads_compare_nothing(pyramid, level):
+def test_hair_and_outlines_of_other_objects_have_no_weight(pyramid, level):
     """Hair has no weight at all. Mask weight lies on the head and on the background that is nearest to the head."""
     targets = pyramid[level]
     weights = {name: images(targets, name)[..., 0] for name in WEIGHTS}
@@ -191,7 +191,7 @@ def test_hair_and_outlines_that_are_not_the_heads_compare_nothing(pyramid, level
     assert min(checked.values()) > 0 or level == LEVELS - 1
 
 
-def test_grazing_normals_weigh_less(pyramid):
+def test_grazing_normals_have_less_weight(pyramid):
     targets = pyramid[0]
     for number, camera in enumerate(targets.pixels.cameras):
         weight = images(targets, "normal_weight")[number, ..., 0]
@@ -203,10 +203,10 @@ def test_grazing_normals_weigh_less(pyramid):
         np.testing.assert_allclose(weight[used], facing[used], atol=0.04)
         rgb = images(targets, "rgb_weight")[number, ..., 0]
         np.testing.assert_allclose(rgb[rgb > 0], weight[rgb > 0])
-        assert (rgb > 0).sum() < used.sum()  # a pixel is eroded at the rim
+        assert (rgb > 0).sum() < used.sum()  # a pixel is eroded at the outline
 
 
-def test_pixels_are_those_that_some_term_compares(pyramid):
+def test_listed_pixels_are_those_with_any_weight(pyramid):
     for targets in pyramid:
         total = sum(getattr(targets, name).float() for name in WEIGHTS)
         assert (total > 0).all()
@@ -216,7 +216,7 @@ def test_pixels_are_those_that_some_term_compares(pyramid):
 
 def test_views_may_lack_masks_normals_and_labels(tmp_path):
     parts = ("mask", "normals", "labels")
-    views = [picture(f"cam{i}", turn) for i, turn in enumerate(small.TURNS)]
+    views = [labelled_view(f"cam{i}", yaw_rad) for i, yaw_rad in enumerate(small.YAWS_RAD)]
     views = [replace(view, **({parts[i]: None} if i < 3 else {})) for i, view in enumerate(views)]
     views[3] = replace(views[3], mask=None, normals=None, labels=None, landmarks={})
     targets = build_pyramid(capture_of(tmp_path / "ball", views), class_map(CLASSES), finest_head_px=999, levels=2)[1]
@@ -224,7 +224,7 @@ def test_views_may_lack_masks_normals_and_labels(tmp_path):
     assert used["rgb_weight"] == [True] * 5
     assert used["normal_weight"] == [True, False, True, False, True]
     assert used["class_weight"] == [True, True, False, False, True]
-    # Labels tell the outline where there is no mask; with neither there is none.
+    # Without a mask, labels give the outline; with neither there is no outline.
     assert used["mask_weight"] == [True, True, True, False, True]
     assert (targets.landmarks["68"][3, :, 2] == 0).all()
     whole = targets.pixels.index[3] >= 0
@@ -233,8 +233,8 @@ def test_views_may_lack_masks_normals_and_labels(tmp_path):
 
 def test_a_capture_of_images_alone(tmp_path):
     views = [
-        replace(picture(f"cam{i}", turn), mask=None, normals=None, labels=None, landmarks={})
-        for i, turn in enumerate(small.TURNS)
+        replace(labelled_view(f"cam{i}", yaw_rad), mask=None, normals=None, labels=None, landmarks={})
+        for i, yaw_rad in enumerate(small.YAWS_RAD)
     ]
     write_capture(tmp_path / "ball", views, CaptureDescription(subject="ball", expression="neutral"))
     targets = build_pyramid(read_capture(tmp_path / "ball"), class_map(()), finest_head_px=999, levels=1)[0]
@@ -252,27 +252,27 @@ def test_select_equals_indexing(pyramid, views):
         assert getattr(batch, name).dtype == torch.float32
         np.testing.assert_array_equal(images(batch, name), images(targets, name)[views])
     torch.testing.assert_close(batch.landmarks["68"], targets.landmarks["68"][views])
-    found = batch.pixels
-    inverse = found.index[found.view.long(), found.y.long(), found.x.long()]
-    torch.testing.assert_close(inverse, torch.arange(len(found.view), dtype=torch.int32))
-    assert (found.index >= 0).sum() == len(found.view)
+    pixels = batch.pixels
+    inverse = pixels.index[pixels.view.long(), pixels.y.long(), pixels.x.long()]
+    torch.testing.assert_close(inverse, torch.arange(len(pixels.view), dtype=torch.int32))
+    assert (pixels.index >= 0).sum() == len(pixels.view)
 
 
-def test_progress_is_told(capture):
+def test_progress_is_reported(capture):
     done = []
     build_pyramid(capture, class_map(CLASSES), finest_head_px=40, levels=1, progress=done.append)
     assert done == [0, 1, 2, 3, 4]
 
 
-def test_a_mask_larger_than_the_labels_makes_no_head_of_the_neck(tmp_path):
+def test_a_mask_larger_than_the_labels_does_not_count_the_neck_as_head(tmp_path):
     """Labels and masks come from two networks: pixels in the mask without a label belong to the neighbouring class."""
-    plain = [picture(f"cam{i}", turn) for i, turn in enumerate(small.TURNS)]
+    plain = [labelled_view(f"cam{i}", yaw_rad) for i, yaw_rad in enumerate(small.YAWS_RAD)]
     larger = [replace(view, mask=distance_transform_edt(~view.mask) <= 3) for view in plain]
-    made = []
+    finest = []
     for name, views in (("plain", plain), ("larger", larger)):
         capture = capture_of(tmp_path / name, views)
-        made.append(build_pyramid(capture, class_map(CLASSES), finest_head_px=10_000, levels=1)[0])
-    tight, wide = made
+        finest.append(build_pyramid(capture, class_map(CLASSES), finest_head_px=10_000, levels=1)[0])
+    tight, wide = finest
     assert wide.px_per_head == pytest.approx(tight.px_per_head, abs=6.0)  # not by the neck's length
     unlabelled = 0
     for number, (camera, view) in enumerate(zip(wide.pixels.cameras, larger, strict=True)):
@@ -282,11 +282,14 @@ def test_a_mask_larger_than_the_labels_makes_no_head_of_the_neck(tmp_path):
         held = (y < view.camera.height_px) & (x < view.camera.width_px)
         listed, y, x = listed[held], y[held], x[held]
         ring = view.mask[y, x] & (view.labels[y, x] == 0)
-        away = {
+        distance_px = {
             name: distance_transform_edt(~np.isin(view.labels, labels))[y, x]
             for name, labels in (("head", (1, 4)), ("other", (2, 3)))
         }
-        of_neck, of_head = ring & (away["other"] < away["head"] - 1), ring & (away["head"] < away["other"] - 1)
+        of_neck, of_head = (
+            ring & (distance_px["other"] < distance_px["head"] - 1),
+            ring & (distance_px["head"] < distance_px["other"] - 1),
+        )
         weight = images(wide, "mask_weight")[number, ..., 0][tuple(listed.T)]
         classes = images(wide, "class_weight")[number, ..., 0][tuple(listed.T)]
         assert not weight[of_neck].any() and (weight[of_head] == 1).all() and not classes[ring].any()
