@@ -30,7 +30,7 @@ from registration.model.regions import exterior
 from registration.options import RegisterOptions
 from registration.progress import NullProgress, Progress
 from registration.render import backend
-from registration.report.inputs import ReportInputs, heat_map, report_views
+from registration.report.inputs import ReportInputs, distance_heat_map, report_views
 from registration.report.page import write_report
 from registration.report.stage_snapshots import write_stage
 from registration.storage import hashing
@@ -299,7 +299,7 @@ def _evaluate(
             expression=inputs.capture.expression,
             views=report_views(batch, rendered),
             class_names=batch.class_names,
-            heat_map=None if evaluation is None else heat_map(registration, evaluation.vertex_distance_mm),
+            heat_map=None if evaluation is None else distance_heat_map(registration, evaluation.vertex_distance_mm),
             versions=hashing.versions(),
         )
     )

@@ -19,7 +19,7 @@ from registration.model import gnm_npz
 from registration.model.gnm_npz import GNMData
 from registration.model.landmarks import LandmarkScheme, schemes_beside
 from registration.model.regions import group
-from registration.report.pictures import PAPER
+from registration.report.pictures import BACKGROUND
 from registration.types import Camera
 
 SMOOTHING = 2  # images are rendered this many times larger and reduced
@@ -102,7 +102,7 @@ def draw(
     if lines:  # a quad's triangles share the side from the last corner to the first
         colour[(weight[:, [0, 2]] < 0.05).any(1)] *= 0.72
     picture = np.empty((*shown.shape, 3))
-    picture[:] = PAPER
+    picture[:] = BACKGROUND
     picture[shown] = np.minimum(colour, 255)
     return cv2.resize(picture, shot.size, interpolation=cv2.INTER_AREA).astype(np.uint8)
 
@@ -243,7 +243,7 @@ def maps(data: GNMData) -> Picture:
         colours[group(data, f"{name}_region") > 0.5] = colour
     pictures = []
     for name, side in (("skin", 641), ("left_eye", 190), ("upper_teeth_and_gums", 190), ("tongue", 190)):
-        canvas = np.full((SMOOTHING * side, SMOOTHING * side, 3), PAPER, np.uint8)
+        canvas = np.full((SMOOTHING * side, SMOOTHING * side, 3), BACKGROUND, np.uint8)
         own = group(data, name)[data.quads[:, 0]] > 0.5
         corners = np.round(data.quad_uvs[own] * (1, -1) * SMOOTHING * side + (0, SMOOTHING * side)).astype(np.int32)
         fills = colours[data.quads[own]].mean(1).astype(int)

@@ -17,7 +17,7 @@ from registration.evaluate.distances import TriangleSurface, distances_mm
 from registration.frames import linear_to_srgb
 from registration.geometry.rasterizer import rasterize
 from registration.geometry.topology import vertex_normals
-from registration.report.pictures import PAPER, scale_colours
+from registration.report.pictures import BACKGROUND, scale_colours
 from registration.storage.registration_folder import load_registration
 from registration.types import Registration, View
 
@@ -55,7 +55,7 @@ def panels(view: View, registration: Registration, scan: TriangleSurface) -> lis
     results = [image]
     for values in renderings:
         picture = np.empty((*shown.shape, 3))
-        picture[:] = PAPER
+        picture[:] = BACKGROUND
         picture[shown] = values
         results.append(cv2.resize(picture, image.shape[1::-1], interpolation=cv2.INTER_AREA))
     return results

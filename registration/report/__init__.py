@@ -1,1 +1,1 @@
-"""The HTML report of a registration."""
+"""The HTML report of a registration, and snapshots of its stages."""

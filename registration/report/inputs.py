@@ -1,4 +1,4 @@
-"""Content of a report as NumPy arrays, so that the page needs neither the renderer nor a GPU."""
+"""The contents of a report, in NumPy arrays: the page needs neither the renderer nor a GPU."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -11,38 +11,38 @@ from torch import Tensor
 from registration.frames import axis_angle_to_matrix
 from registration.types import Registration, Rendered, Targets
 
-_UNLISTED = 0.92  # linear grey level of pixels that are not in the pixel list
+_BACKGROUND = 0.92  # linear; shown where the targets list no pixel
 
 
 @dataclass(frozen=True, kw_only=True)
 class ReportView:
-    """Target and rendering of one view on one pixel grid."""
+    """One view: the capture and the rendered registration on the same pixels."""
 
     name: str
     target_rgb: Float[np.ndarray, "H W 3"]  # linear
     rendered_rgb: Float[np.ndarray, "H W 3"]  # linear
-    compared: Bool[np.ndarray, "H W"]  # where colours were compared
+    compared: Bool[np.ndarray, "H W"]  # pixels whose colours the fit compared
     target_mask: Float[np.ndarray, "H W"] | None = None  # coverage of the subject
     rendered_mask: Float[np.ndarray, "H W"]
-    target_normals: Float[np.ndarray, "H W 3"] | None = None  # world, unit; 0 where there is none
+    target_normals: Float[np.ndarray, "H W 3"] | None = None  # world, unit length; 0 where there is none
     rendered_normals: Float[np.ndarray, "H W 3"]
     target_classes: Int[np.ndarray, "H W"] | None = None  # index into `class_names`; -1 where not compared
-    rendered_classes: Int[np.ndarray, "H W"]  # -1 on a miss
+    rendered_classes: Int[np.ndarray, "H W"]  # -1 where the mesh is not visible
 
 
 @dataclass(frozen=True, kw_only=True)
 class HeatMap:
-    """A mesh with distances of its vertices, and its orientation."""
+    """Distances at the vertices of a mesh, for images of the mesh."""
 
     vertices: Float[np.ndarray, "V 3"]  # m, capture world
     triangles: Int[np.ndarray, "F 3"]
     distance_mm: Float[np.ndarray, "V"]  # NaN where nothing was measured
-    T_head_world: Float[np.ndarray, "4 4"]  # turns the capture world to the model frame: +Y up, +Z out of the face
+    T_head_world: Float[np.ndarray, "4 4"]  # to a frame with +Y up and +Z out of the face
 
 
 @dataclass(frozen=True, kw_only=True)
 class ReportInputs:
-    """Content of the page."""
+    """All inputs of the report's page."""
 
     registration: Registration
     subject: str
@@ -53,8 +53,13 @@ class ReportInputs:
     versions: Mapping[str, str] = field(default_factory=dict)
 
 
-def heat_map(registration: Registration, distance_mm: Float[np.ndarray, "V"]) -> HeatMap:
-    """Combine a registered mesh with distances of its vertices (NaN: not measured) and the root joint's rotation."""
+def distance_heat_map(registration: Registration, distance_mm: Float[np.ndarray, "V"]) -> HeatMap:
+    """Return the heat map of distances of the registered vertices, with the head upright.
+
+    Args:
+        registration: its root joint's rotation is undone.
+        distance_mm: NaN where not measured.
+    """
     T_head_world = np.eye(4)
     root = torch.from_numpy(registration.rotations[0].astype(np.float64))
     T_head_world[:3, :3] = axis_angle_to_matrix(root).numpy().T
@@ -67,13 +72,18 @@ def heat_map(registration: Registration, distance_mm: Float[np.ndarray, "V"]) ->
 
 
 def report_views(targets: Targets, rendered: Rendered) -> tuple[ReportView, ...]:
-    """Convert a batch of targets, and the rendering of its pixels, to images: one `ReportView` for each view."""
+    """Return one `ReportView` for each view of a batch of targets.
+
+    Args:
+        targets: of the views.
+        rendered: the registration at the pixels of `targets`.
+    """
 
     def images(values: Tensor, background: float = 0.0) -> np.ndarray:
         flat = values.detach().float().reshape(len(values), -1)
         return targets.pixels.image(flat, background).cpu().numpy()
 
-    target_rgb, compared = images(targets.rgb, _UNLISTED), images(targets.rgb_weight)[..., 0] > 0
+    target_rgb, compared = images(targets.rgb, _BACKGROUND), images(targets.rgb_weight)[..., 0] > 0
     normals, classes = images(targets.normals), images(targets.classes)
     normals *= images(targets.normal_weight) > 0
     classed = (images(targets.class_weight)[..., 0] > 0) & (classes.max(-1) > 0.5)

@@ -7,9 +7,9 @@ from typing import Any
 from markupsafe import Markup
 
 from registration.report.charts import loss_curves
-from registration.report.heat_map import heat_pictures, scale_limit_mm
+from registration.report.heat_map import render_heat_map, scale_limit_mm
 from registration.report.inputs import ReportInputs, ReportView
-from registration.report.pictures import CLASS_COLOURS, data_uri, view_pictures
+from registration.report.pictures import CLASS_COLOURS, data_uri, view_images
 from registration.report.templates import environment
 from registration.storage.hashing import to_jsonable
 from registration.types import Registration
@@ -22,11 +22,15 @@ METRIC_TITLES = {
     "drift": "Drift from the neutral",
 }
 STATISTICS = {"mean_mm": "mean", "median_mm": "median", "std_mm": "std", "p95_mm": "p95"}
-_OPEN_VIEWS = 4  # with normals and classes unfolded
+_OPEN_VIEWS = 4  # whose normals and classes are unfolded at first
 
 
 def write_report(inputs: ReportInputs) -> str:
-    """Return the page. Sections without content are left out."""
+    """Return the HTML page of a registration; sections without content are omitted.
+
+    Args:
+        inputs: all contents. Text from captures and manifests is escaped.
+    """
     registration, heat = inputs.registration, inputs.heat_map
     limit_mm = scale_limit_mm(heat.distance_mm) if heat else 0.0
     longest_s = max(registration.seconds.values(), default=0.0) or 1.0
@@ -39,7 +43,7 @@ def write_report(inputs: ReportInputs) -> str:
         remarks=remarks(registration),
         tiles=_tiles(registration),
         limit_mm=limit_mm,
-        heat_images=[(side, data_uri(image)) for side, image in heat_pictures(heat, limit_mm)] if heat else [],
+        heat_images=[(side, data_uri(image)) for side, image in render_heat_map(heat, limit_mm)] if heat else [],
         distance_heads=("points", *STATISTICS.values()),
         distance_rows=_distance_rows(registration.figures),
         views=[_view(view) for view in inputs.views],
@@ -126,7 +130,7 @@ def _distance_rows(metrics: Mapping[str, Any]) -> list[dict[str, Any]]:
 
 
 def _view(view: ReportView) -> dict[str, Any]:
-    images = view_pictures(view)
+    images = view_images(view)
     rows = {row: [(caption, data_uri(image)) for caption, image in captioned] for row, captioned in images.rows.items()}
     return {"name": images.name, "numbers": images.numbers, "rows": rows}
 

@@ -1,4 +1,4 @@
-"""Snapshots of a fit for debugging: an image and the mesh after each stage."""
+"""Snapshots for debugging a fit: an image and the mesh after each stage."""
 
 from pathlib import Path
 
@@ -19,20 +19,20 @@ def write_stage(
     vertices: Float[np.ndarray, "V 3"],
     triangles: Int[np.ndarray, "F 3"],
 ) -> Path:
-    """Write the state of a fit after a stage.
+    """Write NAME.png and NAME.ply.
 
-    NAME.png has a row for each view: target, rendering, absolute colour difference times 4, and rendered normals.
-    NAME.ply is the mesh. It is written atomically and last, so that its existence implies that of the image.
+    The image has a row for each view: the target, the rendering, four times their difference where colours were
+    compared, and the rendered normals. The mesh is written last, atomically: once it exists, both files are complete.
 
     Args:
-        folder: created if necessary.
-        name: of both files.
-        views: to draw.
+        folder: created if it does not exist.
+        name: of both files, without the extension.
+        views: at least one.
         vertices: metres, capture world.
         triangles: vertex indices.
 
     Returns:
-        The path of NAME.ply.
+        The path of the mesh.
     """
     rows = []
     for view in views:

@@ -6,7 +6,7 @@ from typing import Any
 
 from markupsafe import Markup
 
-from registration.report.charts import Line, number_curves
+from registration.report.charts import ChartLine, line_charts
 from workflows.pages.base import render
 from workflows.records.coregistration import FIRST_MODEL, model_name
 
@@ -57,12 +57,12 @@ def _round(number: int, row: Mapping[str, Any], record: Mapping[str, Any], compo
 
 
 def _curves(record: Mapping[str, Any]) -> str:
-    panels: dict[str, list[Line]] = {}
+    panels: dict[str, list[ChartLine]] = {}
     for title, name in (("generalization, mm", "generalization_mm"), ("specificity, mm", "specificity_mm")):
         for model, curve in record[name].items():
             counts = [int(count) for count in curve]
-            panels.setdefault(title, []).append(Line(name=model, x=counts, y=list(curve.values())))
-    return number_curves(panels, "components")
+            panels.setdefault(title, []).append(ChartLine(name=model, x=counts, y=list(curve.values())))
+    return line_charts(panels, "components")
 
 
 def _failures(rounds: list[Mapping[str, Any]]) -> list[tuple[str, str, str, str]]:

@@ -8,7 +8,7 @@ from markupsafe import Markup
 
 from coregister.evaluate.evaluation import Curve, MetricRow, ModelEvaluation
 from registration.model.gnm_npz import GNMData
-from registration.report.charts import Line, number_curves
+from registration.report.charts import ChartLine, line_charts
 from registration.report.heat_map import scale_limit_mm
 from registration.report.inputs import HeatMap
 from workflows.pages.base import heat_images, render
@@ -24,8 +24,8 @@ def write_evaluate_page(evaluation: ModelEvaluation, models: Mapping[str, GNMDat
         components=evaluation.settings.components[-1],
         unconverged=sum(metrics.unconverged for metrics in evaluation.models.values()),
         tiles=_tiles(evaluation),
-        generalization=Markup(number_curves(_generalization(evaluation), "components")),
-        specificity=Markup(number_curves(_specificity(evaluation), "components")),
+        generalization=Markup(line_charts(_generalization(evaluation), "components")),
+        specificity=Markup(line_charts(_specificity(evaluation), "components")),
         heat_maps=_heat_maps(evaluation, models, limit_mm),
         limit_mm=limit_mm,
         metrics=_metrics(evaluation),
@@ -47,8 +47,8 @@ def _tiles(evaluation: ModelEvaluation) -> list[tuple[str, str, str]]:
     return tiles
 
 
-def _generalization(evaluation: ModelEvaluation) -> dict[str, list[Line]]:
-    panels: dict[str, list[Line]] = {"identity, mm": [], "identity, scan to surface, mm": []}
+def _generalization(evaluation: ModelEvaluation) -> dict[str, list[ChartLine]]:
+    panels: dict[str, list[ChartLine]] = {"identity, mm": [], "identity, scan to surface, mm": []}
     for name, metrics in evaluation.models.items():
         panels["identity, mm"].append(_line(name, metrics.identity))
         if metrics.scans is not None:
@@ -58,20 +58,20 @@ def _generalization(evaluation: ModelEvaluation) -> dict[str, list[Line]]:
     return panels
 
 
-def _specificity(evaluation: ModelEvaluation) -> dict[str, list[Line]]:
-    panels: dict[str, list[Line]] = {"specificity, mm": []}
+def _specificity(evaluation: ModelEvaluation) -> dict[str, list[ChartLine]]:
+    panels: dict[str, list[ChartLine]] = {"specificity, mm": []}
     for name, metrics in evaluation.models.items():
         if metrics.specificity is not None:
             panels["specificity, mm"].append(_line(name, metrics.specificity))
         for part, compact in metrics.compactness.items():
             numbers = range(1, len(compact.share) + 1)
             percent = [100 * share for share in compact.share]
-            panels.setdefault(f"variance, {_words(part)}, %", []).append(Line(name=name, x=numbers, y=percent))
+            panels.setdefault(f"variance, {_words(part)}, %", []).append(ChartLine(name=name, x=numbers, y=percent))
     return panels
 
 
-def _line(name: str, curve: Curve) -> Line:
-    return Line(
+def _line(name: str, curve: Curve) -> ChartLine:
+    return ChartLine(
         name=name,
         x=curve.components,
         y=[interval.mean for interval in curve.intervals],

@@ -10,7 +10,7 @@ from markupsafe import Markup
 from registration.frames import MM_PER_M
 from registration.model import regions
 from registration.model.gnm_npz import GNMData
-from registration.report.charts import Line, number_curves
+from registration.report.charts import ChartLine, line_charts
 from registration.report.heat_map import scale_limit_mm
 from registration.report.inputs import HeatMap
 from workflows.pages.base import heat_images, render
@@ -97,7 +97,7 @@ def _variance(manifest: Mapping[str, Any]) -> tuple[str, list[tuple[Any, ...]]]:
         variance = np.array(part["variance_mm2"], float)
         percent = 100 * part["share_kept"] * np.cumsum(variance) / max(variance.sum(), 1e-30)
         words = name.replace("_", " ")
-        lines.append(Line(name=words, x=range(1, len(percent) + 1), y=percent.tolist()))
+        lines.append(ChartLine(name=words, x=range(1, len(percent) + 1), y=percent.tolist()))
         cells = (part["components"], f"{100 * part['share_kept']:.2f} %", f"{100 * part['share_previous']:.0f} %")
         rows.append((words, *cells, part["method"]))
-    return number_curves({"variance, %": lines}, "components"), rows
+    return line_charts({"variance, %": lines}, "components"), rows

@@ -9,7 +9,7 @@ from jaxtyping import Float
 
 from registration.frames import axis_angle_to_matrix, linear_to_srgb
 from registration.geometry.rasterizer import rasterize
-from registration.report.pictures import PAPER, data_uri
+from registration.report.pictures import BACKGROUND, data_uri
 from registration.types import Camera, Registration
 from workflows.pages.base import render
 from workflows.records.subject import SubjectRecord
@@ -31,7 +31,7 @@ def thumbnail(registration: Registration) -> str | None:
     size = len(registration.texture)
     column, row = (np.clip((uv * (1, -1) + (0, 1)) * size, 0, size - 1)).astype(np.int64).T
     image = np.empty((*face.shape, 3), np.float32)
-    image[:] = PAPER
+    image[:] = BACKGROUND
     image[covered] = 255 * linear_to_srgb(registration.texture[row, column])
     small = cv2.resize(image, (_WIDTH_PX, _HEIGHT_PX), interpolation=cv2.INTER_AREA)
     return data_uri(np.clip(small + 0.5, 0, 255).astype(np.uint8))

@@ -1,11 +1,11 @@
-"""Jinja2 templates of all HTML pages: one base page, macros of its parts, one environment with autoescape."""
+"""Jinja2 templates of all HTML pages: a base page, macros of shared parts, and the environment with autoescape."""
 
 from functools import cache
 
 from jinja2 import ChoiceLoader, Environment, PackageLoader, StrictUndefined
 
 from registration.report.heat_map import UNMEASURED
-from registration.report.pictures import SCALE
+from registration.report.pictures import COLOUR_SCALE
 
 
 @cache
@@ -27,6 +27,6 @@ def environment(*packages: str) -> Environment:
         lstrip_blocks=True,
     )
     result.filters["words"] = lambda name: str(name).replace("_", " ")
-    result.globals["SCALE"] = ", ".join(f"rgb{colour}" for colour in SCALE)  # stops of a CSS gradient
+    result.globals["COLOUR_SCALE"] = ", ".join(f"rgb{colour}" for colour in COLOUR_SCALE)  # stops of a CSS gradient
     result.globals["UNMEASURED"] = f"rgb{UNMEASURED}"
     return result

@@ -1,9 +1,9 @@
 const dialog = document.querySelector("dialog");
 document.addEventListener("click", (event) => {
-  const picture = event.target.closest("img.zoom");
-  if (picture) {
-    dialog.querySelector("img").src = picture.src;
-    dialog.querySelector("p").textContent = picture.alt;
+  const image = event.target.closest("img.zoom");
+  if (image) {
+    dialog.querySelector("img").src = image.src;
+    dialog.querySelector("p").textContent = image.alt;
     dialog.showModal();
   } else if (dialog.open) dialog.close();
 });

@@ -1,4 +1,4 @@
-"""The page: complete, well-formed, self-contained, and safe against what users name their subjects."""
+"""The page is complete, well-formed and self-contained, and escapes names."""
 
 import re
 from html.parser import HTMLParser
@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from registration.report import heat_map as heat_maps
-from registration.report.charts import Line, loss_curves, number_curves
-from registration.report.inputs import ReportInputs, heat_map
+from registration.report.charts import ChartLine, line_charts, loss_curves
+from registration.report.inputs import ReportInputs, distance_heat_map
 from registration.report.page import headline, write_report
 from registration.storage.hashing import versions
 from registration.types import Registration
@@ -25,7 +25,7 @@ def a_registration(**changes) -> Registration:
     row = {"points": 1234, "mean_mm": 0.1234, "median_mm": 0.0456, "std_mm": 0.2, "p95_mm": 1.456}
     fields = dict(
         status="converged",
-        reason="it rests",
+        reason="the mesh is at rest",
         identity=zeros(1),
         expression=zeros(1),
         rotations=zeros(4, 3),
@@ -57,7 +57,7 @@ def some_inputs(**changes) -> ReportInputs:
         expression="smile",
         views=(a_view(name="cam00"), a_view(name="cam01")),
         class_names=("skin", "left_eye"),
-        heat_map=heat_map(registration, np.array([0.1, 0.2, np.nan, 0.4])),
+        heat_map=distance_heat_map(registration, np.array([0.1, 0.2, np.nan, 0.4])),
         versions=versions(),
     )
     return ReportInputs(**{**fields, **changes})
@@ -110,17 +110,21 @@ def test_a_full_page():
 
 def test_an_empty_page_has_no_empty_sections():
     empty = {name: {} for name in ("seconds", "history", "figures", "config", "inputs")}
-    registration = a_registration(status="failed", reason="no start", **empty)
+    registration = a_registration(status="failed", reason="no initial guess", **empty)
     page = write_report(some_inputs(registration=registration, views=(), heat_map=None, versions={}))
     check_page(page + '<a href="#"></a>')
-    assert "<section" not in page and "The registration failed: no start." in page
+    assert "<section" not in page and "The registration failed: no initial guess." in page
 
 
 def test_names_are_escaped():
-    nasty = '<script>alert("x")</script>'
-    registration = a_registration(reason=nasty, config={nasty: nasty}, inputs={nasty: "0"}, seconds={nasty: 1.0})
+    markup = '<script>alert("x")</script>'
+    registration = a_registration(reason=markup, config={markup: markup}, inputs={markup: "0"}, seconds={markup: 1.0})
     inputs = some_inputs(
-        registration=registration, subject=nasty, expression=nasty, class_names=(nasty,), views=(a_view(name=nasty),)
+        registration=registration,
+        subject=markup,
+        expression=markup,
+        class_names=(markup,),
+        views=(a_view(name=markup),),
     )
     page = write_report(inputs)
     check_page(page)
@@ -129,36 +133,38 @@ def test_names_are_escaped():
 
 @pytest.mark.parametrize(
     ("status", "words"),
-    [("converged", "converged: it rests"), ("stopped", "stopped before it converged"), ("failed", "failed")],
+    [
+        ("converged", "converged: the mesh is at rest"),
+        ("stopped", "stopped before it converged"),
+        ("failed", "failed"),
+    ],
 )
-def test_the_headline_says_what_happened(status, words):
+def test_the_headline_states_the_result(status, words):
     sentence = headline(a_registration(status=status))
     assert words in sentence and "0.123 mm from the mesh on average" in sentence and "95 % within 1.46 mm" in sentence
     assert "no scan" in headline(a_registration(status=status, figures={}))
 
 
-def test_loss_curves_are_one_panel_a_stage():
+def test_loss_curves_have_a_panel_per_stage():
     svg = ElementTree.fromstring(loss_curves(a_registration().history))
     words = {element.text for element in svg.iter("{http://www.w3.org/2000/svg}text")}
     assert {"rigid", "offsets", "landmarks", "colour", "l2", "step"} <= words
     gaps = {"a": {"x": [float("nan"), 0.0, -1.0, 2.0, 1.0]}, "empty": {"x": []}}
-    drawn = loss_curves(gaps)
-    assert ElementTree.fromstring(drawn) is not None and "empty" not in drawn
+    svg_text = loss_curves(gaps)
+    assert ElementTree.fromstring(svg_text) is not None and "empty" not in svg_text
     assert loss_curves({}) == "" and loss_curves({"a": {}}) == ""
 
 
-def test_number_curves_have_a_panel_a_title_and_a_band_where_one_is_known():
+def test_line_charts_have_a_panel_per_title_and_bands():
     lines = [
-        Line(name="first", x=(5, 10), y=(2.0, 1.0), low=(1.5, None), high=(2.5, None)),
-        Line(name="next", x=(5, 10), y=(1.8, 0.8)),
+        ChartLine(name="first", x=(5, 10), y=(2.0, 1.0), low=(1.5, None), high=(2.5, None)),
+        ChartLine(name="next", x=(5, 10), y=(1.8, 0.8)),
     ]
-    svg = ElementTree.fromstring(
-        number_curves({"identity, mm": lines, "scans, mm": lines[:1], "none": []}, "components")
-    )
+    svg = ElementTree.fromstring(line_charts({"identity, mm": lines, "scans, mm": lines[:1], "none": []}, "components"))
     words = [element.text for element in svg.iter("{http://www.w3.org/2000/svg}text")]
     assert {"identity, mm", "scans, mm", "first", "next"} <= set(words) and "none" not in words
     assert words.count("components") == 2 and words.count("first") == 1
-    assert number_curves({"none": []}, "components") == ""
+    assert line_charts({"none": []}, "components") == ""
 
 
 def test_remarks_name_low_weights_exclusions_and_intersections():

@@ -1,4 +1,4 @@
-"""Comparison pictures and their numbers, on views whose differences are known."""
+"""Comparison images and their numbers, of views with known differences."""
 
 import base64
 from dataclasses import replace
@@ -12,9 +12,17 @@ import trimesh
 from registration.frames import srgb_to_linear
 from registration.geometry.rasterizer import rasterize
 from registration.report import heat_map, pictures
-from registration.report.heat_map import heat_pictures, scale_limit_mm
+from registration.report.heat_map import render_heat_map, scale_limit_mm
 from registration.report.inputs import HeatMap, ReportView, report_views
-from registration.report.pictures import OUTLINE, PAPER, SCALE, data_uri, overlap, scale_colours, view_pictures
+from registration.report.pictures import (
+    BACKGROUND,
+    COLOUR_SCALE,
+    OUTLINE,
+    data_uri,
+    overlap,
+    scale_colours,
+    view_images,
+)
 from registration.types import Camera, Pixels, Rendered, Targets
 
 HEIGHT, WIDTH = 40, 30
@@ -26,17 +34,20 @@ def coarse_heat_maps(monkeypatch):
 
 
 def a_view(**changes) -> ReportView:
-    """A square subject: the render is 0.1 brighter (sRGB), turned by 10 degrees, and has one wrong class row."""
+    """A square subject.
+
+    The rendering is 0.1 brighter (sRGB), its normals are rotated by 10 degrees, and one row of its classes is wrong.
+    """
     mask = np.zeros((HEIGHT, WIDTH))
     mask[10:30, 5:25] = 1
     grey = srgb_to_linear(np.full((HEIGHT, WIDTH, 3), 0.4))
     normals = np.zeros((HEIGHT, WIDTH, 3))
     normals[mask > 0] = [0, 0, 1]
-    turned = np.zeros_like(normals)
-    turned[mask > 0] = [np.sin(np.radians(10)), 0, np.cos(np.radians(10))]
+    rotated = np.zeros_like(normals)
+    rotated[mask > 0] = [np.sin(np.radians(10)), 0, np.cos(np.radians(10))]
     classes = np.where(mask > 0, 0, -1)
-    drawn = classes.copy()
-    drawn[10] = np.where(drawn[10] < 0, -1, 1)
+    rendered_classes = classes.copy()
+    rendered_classes[10] = np.where(classes[10] < 0, -1, 1)
     fields = dict(
         name="cam",
         target_rgb=grey,
@@ -45,15 +56,15 @@ def a_view(**changes) -> ReportView:
         target_mask=mask,
         rendered_mask=mask,
         target_normals=normals,
-        rendered_normals=turned,
+        rendered_normals=rotated,
         target_classes=classes,
-        rendered_classes=drawn,
+        rendered_classes=rendered_classes,
     )
     return ReportView(**{**fields, **changes})
 
 
 def test_numbers_of_a_view():
-    assert view_pictures(a_view()).numbers == {
+    assert view_images(a_view()).numbers == {
         "colour": "0.100",
         "normals": "10.0°",
         "classes": "95.0 %",
@@ -61,24 +72,24 @@ def test_numbers_of_a_view():
     }
     half = a_view().rendered_mask.copy()
     half[:20] = 0
-    assert view_pictures(a_view(rendered_mask=half)).numbers["mask overlap"] == "50.0 %"
+    assert view_images(a_view(rendered_mask=half)).numbers["mask overlap"] == "50.0 %"
 
 
-def test_pictures_show_the_differences():
-    rows = {name: [p for _, p in row] for name, row in view_pictures(a_view()).rows.items()}
+def test_images_show_the_differences():
+    rows = {name: [p for _, p in row] for name, row in view_images(a_view()).rows.items()}
     assert list(rows) == ["Colour", "Normals", "Classes"] and all(len(row) == 3 for row in rows.values())
     inside, outside = (20, 15), (2, 2)
     colour, normal, wrong = (rows[name][2] for name in rows)
     np.testing.assert_allclose(colour[inside], scale_colours(np.array(0.1 / pictures.COLOUR_LIMIT)), atol=1)
     np.testing.assert_allclose(normal[inside], scale_colours(np.array(10 / pictures.ANGLE_LIMIT)), atol=1)
-    assert tuple(colour[outside]) == tuple(normal[outside]) == tuple(wrong[outside]) == PAPER
-    red = (wrong == SCALE[-2]).all(-1)
+    assert tuple(colour[outside]) == tuple(normal[outside]) == tuple(wrong[outside]) == BACKGROUND
+    red = (wrong == COLOUR_SCALE[-2]).all(-1)
     assert red[10, 5:25].all() and red.sum() == 20
     assert abs(int(rows["Colour"][1][inside][0]) - 128) <= 1  # 0.5 sRGB
 
 
-def test_the_outline_of_the_render_lies_on_the_capture():
-    capture = view_pictures(a_view()).rows["Colour"][0][1]
+def test_the_outline_of_the_rendering_is_drawn_on_the_capture():
+    capture = view_images(a_view()).rows["Colour"][0][1]
     outlined = (capture == OUTLINE).all(-1)
     rows, columns = np.nonzero(outlined)
     assert (rows.min(), rows.max(), columns.min(), columns.max()) == (10, 29, 5, 24)
@@ -86,21 +97,21 @@ def test_the_outline_of_the_render_lies_on_the_capture():
     np.testing.assert_allclose(capture[20, 15], 0.4 * 255, atol=1)
 
 
-def test_what_a_view_lacks_is_left_out():
-    found = view_pictures(a_view(target_normals=None, target_classes=None, target_mask=None))
-    assert list(found.rows) == ["Colour"] and list(found.numbers) == ["colour"]
-    blind = view_pictures(a_view(compared=np.zeros((HEIGHT, WIDTH), bool), rendered_mask=np.zeros((HEIGHT, WIDTH))))
-    assert "colour" not in blind.numbers and blind.numbers["mask overlap"] == "0.0 %"
+def test_missing_targets_of_a_view_are_omitted():
+    images = view_images(a_view(target_normals=None, target_classes=None, target_mask=None))
+    assert list(images.rows) == ["Colour"] and list(images.numbers) == ["colour"]
+    no_pixels = view_images(a_view(compared=np.zeros((HEIGHT, WIDTH), bool), rendered_mask=np.zeros((HEIGHT, WIDTH))))
+    assert "colour" not in no_pixels.numbers and no_pixels.numbers["mask overlap"] == "0.0 %"
 
 
-def test_large_views_are_shrunk_and_drawn_alike():
+def test_large_views_are_downscaled():
     def tall(array):
         return np.repeat(np.repeat(array, 40, 0), 40, 1)
 
     view = a_view()
     arrays = {k: tall(v) for k, v in vars(view).items() if isinstance(v, np.ndarray)}
-    picture = view_pictures(replace(view, **arrays)).rows["Colour"][0][1]
-    assert picture.shape == (pictures.PICTURE_HEIGHT, 480, 3)
+    image = view_images(replace(view, **arrays)).rows["Colour"][0][1]
+    assert image.shape == (pictures.MAX_IMAGE_HEIGHT, 480, 3)
 
 
 def test_overlap():
@@ -111,15 +122,17 @@ def test_overlap():
 
 
 def test_scale_runs_from_first_to_last_colour():
-    np.testing.assert_array_equal(scale_colours(np.array([-1.0, 0, 1, 9])), [SCALE[0], SCALE[0], SCALE[-1], SCALE[-1]])
+    np.testing.assert_array_equal(
+        scale_colours(np.array([-1.0, 0, 1, 9])), [COLOUR_SCALE[0], COLOUR_SCALE[0], COLOUR_SCALE[-1], COLOUR_SCALE[-1]]
+    )
 
 
-def test_data_uri_is_a_jpeg_of_the_picture():
-    picture = np.zeros((16, 16, 3), np.uint8) + np.array([200, 60, 20], np.uint8)
-    head, body = data_uri(picture).split(",")
+def test_data_uri_is_a_jpeg_of_the_image():
+    image = np.zeros((16, 16, 3), np.uint8) + np.array([200, 60, 20], np.uint8)
+    head, body = data_uri(image).split(",")
     assert head == "data:image/jpeg;base64"
     decoded = cv2.imdecode(np.frombuffer(base64.b64decode(body), np.uint8), cv2.IMREAD_COLOR)[..., ::-1]
-    np.testing.assert_allclose(decoded.astype(int), picture, atol=6)
+    np.testing.assert_allclose(decoded.astype(int), image, atol=6)
 
 
 @pytest.mark.parametrize(("p95", "limit"), [(0.05, 0.1), (0.19, 0.2), (0.3, 0.5), (50.0, 10.0)])
@@ -129,7 +142,7 @@ def test_scale_limit(p95, limit):
 
 
 def a_heat_map(**changes) -> HeatMap:
-    """A sphere in the world; distances only on the head frame's +x half. The head is turned by 90 degrees about y."""
+    """A sphere in the world; distances only on the head frame's +x half. The head is rotated by 90 degrees about y."""
     ball = trimesh.creation.icosphere(subdivisions=4, radius=0.1)
     vertices = np.asarray(ball.vertices)
     T_head_world = np.eye(4)
@@ -144,31 +157,31 @@ def a_heat_map(**changes) -> HeatMap:
     return HeatMap(**{**fields, **changes})
 
 
-def hue_share(picture, colour) -> float:
-    """Share of the drawn pixels whose hue is the colour's."""
-    drawn = (np.abs(picture.astype(int) - PAPER) > 3).any(-1)
-    wanted, given = np.array(colour, float), picture[drawn].astype(float)
-    cosine = given @ wanted / np.linalg.norm(given, axis=1) / np.linalg.norm(wanted)
+def hue_fraction(image, colour) -> float:
+    """Fraction of the pixels of the head that have the colour's hue."""
+    covered = (np.abs(image.astype(int) - BACKGROUND) > 3).any(-1)
+    expected, actual = np.array(colour, float), image[covered].astype(float)
+    cosine = actual @ expected / np.linalg.norm(actual, axis=1) / np.linalg.norm(expected)
     return float((cosine > 0.999).mean())
 
 
-def test_heat_is_drawn_on_the_right_side_and_grey_where_unmeasured():
-    drawn = dict(heat_pictures(a_heat_map(), limit_mm=1.0))
+def test_heat_maps_show_distances_on_their_side_and_grey_where_unmeasured():
+    images = dict(render_heat_map(a_heat_map(), limit_mm=1.0))
     colour = scale_colours(np.array(0.5))
-    assert hue_share(drawn["subject's left"], colour) > 0.8
-    assert hue_share(drawn["subject's right"], heat_map.UNMEASURED) > 0.8
-    front = drawn["front"]
-    middle = front.shape[1] // 2
-    assert hue_share(front[:, middle + 15 :], colour) > 0.95  # the subject's left is on the picture's right
-    assert hue_share(front[:, : middle - 15], heat_map.UNMEASURED) > 0.95
+    assert hue_fraction(images["subject's left"], colour) > 0.8
+    assert hue_fraction(images["subject's right"], heat_map.UNMEASURED) > 0.8
+    front = images["front"]
+    center = front.shape[1] // 2
+    assert hue_fraction(front[:, center + 15 :], colour) > 0.95  # the subject's left is on the image's right
+    assert hue_fraction(front[:, : center - 15], heat_map.UNMEASURED) > 0.95
 
 
-def test_the_head_fills_the_pictures():
-    for _, picture in heat_pictures(a_heat_map(), limit_mm=1.0):
-        rows, columns = np.nonzero((np.abs(picture.astype(int) - PAPER) > 3).any(-1))
-        spans = np.ptp(columns) / picture.shape[1], np.ptp(rows) / picture.shape[0]
+def test_the_head_fills_the_images():
+    for _, image in render_heat_map(a_heat_map(), limit_mm=1.0):
+        rows, columns = np.nonzero((np.abs(image.astype(int) - BACKGROUND) > 3).any(-1))
+        spans = np.ptp(columns) / image.shape[1], np.ptp(rows) / image.shape[0]
         assert max(spans) == pytest.approx(0.94, abs=0.02)
-        assert abs(columns.min() + columns.max() - picture.shape[1]) < 6
+        assert abs(columns.min() + columns.max() - image.shape[1]) < 6
 
 
 def test_report_views_of_targets_and_a_rendering():
@@ -203,9 +216,11 @@ def test_report_views_of_targets_and_a_rendering():
         np.testing.assert_array_equal(view.target_classes, np.where(mask[0] > 0, 2, -1))
         np.testing.assert_array_equal(view.rendered_classes, view.target_classes)
         assert view.target_normals is None and view.target_rgb[3, 3, 0] == 0.25 and view.target_rgb[0, 5, 0] > 0.9
-        assert view_pictures(view).numbers["mask overlap"] == "100.0 %"
-    unknown = replace(targets, mask_weight=listed * 0, class_weight=listed * 0)
-    assert all(view.target_mask is None and view.target_classes is None for view in report_views(unknown, rendered))
+        assert view_images(view).numbers["mask overlap"] == "100.0 %"
+    without_targets = replace(targets, mask_weight=listed * 0, class_weight=listed * 0)
+    assert all(
+        view.target_mask is None and view.target_classes is None for view in report_views(without_targets, rendered)
+    )
 
 
 def test_heat_cameras_see_the_mesh_they_are_fitted_to():

@@ -22,7 +22,7 @@ def test_what_a_template_inserts_is_escaped_unless_it_is_markup():
 
 def test_a_missing_value_is_an_error():
     with pytest.raises(jinja2.UndefinedError):
-        environment().from_string("{{ nobody }}").render()
+        environment().from_string("{{ missing }}").render()
 
 
 @pytest.mark.parametrize("folder", FOLDERS)
@@ -45,7 +45,7 @@ def test_no_template_turns_escaping_off():
     assert [path for path, text in texts.items() if "|safe" in text or "autoescape" in text] == []
 
 
-def test_tables_align_numbers_and_sections_without_content_are_left_out():
+def test_tables_align_numbers_and_sections_without_content_are_omitted():
     source = """{% import "parts.html" as parts %}{{ parts.table(("name", "count"), rows) }}
 {{ parts.sectioned((("First one", "why", "x"), ("Second", "", " "))) }}"""
     html = environment().from_string(source).render(rows=[("a", 1), ("b", 22)])
