@@ -29,7 +29,7 @@ def capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def subject(capture: Path, tmp_path: Path) -> Path:
-    """A folder of four captures and of things that are none."""
+    """A folder of four captures and of entries that are not captures."""
     folder = tmp_path / "subject"
     for name, expression in (("rest", "neutral"), ("jaw10", "jaw"), ("jaw2", "jaw"), ("smile", "smile")):
         add(capture, folder / name, expression)
@@ -46,7 +46,7 @@ def add(capture: Path, folder: Path, expression: str, subject: str = "ball") -> 
 
 
 def add_truths(subject: Path, *names: str) -> None:
-    """The same true points for each capture."""
+    """Write the same true points to each capture."""
     for name in names:
         np.savez(subject / name / "ground_truth.npz", vertices=small.landmarks_68())
 
@@ -59,30 +59,30 @@ def change(folder: Path, old: str, new: str) -> None:
 
 
 class FakeRegister:
-    """Stands in for `register`: writes the true ball, of an expression moved by a millimetre."""
+    """Stand-in for `register`: writes the true ball, translated by a millimetre for an expression."""
 
     def __init__(self) -> None:
         self.outcomes: dict[str, str | BaseException] = {}  # capture -> a status, or what is raised
         self.calls: list[tuple[str, Path, Path | None]] = []  # capture, out, neutral
         self.settings: list[Mapping[str, object]] = []
-        self.seen: list[list[tuple[str, str]]] = []  # subject.json's rows at each call
+        self.records: list[list[tuple[str, str]]] = []  # subject.json's rows at each call
 
     def __call__(self, capture_path: Path, *, out: Path, neutral: Path | None, progress, **settings) -> Registration:
         self.calls.append((capture_path.name, out, neutral))
         self.settings.append(settings)
-        self.seen.append(statuses(out.parent))
+        self.records.append(statuses(out.parent))
         progress.update(1, 2, "fitting")
         outcome = self.outcomes.get(capture_path.name, "converged")
         if isinstance(outcome, BaseException):
             raise outcome
         ball = trimesh.creation.icosphere(subdivisions=3, radius=small.RADIUS_M)
-        moved = np.array(ball.vertices + (0 if neutral is None else (1e-3, 0, 0)), np.float32)
+        vertices = np.array(ball.vertices + (0 if neutral is None else (1e-3, 0, 0)), np.float32)
         result = a_registration(
             status=outcome,
             reason=f"it is {outcome}",
-            vertices=moved,
-            offsets=np.zeros_like(moved),
-            confidence=np.ones(len(moved), np.float32),
+            vertices=vertices,
+            offsets=np.zeros_like(vertices),
+            confidence=np.ones(len(vertices), np.float32),
             triangles=np.array(ball.faces, np.int32),
             corner_uvs=np.zeros((len(ball.faces), 3, 2), np.float32),
             figures={"scan_to_mesh": {"face": {"mean_mm": 0.25, "median_mm": 0.125}}},
@@ -102,15 +102,15 @@ def fake(monkeypatch: pytest.MonkeyPatch) -> FakeRegister:
     return fake
 
 
-class Notes:
-    """A progress that keeps what it is told."""
+class RecordingProgress:
+    """A progress that records its messages and labels."""
 
     def __init__(self) -> None:
-        self.notes: list[str] = []
+        self.messages: list[str] = []
         self.steps: list[str] = []
 
     def message(self, text: str) -> None:
-        self.notes.append(text)
+        self.messages.append(text)
 
     def update(self, done: int, total: int, label: str) -> None:
         self.steps.append(label)

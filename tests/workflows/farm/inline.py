@@ -1,4 +1,4 @@
-"""Flows without a queue: a scope that does jobs at once, in this process."""
+"""Flows without a queue: a scope that runs each job immediately in this process."""
 
 import json
 from collections.abc import Callable, Sequence
@@ -15,7 +15,7 @@ from workflows.steps.table import STEPS
 
 
 class Inline:
-    """Stands in for a `FlowScope`; `step` says what a job's result is, or raises."""
+    """Stand-in for a `FlowScope`; `step` returns a job's result or raises."""
 
     def __init__(self, identity: str, step: Callable[[Job], Any], log: list[Job]) -> None:
         self.id, self._step, self.log = identity, step, log
@@ -23,11 +23,11 @@ class Inline:
 
     async def run(self, jobs: Sequence[Job | FlowJob]) -> dict[str, Any]:
         done = {}
-        for job in sorted(jobs, key=lambda one: one.priority):
+        for job in sorted(jobs, key=lambda item: item.priority):
             try:
                 if isinstance(job, FlowJob):
-                    below = Inline(check_id(job.id), self._step, self.log)
-                    done[job.id] = await FLOWS[job.flow](below, **json.loads(json.dumps(job.arguments)))
+                    child = Inline(check_id(job.id), self._step, self.log)
+                    done[job.id] = await FLOWS[job.flow](child, **json.loads(json.dumps(job.arguments)))
                 else:
                     assert job.step in STEPS and json.dumps(job.spec())
                     self.log.append(job)
@@ -46,13 +46,13 @@ class Inline:
         return JobFailed({"status": "parked", "reason": reason})
 
 
-def really(roots: Sequence[Path]) -> Callable[[Job], Any]:
-    """Jobs as workers do them, with all that goes through a queue as JSON: for `Inline`."""
+def run_step(roots: Sequence[Path]) -> Callable[[Job], Any]:
+    """Return a `step` for `Inline` that runs jobs as workers do, with arguments and results passed as JSON."""
 
     def step(job: Job) -> Any:
-        taken, arguments = validate_arguments(json.loads(json.dumps(job.spec())), STEPS, resolve_roots(roots))
+        entry, arguments = validate_arguments(json.loads(json.dumps(job.spec())), STEPS, resolve_roots(roots))
         try:
-            return json.loads(json.dumps(function_of(taken.function)(**arguments)))
+            return json.loads(json.dumps(function_of(entry.function)(**arguments)))
         except InputError as error:
             raise JobFailed({"status": "bad input", "reason": error.line}) from None
         except PermanentStepError as error:

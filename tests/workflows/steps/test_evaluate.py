@@ -1,4 +1,4 @@
-"""`gnmreg model evaluate`: what it reads, the folder and page it writes, what it refuses before any work."""
+"""`gnmreg model evaluate`: inputs, the folder and page it writes, and what it refuses before any work."""
 
 import json
 from pathlib import Path
@@ -25,7 +25,7 @@ LABELS = ("neutral", "jaw_open", "smile")
 
 
 def meshes(model) -> dict[str, np.ndarray]:
-    """Three meshes of each of three people; subjects are mixed and neutrals do not come first."""
+    """Return three meshes of each of three subjects; subjects are mixed and neutrals do not come first."""
     rng = np.random.default_rng(0)
     neutrals = heads(model, rng.standard_normal((3, 12)))
     acts = np.tensordot(rng.standard_normal((2, 12)), model.expression_basis, 1)
@@ -48,8 +48,8 @@ def model():
 
 
 @pytest.fixture(scope="module")
-def place(model, tmp_path_factory) -> Path:
-    """Two models and an NPZ file of people of the first one."""
+def inputs(model, tmp_path_factory) -> Path:
+    """A folder of two models and an NPZ file of meshes that the second model spans."""
     folder = tmp_path_factory.mktemp("evaluate")
     gnm_npz.write(model, folder / "own.npz")
     gnm_npz.write(with_identity(model, np.roll(model.vertex_identity_basis, -1, 0)), folder / "weak.npz")
@@ -58,38 +58,44 @@ def place(model, tmp_path_factory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def out(place) -> Path:
-    paths = [place / "weak.npz", place / "own.npz"]
-    evaluate_models(paths, held_out=place / "people.npz", out=place / "out", settings=SETTINGS)
-    return place / "out"
+def out(inputs) -> Path:
+    paths = [inputs / "weak.npz", inputs / "own.npz"]
+    evaluate_models(paths, held_out=inputs / "people.npz", out=inputs / "out", settings=SETTINGS)
+    return inputs / "out"
 
 
-def test_a_file_of_meshes_is_read_by_subject(place, model):
+def test_a_file_of_meshes_is_read_by_subject(inputs, model):
     arrays = meshes(model)
-    found = read_held_out(place / "people.npz")
-    assert [one.subject for one in found.subjects] == list(NAMES)
-    for number, one in enumerate(found.subjects):
-        np.testing.assert_array_equal(one.neutral, arrays["vertices"][6 + number])
-        np.testing.assert_array_equal(one.expressions, arrays["vertices"][[number, 3 + number]])
-        assert one.categories == ("flexing", "jaw")
-        assert one.tags == {"age": (30, 41, 42)[number], "gender": ("female", "male", "female")[number]}
-    assert gnm_npz.topology_hash(found.triangles) == gnm_npz.topology_hash(model.triangles)
+    held_out = read_held_out(inputs / "people.npz")
+    assert [subject.subject for subject in held_out.subjects] == list(NAMES)
+    for number, subject in enumerate(held_out.subjects):
+        np.testing.assert_array_equal(subject.neutral, arrays["vertices"][6 + number])
+        np.testing.assert_array_equal(subject.expressions, arrays["vertices"][[number, 3 + number]])
+        assert subject.categories == ("flexing", "jaw")
+        assert subject.tags == {"age": (30, 41, 42)[number], "gender": ("female", "male", "female")[number]}
+    assert gnm_npz.topology_hash(held_out.triangles) == gnm_npz.topology_hash(model.triangles)
 
 
-def spoil(arrays, **changes):
+def with_changes(arrays, **changes):
     arrays = {name: value for name, value in {**arrays, **changes}.items() if value is not None}
     return arrays
 
 
 BAD_FILES = {
-    "no labels": (lambda a: spoil(a, labels=None), "'labels' is missing"),
-    "a tag too short": (lambda a: spoil(a, tag_age=a["tag_age"][:-1]), "incomplete"),
-    "flat vertices": (lambda a: spoil(a, vertices=a["vertices"].reshape(9, -1)), "'vertices' has a wrong shape"),
-    "whole vertices": (lambda a: spoil(a, vertices=a["vertices"].astype(int)), "'vertices' has a wrong type"),
-    "quads": (lambda a: spoil(a, triangles=np.zeros((5, 4), int)), "'triangles' has a wrong shape"),
-    "two neutrals": (lambda a: spoil(a, labels=np.where(a["labels"] == "smile", "neutral", a["labels"])), "not one"),
-    "no neutral": (lambda a: spoil(a, labels=np.where(a["labels"] == "neutral", "rest", a["labels"])), "not one"),
-    "objects": (lambda a: spoil(a, labels=a["labels"].astype(object)), "cannot be read"),
+    "no labels": (lambda a: with_changes(a, labels=None), "'labels' is missing"),
+    "a tag too short": (lambda a: with_changes(a, tag_age=a["tag_age"][:-1]), "incomplete"),
+    "flat vertices": (lambda a: with_changes(a, vertices=a["vertices"].reshape(9, -1)), "'vertices' has a wrong shape"),
+    "whole vertices": (lambda a: with_changes(a, vertices=a["vertices"].astype(int)), "'vertices' has a wrong type"),
+    "quads": (lambda a: with_changes(a, triangles=np.zeros((5, 4), int)), "'triangles' has a wrong shape"),
+    "two neutrals": (
+        lambda a: with_changes(a, labels=np.where(a["labels"] == "smile", "neutral", a["labels"])),
+        "not one",
+    ),
+    "no neutral": (
+        lambda a: with_changes(a, labels=np.where(a["labels"] == "neutral", "rest", a["labels"])),
+        "not one",
+    ),
+    "objects": (lambda a: with_changes(a, labels=a["labels"].astype(object)), "cannot be read"),
 }
 
 
@@ -102,14 +108,14 @@ def test_files_that_cannot_be_used_are_refused(model, tmp_path, name):
     assert what in error.value.what and str(tmp_path) in error.value.where
 
 
-def test_what_is_no_file_is_refused(tmp_path):
+def test_unreadable_paths_are_refused(tmp_path):
     (tmp_path / "text.npz").write_text("none")
     for path in (tmp_path / "text.npz", tmp_path / "missing.npz", tmp_path):
         with pytest.raises(InputError):
             read_held_out(path)
 
 
-def test_the_folder_holds_figures_distances_and_a_page_of_its_own(out, model):
+def test_the_folder_holds_metrics_distances_and_a_self_contained_page(out, model):
     manifest = json.loads((out / "manifest.json").read_text())
     assert manifest["kind"] == "gnm-evaluation" and manifest["figures"]["subjects"] == list(NAMES)
     own = manifest["figures"]["models"]["own"]
@@ -128,65 +134,65 @@ def test_the_folder_holds_figures_distances_and_a_page_of_its_own(out, model):
     assert not list(out.parent.glob(".*.tmp"))
 
 
-def test_the_same_again_is_left_alone_and_another_seed_is_not(place, out, monkeypatch):
+def test_an_existing_result_is_reused_and_another_seed_is_computed(inputs, out, monkeypatch):
     calls = []
     real = workflows.steps.evaluate.evaluate
     monkeypatch.setattr(workflows.steps.evaluate, "evaluate", lambda *a: calls.append(1) or real(*a))
-    paths = [place / "weak.npz", place / "own.npz"]
-    told = json.loads((out / "manifest.json").read_text())
-    again = evaluate_models(paths, held_out=place / "people.npz", out=out, settings=SETTINGS)
-    assert again.to_json() == told and not calls
+    paths = [inputs / "weak.npz", inputs / "own.npz"]
+    saved = json.loads((out / "manifest.json").read_text())
+    again = evaluate_models(paths, held_out=inputs / "people.npz", out=out, settings=SETTINGS)
+    assert again.to_json() == saved and not calls
     other = EvaluationSettings(components=(2, 4), samples=3, draws=200, seed=1)
-    changed = evaluate_models(paths, held_out=place / "people.npz", out=out, settings=other)
-    assert len(calls) == 1 and changed.input_hash != told["input_hash"]
-    back = evaluate_models(paths, held_out=place / "people.npz", out=out, settings=SETTINGS)
-    assert back.to_json() == told
+    changed = evaluate_models(paths, held_out=inputs / "people.npz", out=out, settings=other)
+    assert len(calls) == 1 and changed.input_hash != saved["input_hash"]
+    back = evaluate_models(paths, held_out=inputs / "people.npz", out=out, settings=SETTINGS)
+    assert back.to_json() == saved
 
 
-def test_the_command_tells_the_figures(place, tmp_path, capsys):
-    arguments = ["model", "evaluate", str(place / "weak.npz"), str(place / "own.npz"), "--held-out"]
+def test_the_command_prints_the_metrics(inputs, tmp_path, capsys):
+    arguments = ["model", "evaluate", str(inputs / "weak.npz"), str(inputs / "own.npz"), "--held-out"]
     options = ["--components", "2", "4", "--samples", "2"]
-    assert main([*arguments, str(place / "people.npz"), "--out", str(tmp_path / "out"), *options]) == 0
-    told = capsys.readouterr().out
-    assert "own, 12 components: generalization 0.000 mm" in told
-    assert "own, 4 components: gain" in told and str(tmp_path / "out" / "index.html") in told
+    assert main([*arguments, str(inputs / "people.npz"), "--out", str(tmp_path / "out"), *options]) == 0
+    printed = capsys.readouterr().out
+    assert "own, 12 components: generalization 0.000 mm" in printed
+    assert "own, 4 components: gain" in printed and str(tmp_path / "out" / "index.html") in printed
 
 
 @pytest.mark.parametrize("options", [["--components", "2", "13"], ["--components", "4", "2"], ["--samples", "-1"]])
-def test_bad_settings_end_before_anything_is_written(place, tmp_path, capsys, options):
-    arguments = ["model", "evaluate", str(place / "own.npz"), "--held-out", str(place / "people.npz")]
+def test_bad_settings_are_refused_before_anything_is_written(inputs, tmp_path, capsys, options):
+    arguments = ["model", "evaluate", str(inputs / "own.npz"), "--held-out", str(inputs / "people.npz")]
     assert main([*arguments, "--out", str(tmp_path / "out"), *options]) == 2
     assert "fix:" in capsys.readouterr().err and not (tmp_path / "out").exists()
 
 
-def test_folders_of_others_and_models_that_come_twice_are_refused(place, tmp_path):
+def test_foreign_folders_and_duplicate_models_are_refused(inputs, tmp_path):
     (tmp_path / "notes.txt").write_text("mine")
-    for paths, out in (([place / "own.npz"], tmp_path), ([place / "own.npz"] * 2, tmp_path / "out")):
+    for paths, out in (([inputs / "own.npz"], tmp_path), ([inputs / "own.npz"] * 2, tmp_path / "out")):
         with pytest.raises(InputError):
-            evaluate_models(paths, held_out=place / "people.npz", out=out, settings=SETTINGS)
+            evaluate_models(paths, held_out=inputs / "people.npz", out=out, settings=SETTINGS)
     assert (tmp_path / "notes.txt").read_text() == "mine"
 
 
 @pytest.fixture
 def run(model, tmp_path) -> Path:
-    """Registrations of two people; one has an expression."""
+    """Registrations of two subjects, of which one has an expression."""
     neutrals = meshes(model)["vertices"][6:8]
-    seen = np.ones(len(neutrals[0]))
-    anna = {"rest": ("neutral", neutrals[0], seen), "jaw": ("jaw_open", neutrals[0] + 1e-3, seen)}
-    write_subject(tmp_path / "run" / "subject_10", "ben", model, {"rest": ("neutral", neutrals[1], seen)})
+    confidence = np.ones(len(neutrals[0]))
+    anna = {"rest": ("neutral", neutrals[0], confidence), "jaw": ("jaw_open", neutrals[0] + 1e-3, confidence)}
+    write_subject(tmp_path / "run" / "subject_10", "ben", model, {"rest": ("neutral", neutrals[1], confidence)})
     write_subject(tmp_path / "run" / "subject_2", "anna", model, anna)
     return tmp_path / "run"
 
 
-def test_a_run_gives_its_neutrals_and_what_was_stabilized(model, run):
+def test_a_run_gives_its_neutrals_and_stabilized_expressions(model, run):
     neutrals = meshes(model)["vertices"][6:8]
-    found = read_held_out(run)
-    assert [one.subject for one in found.subjects] == ["anna", "ben"]  # by folder, numbers as numbers
-    for one, neutral in zip(found.subjects, neutrals, strict=True):
-        np.testing.assert_allclose(one.neutral, neutral, atol=1e-7)
-        assert len(one.expressions) == 0
-    place = run / "stabilized"
-    (place / "subjects").mkdir(parents=True)
+    held_out = read_held_out(run)
+    assert [subject.subject for subject in held_out.subjects] == ["anna", "ben"]  # by folder, numbers as numbers
+    for subject, neutral in zip(held_out.subjects, neutrals, strict=True):
+        np.testing.assert_allclose(subject.neutral, neutral, atol=1e-7)
+        assert len(subject.expressions) == 0
+    folder = run / "stabilized"
+    (folder / "subjects").mkdir(parents=True)
     steady = StabilizedSubject(
         subject="anna",
         names=("jaw",),
@@ -198,7 +204,7 @@ def test_a_run_gives_its_neutrals_and_what_was_stabilized(model, run):
         residual_mm=np.zeros((1, 5), np.float32),
         T_head_world=np.eye(4),
     )
-    stabilized.write_subject(steady, place, 0)
+    stabilized.write_subject(steady, folder, 0)
     stabilized.StabilizedManifest(
         content_id="",
         input_hash="",
@@ -210,21 +216,21 @@ def test_a_run_gives_its_neutrals_and_what_was_stabilized(model, run):
         config={},
         inputs={},
         versions={},
-    ).write(place / stabilized.MANIFEST)
+    ).write(folder / stabilized.MANIFEST)
     anna, ben = read_held_out(run).subjects
     np.testing.assert_array_equal(anna.expressions, steady.vertices)
     assert anna.categories == ("jaw_open",) and len(ben.expressions) == 0
 
 
-def test_captures_add_tags_and_the_scans_face(run, tmp_path):
+def test_captures_add_tags_and_face_points_of_the_scan(run, tmp_path):
     for folder in ("subject_2", "subject_10"):
         small.make(tmp_path / "captures" / folder / "rest")
-    found = read_held_out(run, tmp_path / "captures")
-    for one in found.subjects:
-        assert one.tags["age"] == 30
-        assert one.scan is not None and 10 < len(one.scan)
-    assert {"capture anna", "capture ben"} <= set(found.inputs)
-    assert found.inputs["held_out"] != read_held_out(run).inputs["held_out"]
+    held_out = read_held_out(run, tmp_path / "captures")
+    for subject in held_out.subjects:
+        assert subject.tags["age"] == 30
+        assert subject.scan is not None and 10 < len(subject.scan)
+    assert {"capture anna", "capture ben"} <= set(held_out.inputs)
+    assert held_out.inputs["held_out"] != read_held_out(run).inputs["held_out"]
     (tmp_path / "captures" / "subject_2" / "rest" / "capture.toml").unlink()
     with pytest.raises(InputError):
         read_held_out(run, tmp_path / "captures")

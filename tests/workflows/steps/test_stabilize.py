@@ -1,4 +1,4 @@
-"""`gnmreg stabilize`: the same as the plain function; bad input before any work; decisions belong to their dataset."""
+"""`gnmreg stabilize`: equal to the plain function; bad input is refused first; decisions belong to their dataset."""
 
 import json
 import shutil
@@ -36,20 +36,20 @@ def outcome(run, model_file):  # noqa: F811
 
 
 @pytest.fixture
-def own(run, tmp_path) -> Path:
-    """A copy that a test may spoil."""
-    shutil.copytree(run, tmp_path / "own", ignore=shutil.ignore_patterns("stabilized"))
-    return tmp_path / "own"
+def run_copy(run, tmp_path) -> Path:
+    """A copy of the run that a test may modify."""
+    shutil.copytree(run, tmp_path / "copy", ignore=shutil.ignore_patterns("stabilized"))
+    return tmp_path / "copy"
 
 
 def test_the_folder_holds_what_the_function_returns(run, outcome, model):  # noqa: F811
     expected = stabilize(read_run(run, model).meshes(), model)
     for number, subject in enumerate(expected.subjects):
-        found = disk.read_subject(outcome.out, number)
-        assert found.subject == subject.subject and found.labels == NAMES
-        np.testing.assert_allclose(found.T_neutral_expression, subject.T_neutral_expression, atol=1e-9)
-        np.testing.assert_allclose(found.vertices, subject.vertices, atol=1e-6)
-        np.testing.assert_array_equal(found.confidence_map, subject.confidence_map)
+        saved = disk.read_subject(outcome.out, number)
+        assert saved.subject == subject.subject and saved.labels == NAMES
+        np.testing.assert_allclose(saved.T_neutral_expression, subject.T_neutral_expression, atol=1e-9)
+        np.testing.assert_allclose(saved.vertices, subject.vertices, atol=1e-6)
+        np.testing.assert_array_equal(saved.confidence_map, subject.confidence_map)
     stored = disk.read_components(outcome.out)
     assert [part.region for part in stored.components] == [part.region for part in expected.components]
     assert stored.labels == 2 * NAMES and stored.names == 2 * NAMES
@@ -58,14 +58,14 @@ def test_the_folder_holds_what_the_function_returns(run, outcome, model):  # noq
     assert not list(outcome.out.parent.glob(".*.tmp"))
 
 
-def test_the_same_again_is_left_alone_and_one_subject_will_do(run, outcome, model_file, capsys):  # noqa: F811
+def test_an_existing_result_is_reused_and_one_subject_suffices(run, outcome, model_file, capsys):  # noqa: F811
     written = (outcome.out / "manifest.json").stat().st_mtime_ns
     assert main(["stabilize", str(run)]) == 0
     assert "index.html" in capsys.readouterr().out
     assert (outcome.out / "manifest.json").stat().st_mtime_ns == written
-    one = stabilize_run(run / "synth_0001", model_path=model_file)
-    assert one.figures["samples"] == 3 and one.dataset != outcome.dataset
-    assert one.out == run / "synth_0001" / "stabilized"
+    single = stabilize_run(run / "synth_0001", model_path=model_file)
+    assert single.figures["samples"] == 3 and single.dataset != outcome.dataset
+    assert single.out == run / "synth_0001" / "stabilized"
 
 
 def test_decisions_are_replayed(run, outcome, model, model_file, tmp_path):  # noqa: F811
@@ -79,9 +79,9 @@ def test_decisions_are_replayed(run, outcome, model, model_file, tmp_path):  # n
     replayed = stabilize_run(run, model_path=model_file, out=tmp_path / "out", decisions=log)
     expected = stabilize(read_run(run, model).meshes(), model, decisions=[last])
     plain = disk.read_subject(outcome.out, 0)
-    found = disk.read_subject(replayed.out, 0)
-    np.testing.assert_allclose(found.vertices, expected.subjects[0].vertices, atol=1e-6)
-    assert np.abs(found.T_neutral_expression - plain.T_neutral_expression).max() > 1e-6
+    saved = disk.read_subject(replayed.out, 0)
+    np.testing.assert_allclose(saved.vertices, expected.subjects[0].vertices, atol=1e-6)
+    assert np.abs(saved.T_neutral_expression - plain.T_neutral_expression).max() > 1e-6
 
 
 def test_decisions_of_another_dataset_or_none_are_refused(run, outcome, model_file, tmp_path):  # noqa: F811
@@ -98,40 +98,40 @@ def test_decisions_of_another_dataset_or_none_are_refused(run, outcome, model_fi
     assert [path.name for path in tmp_path.iterdir()] == ["decisions.jsonl"]
 
 
-def spoil_neutral(run: Path) -> None:
+def remove_neutral(run: Path) -> None:
     change_record(run, lambda rows: rows.pop(0))
 
 
-def spoil_status(run: Path) -> None:
+def mark_failed(run: Path) -> None:
     change_record(run, lambda rows: rows[1].update(status="failed", reason="blew up"))
 
 
-def spoil_expressions(run: Path) -> None:
+def remove_expressions(run: Path) -> None:
     change_record(run, lambda rows: rows.__delitem__(slice(1, None)))
 
 
-def spoil_topology(run: Path) -> None:
+def change_topology(run: Path) -> None:
     change_arrays(run, lambda arrays: arrays.update(triangles=arrays["triangles"][::-1].copy()))
 
 
-def spoil_numbers(run: Path) -> None:
+def write_nan(run: Path) -> None:
     change_arrays(run, lambda arrays: arrays["vertices"].__setitem__((5, 1), np.nan))
 
 
-def spoil_file(run: Path) -> None:
+def corrupt_file(run: Path) -> None:
     (run / "synth_0001" / "smile" / "registration.npz").write_bytes(b"none")
 
 
-def spoil_twice(run: Path) -> None:
+def duplicate_subject(run: Path) -> None:
     shutil.copytree(run / "synth_0001", run / "again")
 
 
-def spoil_one_sample(run: Path) -> None:
+def leave_one_expression(run: Path) -> None:
     shutil.rmtree(run / "synth_0000")
     change_record(run, lambda rows: rows.__delitem__(slice(2, None)))
 
 
-def spoil_all(run: Path) -> None:
+def remove_all_subjects(run: Path) -> None:
     shutil.rmtree(run)
     run.mkdir()
 
@@ -152,41 +152,41 @@ def change_arrays(run: Path, change) -> None:
 
 
 @pytest.mark.parametrize(
-    "spoil, what",
+    "damage, what",
     [
-        (spoil_neutral, "no neutral"),
-        (spoil_status, "registrations that failed"),
-        (spoil_expressions, "no expression"),
-        (spoil_topology, "another topology"),
-        (spoil_numbers, "not finite"),
-        (spoil_file, "cannot be read"),
-        (spoil_twice, "same subject"),
-        (spoil_one_sample, "only one expression"),
-        (spoil_all, "no subjects"),
+        (remove_neutral, "no neutral"),
+        (mark_failed, "registrations that failed"),
+        (remove_expressions, "no expression"),
+        (change_topology, "another topology"),
+        (write_nan, "not finite"),
+        (corrupt_file, "cannot be read"),
+        (duplicate_subject, "same subject"),
+        (leave_one_expression, "only one expression"),
+        (remove_all_subjects, "no subjects"),
     ],
 )
-def test_bad_runs_are_told_before_any_work(own, spoil, what, model_file, monkeypatch, capsys):  # noqa: F811
-    spoil(own)
-    before = sorted(own.rglob("*"))
+def test_bad_runs_are_refused_before_any_work(run_copy, damage, what, model_file, monkeypatch, capsys):  # noqa: F811
+    damage(run_copy)
+    before = sorted(run_copy.rglob("*"))
     monkeypatch.setattr("workflows.steps.stabilize.automatic_stage", None)  # must not be reached
-    assert main(["stabilize", str(own), "--model", str(model_file)]) == 2
-    told = capsys.readouterr().err
-    assert what in told and "fix:" in told and "Traceback" not in told
-    assert sorted(own.rglob("*")) == before
+    assert main(["stabilize", str(run_copy), "--model", str(model_file)]) == 2
+    error = capsys.readouterr().err
+    assert what in error and "fix:" in error and "Traceback" not in error
+    assert sorted(run_copy.rglob("*")) == before
 
 
-def test_failed_registrations_can_be_left_out(own, model_file):  # noqa: F811
-    spoil_status(own)
-    outcome = stabilize_run(own, model_path=model_file, selection=Selection(skip_failed=True))
+def test_failed_registrations_can_be_excluded(run_copy, model_file):  # noqa: F811
+    mark_failed(run_copy)
+    outcome = stabilize_run(run_copy, model_path=model_file, selection=Selection(skip_failed=True))
     manifest = disk.read_manifest(outcome.out)
     assert outcome.figures["samples"] == 5 and manifest.left_out == {"synth_0001": ("smile",)}
 
 
-def test_other_folders_and_other_models_are_refused(own, model_file, model, tmp_path):  # noqa: F811
-    (own / "stabilized").mkdir()
-    (own / "stabilized" / "mine.txt").write_text("mine")
+def test_other_folders_and_other_models_are_refused(run_copy, model_file, model, tmp_path):  # noqa: F811
+    (run_copy / "stabilized").mkdir()
+    (run_copy / "stabilized" / "mine.txt").write_text("mine")
     with pytest.raises(InputError, match="output folder"):
-        stabilize_run(own, model_path=model_file)
+        stabilize_run(run_copy, model_path=model_file)
     keep = model.vertex_group_names != "nose_region"
     poor = tmp_path / "poor.npz"
     gnm_npz.write(
@@ -200,22 +200,22 @@ def test_other_folders_and_other_models_are_refused(own, model_file, model, tmp_
         poor,
     )
     with pytest.raises(InputError, match="no vertex group 'nose_region'"):
-        stabilize_run(own, model_path=poor)
+        stabilize_run(run_copy, model_path=poor)
 
 
-def test_an_interrupted_run_leaves_nothing(own, model_file, monkeypatch):  # noqa: F811
+def test_an_interrupted_run_leaves_nothing(run_copy, model_file, monkeypatch):  # noqa: F811
     def stop(*_):
         raise KeyboardInterrupt
 
     monkeypatch.setattr("workflows.steps.stabilize.regional_stage", stop)
-    before = sorted(path.name for path in own.iterdir())
+    before = sorted(path.name for path in run_copy.iterdir())
     with pytest.raises(KeyboardInterrupt):
-        stabilize_run(own, model_path=model_file)
-    assert sorted(path.name for path in own.iterdir()) == before
+        stabilize_run(run_copy, model_path=model_file)
+    assert sorted(path.name for path in run_copy.iterdir()) == before
 
 
-def test_a_model_that_is_not_known_here_must_be_named(own, capsys):
-    file = own / "synth_0000" / "subject.json"
+def test_an_unknown_model_must_be_given_by_option(run_copy, capsys):
+    file = run_copy / "synth_0000" / "subject.json"
     file.write_text(file.read_text().replace('"model": "', '"model": "0'))
-    assert main(["stabilize", str(own)]) == 2
+    assert main(["stabilize", str(run_copy)]) == 2
     assert "--model" in capsys.readouterr().err

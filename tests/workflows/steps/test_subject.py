@@ -1,4 +1,4 @@
-"""A subject's captures, one after the other. The registrations are stand-ins, but for the last test."""
+"""A subject's captures in sequence. Registrations are stand-ins except in the last test."""
 
 import os
 import re
@@ -20,7 +20,7 @@ from registration.pipeline import register
 from registration.render import backend
 from registration.storage.registration_folder import AXES, load_registration, read_manifest
 from tests.registration.register import synthetic
-from tests.workflows.conftest import MODEL, FakeRegister, Notes, add_truths, change, manifest, statuses
+from tests.workflows.conftest import MODEL, FakeRegister, RecordingProgress, add_truths, change, manifest, statuses
 from workflows.records.subject import SubjectRecord
 from workflows.steps.subject import register_subject
 
@@ -32,8 +32,10 @@ def run(subject: Path, **options) -> SubjectRecord:
     return register_subject(subject, MODEL, out, **options)
 
 
-def test_the_neutral_first_then_each_expression_from_it(subject: Path, fake: FakeRegister, tmp_path: Path):
-    progress, out = Notes(), tmp_path / "out"
+def test_the_neutral_is_registered_first_then_each_expression_from_it(
+    subject: Path, fake: FakeRegister, tmp_path: Path
+):
+    progress, out = RecordingProgress(), tmp_path / "out"
     files = {"68": synthetic.FIXTURES / "head_sparse_68.txt"}
     options = RegisterOptions(
         recipe="studio", views=3, seed=4, deterministic=True, variant="cuda", landmark_files=files
@@ -45,17 +47,17 @@ def test_the_neutral_first_then_each_expression_from_it(subject: Path, fake: Fak
     ]
     assert fake.settings == 4 * [{"model": MODEL, "options": options, "force": True}]
     assert progress.steps[:2] == ["rest (1 of 4): fitting", "jaw2 (2 of 4): fitting"]
-    assert "smile (4 of 4): converged: it is converged" in progress.notes
+    assert "smile (4 of 4): converged: it is converged" in progress.messages
 
 
-def test_what_subject_json_holds(subject: Path, fake: FakeRegister, tmp_path: Path):
+def test_the_contents_of_subject_json(subject: Path, fake: FakeRegister, tmp_path: Path):
     out = tmp_path / "out"
     run(subject)
-    told = manifest(out)
-    assert (told["kind"], told["schema"], told["subject"]) == ("gnm-subject", 1, "ball")
-    assert (told["recipe"], told["neutral"]) == ("draft", "rest")
-    assert re.fullmatch("[0-9a-f]{64}", told["model"])
-    rest, jaw, *_ = told["captures"]
+    record = manifest(out)
+    assert (record["kind"], record["schema"], record["subject"]) == ("gnm-subject", 1, "ball")
+    assert (record["recipe"], record["neutral"]) == ("draft", "rest")
+    assert re.fullmatch("[0-9a-f]{64}", record["model"])
+    rest, jaw, *_ = record["captures"]
     assert rest == {
         "name": "rest",
         "expression": "neutral",
@@ -71,16 +73,16 @@ def test_what_subject_json_holds(subject: Path, fake: FakeRegister, tmp_path: Pa
     ]  # fmt: skip
 
 
-def test_the_drift_is_that_of_evaluate(subject: Path, fake: FakeRegister, tmp_path: Path):
-    """Both truths are one and the same, the surface moved by a millimetre."""
+def test_the_drift_equals_that_of_evaluate(subject: Path, fake: FakeRegister, tmp_path: Path):
+    """Both ground truths are equal, and the registered surface is translated by a millimetre."""
     out = tmp_path / "out"
     add_truths(subject, "rest", "smile")
     run(subject)
     figures = read_manifest(out / "smile").figures
     assert figures["drift"]["face"]["mean_mm"] == pytest.approx(1.0, abs=0.05)
     assert "drift" not in read_manifest(out / "rest").figures
-    told = manifest(out)["captures"][-1]["figures"]
-    assert told == {name: {"face": figures[name]["face"]} for name in ("scan_to_mesh", "drift")}
+    row_figures = manifest(out)["captures"][-1]["figures"]
+    assert row_figures == {name: {"face": figures[name]["face"]} for name in ("scan_to_mesh", "drift")}
     by_hand = evaluate_folder(out / "smile", subject / "smile", out / "rest", subject / "rest").metrics
     assert by_hand["drift"] == figures["drift"] and by_hand["scan_to_mesh"] == figures["scan_to_mesh"]
 
@@ -103,7 +105,7 @@ def test_no_drift_without_comparable_truths(change_truths, subject: Path, fake: 
     assert set(row.figures) == {"scan_to_mesh"}
 
 
-def test_an_unmeasured_drift_is_told(subject: Path, fake: FakeRegister):
+def test_a_failed_drift_measurement_is_reported(subject: Path, fake: FakeRegister):
     add_truths(subject, "rest")
     (subject / "jaw10" / "ground_truth.npz").write_bytes(b"broken")
     rest, jaw2, row, smile = run(subject).rows
@@ -121,7 +123,7 @@ def test_an_unmeasured_drift_is_told(subject: Path, fake: FakeRegister):
     ],
 )
 def test_one_failure_does_not_stop_the_others(outcome, status, reason, subject: Path, fake: FakeRegister):
-    progress = Notes()
+    progress = RecordingProgress()
     fake.outcomes["jaw2"] = outcome
     result = run(subject, progress=progress)
     assert fake.order == ["rest", "jaw2", "jaw10", "smile"]
@@ -129,14 +131,14 @@ def test_one_failure_does_not_stop_the_others(outcome, status, reason, subject: 
     row = result.rows[1]
     assert row.reason == reason
     assert row.folder == (None if status == "error" else "jaw2")
-    assert any("Traceback" in note for note in progress.notes) == isinstance(outcome, RuntimeError)
+    assert any("Traceback" in text for text in progress.messages) == isinstance(outcome, RuntimeError)
 
 
 @pytest.mark.parametrize(
     ("outcome", "reason"),
     [("failed", "it is failed"), (REFUSED, "The lens is dirty"), (ValueError("odd"), "ValueError: odd")],
 )
-def test_without_a_neutral_no_expression_is_tried(outcome, reason: str, subject: Path, fake: FakeRegister):
+def test_without_a_neutral_no_expression_is_registered(outcome, reason: str, subject: Path, fake: FakeRegister):
     fake.outcomes["rest"] = outcome
     result = run(subject)
     assert fake.order == ["rest"]
@@ -158,15 +160,15 @@ def test_a_capture_that_cannot_be_read_does_not_stop_the_others(subject: Path, f
     assert "The COLMAP model is missing" in result.rows[-1].reason
 
 
-def test_every_capture_is_on_record_at_once(subject: Path, fake: FakeRegister, tmp_path: Path):
+def test_the_record_lists_every_capture_from_the_start(subject: Path, fake: FakeRegister, tmp_path: Path):
     fake.outcomes["jaw2"] = "failed"
     run(subject)
-    told = ["converged", "failed", "converged", "converged"]
-    for count, seen in enumerate(fake.seen):
-        assert [status for _, status in seen] == [*told[:count], *(4 - count) * ["waiting"]]
+    expected = ["converged", "failed", "converged", "converged"]
+    for count, rows in enumerate(fake.records):
+        assert [status for _, status in rows] == [*expected[:count], *(4 - count) * ["waiting"]]
 
 
-def test_an_interrupted_run_is_on_record_and_goes_on(subject: Path, fake: FakeRegister, tmp_path: Path):
+def test_an_interrupted_run_is_recorded_and_resumes(subject: Path, fake: FakeRegister, tmp_path: Path):
     out = tmp_path / "out"
     fake.outcomes["jaw10"] = KeyboardInterrupt()
     with pytest.raises(KeyboardInterrupt):
@@ -179,7 +181,7 @@ def test_an_interrupted_run_is_on_record_and_goes_on(subject: Path, fake: FakeRe
     assert {status for _, status in statuses(out)} == {"converged"}
 
 
-def test_a_crash_while_writing_leaves_the_former_record(subject: Path, fake: FakeRegister, tmp_path, monkeypatch):
+def test_a_crash_while_writing_leaves_the_previous_record(subject: Path, fake: FakeRegister, tmp_path, monkeypatch):
     out = tmp_path / "out"
     run(subject)
     before = manifest(out)
@@ -190,25 +192,25 @@ def test_a_crash_while_writing_leaves_the_former_record(subject: Path, fake: Fak
     assert not [path for path in out.iterdir() if path.name.startswith(".")]
 
 
-def test_a_drift_that_is_newer_than_the_neutral_stays(subject: Path, fake: FakeRegister, tmp_path: Path, monkeypatch):
-    out, asked = tmp_path / "out", []
+def test_a_drift_newer_than_the_neutral_is_kept(subject: Path, fake: FakeRegister, tmp_path: Path, monkeypatch):
+    out, evaluated = tmp_path / "out", []
     add_truths(subject, "rest", "jaw2", "smile")
     run(subject)
     monkeypatch.setattr(workflows.steps.subject, "register", lambda capture, *, out, **settings: load_registration(out))
 
-    def listen(registration, capture, **options):
-        asked.append(capture.root.name)
+    def record_call(registration, capture, **options):
+        evaluated.append(capture.root.name)
         raise REFUSED
 
-    monkeypatch.setattr(workflows.steps.subject, "evaluate_registration", listen)
+    monkeypatch.setattr(workflows.steps.subject, "evaluate_registration", record_call)
     again = run(subject)
-    assert asked == [] and again.rows[-1].figures["drift"]["face"]["mean_mm"] == pytest.approx(1.0, abs=0.05)
+    assert evaluated == [] and again.rows[-1].figures["drift"]["face"]["mean_mm"] == pytest.approx(1.0, abs=0.05)
     os.utime(out / "rest" / "manifest.json")
     run(subject)
-    assert asked == ["jaw2", "smile"]
+    assert evaluated == ["jaw2", "smile"]
 
 
-def test_another_capture_as_the_neutral(subject: Path, fake: FakeRegister):
+def test_the_neutral_can_be_selected(subject: Path, fake: FakeRegister):
     change(subject / "smile", '"smile"', '"neutral"')
     assert run(subject, neutral="smile").neutral == "smile"
     assert fake.order == ["smile", "jaw2", "jaw10", "rest"]
@@ -223,15 +225,15 @@ def test_the_recorded_folder_is_replaced_only_for_its_subject(subject: Path, fak
     assert "'ball'" in str(refused.value) and len(fake.calls) == 4
 
 
-def hasty() -> Recipe:
-    """A draft of a fifth of its steps."""
+def short_draft() -> Recipe:
+    """Return the draft recipe with a fifth of its steps."""
     recipe = draft()
     return replace(recipe, stages=tuple(replace(stage, steps=stage.steps // 5) for stage in recipe.stages))
 
 
 @pytest.fixture
 def threads() -> Iterator[None]:
-    """Gives back the threads that a deterministic run takes from the whole process."""
+    """Restore the thread counts that a deterministic run changes for the whole process."""
     import drjit as dr
 
     count, lanes = torch.get_num_threads(), os.cpu_count() or 1
@@ -241,7 +243,7 @@ def threads() -> Iterator[None]:
 
 
 def test_a_subject_equals_its_captures_registered_by_hand(tmp_path: Path, monkeypatch, threads: None):
-    monkeypatch.setitem(RECIPES, "draft", hasty)
+    monkeypatch.setitem(RECIPES, "draft", short_draft)
     subject, out, options = tmp_path / "tiny", tmp_path / "out", RegisterOptions(views=3, deterministic=True)
     for expression in ("neutral", "smile"):
         synthetic.make(subject / expression, expression)
@@ -259,7 +261,7 @@ def test_a_subject_equals_its_captures_registered_by_hand(tmp_path: Path, monkey
     assert record["captures"][1]["figures"]["drift"] == stored.figures["drift"]
 
     def stop(*args, **kwargs):
-        raise AssertionError("there was nothing to compute")
+        raise AssertionError("nothing was to be computed")
 
     monkeypatch.setattr(backend, "activate", stop)
     monkeypatch.setattr(workflows.steps.subject, "evaluate_registration", stop)
