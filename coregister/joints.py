@@ -5,7 +5,7 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy.optimize import nnls
 
-from coregister.region_masks import smoothstep
+from registration.geometry.smoothstep import smoothstep
 from registration.model import regions
 from registration.model.gnm_npz import GNMData
 
@@ -25,7 +25,7 @@ def head_weight(vertices: Float[np.ndarray, "V 3"]) -> Float[np.ndarray, "V"]:
     Args:
         vertices: of the skin, metres, the model's frame.
     """
-    return smoothstep((vertices[:, 1] + _SLOPE * vertices[:, 2] - _NECK) / (_SKULL - _NECK))
+    return smoothstep(0, 1, (vertices[:, 1] + _SLOPE * vertices[:, 2] - _NECK) / (_SKULL - _NECK))
 
 
 def regressor(

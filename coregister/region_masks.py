@@ -8,6 +8,7 @@ import scipy.sparse as sp
 from jaxtyping import Bool, Float, Int
 from scipy.sparse.csgraph import dijkstra
 
+from registration.geometry.smoothstep import smoothstep
 from registration.geometry.topology import edges as edges_of
 from registration.model import regions
 from registration.model.gnm_npz import GNMData
@@ -59,7 +60,7 @@ def regional_masks(data: GNMData) -> Float[np.ndarray, "3 V"]:
 def _split(
     graph: sp.csr_matrix, upper: Bool[np.ndarray, "V"], x: Float[np.ndarray, "V"], mirror: Int[np.ndarray, "V"]
 ) -> Float[np.ndarray, "3 V"]:
-    left_of = smoothstep(0.5 + x / _BLEND_M)
+    left_of = smoothstep(0, 1, 0.5 + x / _BLEND_M)
     eyes = _fade(graph, upper)
     eyes = (eyes + eyes[mirror]) / 2
     return np.stack([eyes * left_of, eyes * (1 - left_of), 1 - eyes])
@@ -68,13 +69,7 @@ def _split(
 def _fade(graph: sp.csr_matrix, inside: Bool[np.ndarray, "V"]) -> Float[np.ndarray, "V"]:
     """A mask that is 1 inside, 0 outside and 1/2 on the border."""
     distance = [dijkstra(graph, directed=False, indices=np.flatnonzero(s), min_only=True) for s in (inside, ~inside)]
-    return smoothstep(0.5 + (distance[1] - distance[0]) / _BLEND_M)
-
-
-def smoothstep(x: Float[np.ndarray, "*S"]) -> Float[np.ndarray, "*S"]:
-    """Return 3 t^2 - 2 t^3 with t = x clipped to [0, 1]."""
-    t = np.clip(x, 0, 1)
-    return t * t * (3 - 2 * t)
+    return smoothstep(0, 1, 0.5 + (distance[1] - distance[0]) / _BLEND_M)
 
 
 def mirrored(basis: Float[np.ndarray, "K V 3"], mirror: Int[np.ndarray, "V"]) -> Float[np.ndarray, "K V 3"]:

@@ -12,10 +12,11 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
 from registration.geometry import rigid
+from registration.geometry.smoothstep import smoothstep
 from registration.geometry.topology import edges
 from registration.model.gnm_npz import GNMData
 from registration.model.regions import exterior, group
-from registration.render.studio.canvas import fill_texture, make_canvas, smoothed, smoothstep
+from registration.render.studio.canvas import fill_texture, make_canvas, smoothed
 from registration.render.studio.noise import SolidNoise
 from registration.render.studio.scene import StudioSurface, subdivide, surface_normals
 from registration.render.studio.skin import SkinAppearance, depth_inside_hairline

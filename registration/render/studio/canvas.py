@@ -96,9 +96,3 @@ def soft_group(data: GNMData, name: str, iterations: int = 1) -> Float[np.ndarra
     if name not in data.vertex_group_names.tolist():
         return np.zeros(len(data.template_vertex_positions))
     return smoothed(data, group(data, name).astype(np.float64), iterations)
-
-
-def smoothstep(low: float, high: float, x: Float[np.ndarray, "*N"]) -> Float[np.ndarray, "*N"]:
-    """Return 0 below `low`, 1 above `high`, and a cubic between; decreasing if `low` is the larger."""
-    t = np.clip((x - low) / (high - low), 0, 1)
-    return t * t * (3 - 2 * t)

@@ -5,9 +5,9 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float
 
+from registration.geometry.smoothstep import smoothstep
 from registration.model.gnm_npz import GNMData
 from registration.model.regions import group
-from registration.render.studio.canvas import smoothstep
 from registration.render.studio.noise import SolidNoise
 
 SIDES = ("left_eye", "right_eye")

@@ -10,9 +10,10 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial import cKDTree
 
+from registration.geometry.smoothstep import smoothstep
 from registration.model.gnm_npz import GNMData
 from registration.model.regions import exterior, group
-from registration.render.studio.canvas import Canvas, fill_texture, smoothed, smoothstep, soft_group
+from registration.render.studio.canvas import Canvas, fill_texture, smoothed, soft_group
 from registration.render.studio.eyes import SIDES, eye_frame, paint_eye
 from registration.render.studio.noise import SolidNoise
 

@@ -11,11 +11,12 @@ from coregister.first_model.build import bootstrap
 from registration.errors import InputError
 from registration.frames import linear_to_srgb
 from registration.geometry.rasterizer import rasterize
+from registration.geometry.smoothstep import smoothstep
 from registration.model import gnm_npz
 from registration.model.atlas import texture_atlas
 from registration.model.regions import group, vertex_classes
 from registration.render import backend
-from registration.render.studio.canvas import fill_texture, make_canvas, smoothstep
+from registration.render.studio.canvas import fill_texture, make_canvas
 from registration.render.studio.eyes import corneas, eye_frame
 from registration.render.studio.light import Sky, bake_light
 from registration.render.studio.noise import SolidNoise
