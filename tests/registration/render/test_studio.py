@@ -11,7 +11,6 @@ from coregister.first_model.build import bootstrap
 from registration.errors import InputError
 from registration.frames import linear_to_srgb
 from registration.geometry.rasterizer import rasterize
-from registration.geometry.smoothstep import smoothstep
 from registration.model import gnm_npz
 from registration.model.atlas import texture_atlas
 from registration.model.regions import group, vertex_classes
@@ -395,4 +394,3 @@ def test_the_canvas_covers_every_face_and_fills_the_remaining_texels():
     texture = fill_texture(256, page.texel, points)
     assert (texture.reshape(-1, 3)[page.texel] == points).all()
     assert {tuple(row) for row in texture.reshape(-1, 3).tolist()} == {tuple(row) for row in points.tolist()}
-    np.testing.assert_allclose(smoothstep(2.0, 1.0, np.array([0.5, 1.5, 2.5])), [1, 0.5, 0])
