@@ -50,8 +50,8 @@ def true_register(monkeypatch) -> TrueRegister:
     monkeypatch.setattr(workflows.steps.register, "register", register)
     monkeypatch.setattr(workflows.steps.evaluate, "write_evaluate_page", lambda *a: "<html></html>")
     monkeypatch.setattr(workflows.steps.stabilize, "write_stabilize_page", lambda *a: "<html></html>")
-    monkeypatch.setattr(workflows.pages.coregistration, "number_curves", lambda *a: "<svg></svg>")
-    monkeypatch.setattr(model, "number_curves", lambda *a: "<svg></svg>")
+    monkeypatch.setattr(workflows.pages.coregistration, "line_charts", lambda *a: "<svg></svg>")
+    monkeypatch.setattr(model, "line_charts", lambda *a: "<svg></svg>")
     monkeypatch.setattr(model, "heat_images", lambda *a, **k: [])
     return register
 
