@@ -111,7 +111,7 @@ def test_a_failed_drift_measurement_is_reported(subject: Path, fake: FakeRegiste
     rest, jaw2, row, smile = run(subject).rows
     assert smile.reason == "it is converged"
     assert row.status == "converged" and row.folder == "jaw10"
-    assert "the drift could not be measured: The ground truth cannot be used" in row.reason
+    assert "the drift could not be measured: The ground truth cannot be read" in row.reason
 
 
 @pytest.mark.parametrize(
