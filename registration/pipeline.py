@@ -31,7 +31,7 @@ from registration.options import RegisterOptions
 from registration.progress import NullProgress, Progress
 from registration.render import backend
 from registration.report.inputs import ReportInputs, distance_heat_map, report_views
-from registration.report.page import write_report
+from registration.report.page import render_report
 from registration.report.stage_snapshots import write_stage
 from registration.storage import hashing
 from registration.storage.registration_folder import check_output_folder, find_existing, save_registration
@@ -292,7 +292,7 @@ def _evaluate(
     progress.message("writing the report")
     cameras = [view.camera for view in inputs.capture.views]
     batch, rendered = problem.render_views(select_spread_views(cameras, _REPORT_VIEWS))
-    page = write_report(
+    page = render_report(
         ReportInputs(
             registration=registration,
             subject=inputs.capture.subject,

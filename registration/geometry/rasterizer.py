@@ -105,9 +105,7 @@ def rasterize(
     return RayCaster(vertices, triangles).rasterize(camera)
 
 
-def _committed(
-    vertices: Float[np.ndarray, "V 3"], triangles: Int[np.ndarray, "F 3"]
-) -> lagrange.raycasting.RayCaster:
+def _committed(vertices: Float[np.ndarray, "V 3"], triangles: Int[np.ndarray, "F 3"]) -> lagrange.raycasting.RayCaster:
     caster = lagrange.raycasting.RayCaster()
     # Its constructor makes the thread flush subnormal numbers to zero, which would change later computations.
     torch.set_flush_denormal(False)

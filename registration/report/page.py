@@ -25,7 +25,7 @@ STATISTICS = {"mean_mm": "mean", "median_mm": "median", "std_mm": "std", "p95_mm
 _OPEN_VIEWS = 4  # whose normals and classes are unfolded at first
 
 
-def write_report(inputs: ReportInputs) -> str:
+def render_report(inputs: ReportInputs) -> str:
     """Return the HTML page of a registration; sections without content are omitted.
 
     Args:

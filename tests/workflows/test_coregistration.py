@@ -48,8 +48,8 @@ def true_register(monkeypatch) -> TrueRegister:
     monkeypatch.setattr(workflows.steps.subject, "register", register)
     monkeypatch.setattr(workflows.steps.subject, "thumbnail", lambda registration: None)
     monkeypatch.setattr(workflows.steps.register, "register", register)
-    monkeypatch.setattr(workflows.steps.evaluate, "write_evaluate_page", lambda *a: "<html></html>")
-    monkeypatch.setattr(workflows.steps.stabilize, "write_stabilize_page", lambda *a: "<html></html>")
+    monkeypatch.setattr(workflows.steps.evaluate, "render_evaluation_page", lambda *a: "<html></html>")
+    monkeypatch.setattr(workflows.steps.stabilize, "render_stabilization_page", lambda *a: "<html></html>")
     monkeypatch.setattr(workflows.pages.coregistration, "line_charts", lambda *a: "<svg></svg>")
     monkeypatch.setattr(model, "line_charts", lambda *a: "<svg></svg>")
     monkeypatch.setattr(model, "heat_images", lambda *a, **k: [])
@@ -77,7 +77,7 @@ def read_record(out: Path) -> dict:
 
 def write_times(out: Path) -> dict[Path, int]:
     """Return the time at which each product was written."""
-    names = ("manifest.json", "gnm_head.npz", "registration.npz", "people.npz", "step.json")
+    names = ("manifest.json", "gnm_head.npz", "registration.npz", "held_out.npz", "step.json")
     return {path: path.stat().st_mtime_ns for name in names for path in out.rglob(name)}
 
 
@@ -130,7 +130,7 @@ def test_python_builds_the_same_model_from_the_same_registrations(dataset, true_
         run = out / "it00" / "registrations"
         names = record["plan"]["split"]["training"]
         tags = {subject: parsed.tags(subject) for subject in names}
-        subjects = RegisteredSubjects(run=run, names=names, model=data, steady=run / "stabilized", tags=tags)
+        subjects = RegisteredSubjects(run=run, names=names, model=data, stabilized_set=run / "stabilized", tags=tags)
         recipe = None if name == DEFAULT_MODEL_RECIPE else load_model_recipe(name)
         built = build_model(subjects, data, recipe, categories=parsed.categories)
         manifest = json.loads((out / "it00/model/gnm_head.manifest.json").read_text())
@@ -253,7 +253,7 @@ def test_expressions_reach_the_builder_in_the_frame_of_the_neutral(dataset, true
     still = workflows.steps.stabilize.stabilize_subjects(
         run=str(run), names=["p0", "p1"], model=str(MODEL), out=str(run / "stabilized")
     )
-    subjects = list(RegisteredSubjects(run=run, names=["p0", "p1"], model=data, steady=Path(still["out"])))
+    subjects = list(RegisteredSubjects(run=run, names=["p0", "p1"], model=data, stabilized_set=Path(still["out"])))
     assert [subject.name for subject in subjects] == ["p0", "p1"]
     for seed, subject in enumerate(subjects):
         assert subject.neutral is not None

@@ -8,7 +8,7 @@ from workflows.engine.client import QueueClient
 from workflows.engine.jobs import DRIVER, FlowJob
 from workflows.farm.local import LocalFarm, run_until_done
 from workflows.ids import check_id
-from workflows.pages.coregistration import write_coregistration_page
+from workflows.pages.coregistration import render_coregistration_page
 from workflows.records.coregistration import (
     MANIFEST,
     PLAN,
@@ -50,7 +50,7 @@ def submit_coregistration(url: str, plan: CoregistrationPlan, *, run: str | None
 
 def start_coregistration(plan: CoregistrationPlan) -> Path:
     """Write the record before the first round, and the plan, whose file is returned."""
-    write_state(initial_state(plan), write_coregistration_page)
+    write_state(initial_state(plan), render_coregistration_page)
     file = plan.out / PLAN
     plan.write(file)
     return file

@@ -119,7 +119,7 @@ async def coregister(scope: "FlowScope", *, plan: str) -> dict[str, Any]:
                 table.BUILD,
                 run=run,
                 names=training,
-                steady=stabilized.out,
+                stabilized=stabilized.out,
                 dataset=str(record.dataset),
                 previous=model,
                 out=f"{folder}/model",
@@ -135,7 +135,7 @@ async def coregister(scope: "FlowScope", *, plan: str) -> dict[str, Any]:
                 f"{name}/evaluate",
                 table.EVALUATE,
                 models=models,
-                people=held_out.people,
+                held_out=held_out.file,
                 out=f"{folder}/evaluation",
                 components=list(record.components),
                 samples=record.samples,
@@ -154,7 +154,7 @@ async def _end_round(
     scope: "FlowScope", name: str, plan: str, held_out: HoldOutResult, rounds: Sequence[RoundProducts]
 ) -> StoppingVerdict:
     """The stopping rule's verdict, in the record."""
-    arguments = {"plan": plan, "people": held_out.to_json(), "rounds": to_json(rounds)}
+    arguments = {"plan": plan, "held_out": held_out.to_json(), "rounds": to_json(rounds)}
     value = await _run_step(scope, f"{name}/decide", table.END_ROUND, **arguments)
     verdict: StoppingVerdict = structure(value, StoppingVerdict, where=f"{name}/decide", title="verdict")
     return verdict

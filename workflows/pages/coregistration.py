@@ -13,7 +13,7 @@ from workflows.records.coregistration import FIRST_MODEL, model_name
 MISSING = "–"
 
 
-def write_coregistration_page(record: Mapping[str, Any]) -> str:
+def render_coregistration_page(record: Mapping[str, Any]) -> str:
     """Return the page for the entries of `coregistration.json`; its links lead to files beside it."""
     plan, components = record["plan"], str(record["at"])
     recipe = plan["options"]["recipe"]

@@ -14,7 +14,9 @@ from registration.report.inputs import HeatMap
 from workflows.pages.base import heat_images, render
 
 
-def write_evaluate_page(evaluation: ModelEvaluation, models: Mapping[str, GNMData], manifest: Mapping[str, Any]) -> str:
+def render_evaluation_page(
+    evaluation: ModelEvaluation, models: Mapping[str, GNMData], manifest: Mapping[str, Any]
+) -> str:
     """Return the page: curves, gains, tables and maps of the distance."""
     limit_mm = max(scale_limit_mm(metrics.vertex_mm) for metrics in evaluation.models.values())
     return render(

@@ -20,7 +20,7 @@ IDENTITY, EXPRESSION = 4, 2  # components drawn, of the head and of each region
 SIDES, SIZE = ("front", "subject's left"), (300, 325)  # of each image; px
 
 
-def write_model_page(data: GNMData, manifest: Mapping[str, Any]) -> str:
+def render_model_page(data: GNMData, manifest: Mapping[str, Any]) -> str:
     """Return the page: the first components at plus and minus two standard deviations, variance and tables."""
     curves, variance_rows = _variance(manifest)
     groups = {**manifest["demographics"], "category": manifest["categories"], "label": manifest["labels"]}

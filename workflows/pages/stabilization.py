@@ -18,7 +18,7 @@ LIMIT_MM = 2.0  # at the end of the colour scale
 _MAX_SUBJECTS = 12  # with maps; a page of hundreds would be too large to open
 
 
-def write_stabilize_page(
+def render_stabilization_page(
     manifest: StabilizedManifest,
     components: Sequence[RegionalComponents],
     subjects: Iterable[StabilizedSubject],

@@ -48,7 +48,7 @@ def _front(head: Float[np.ndarray, "V 3"], width_px: int, height_px: int) -> Cam
     return Camera(width_px=width_px, height_px=height_px, intrinsics=intrinsics, T_cam_world=pose)
 
 
-def write_subject_page(subject: SubjectRecord, thumbnails: Mapping[str, str]) -> str:
+def render_subject_page(subject: SubjectRecord, thumbnails: Mapping[str, str]) -> str:
     """Return the page; `thumbnails` are data URIs by the name of the row."""
     return render(
         "subject.html",

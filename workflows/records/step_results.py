@@ -39,7 +39,7 @@ class CollectResult(StepResult):
 class HoldOutResult(StepResult):
     """Of the step that gathers held-out subjects."""
 
-    people: str  # the NPZ file
+    file: str  # NPZ
     sources: Mapping[str, str]  # subject -> "true meshes" or "registrations"
     lost: tuple[str, ...] = ()  # subjects that have neither
 

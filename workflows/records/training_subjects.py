@@ -34,7 +34,7 @@ class RegisteredSubjects:
     run: Path
     names: Sequence[str]  # of the subjects' folders
     model: GNMData
-    steady: Path | None  # the stabilized set; None: neutrals alone
+    stabilized_set: Path | None  # the stabilized set; None: neutrals alone
     tags: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)  # by folder name
 
     @cached_property
@@ -49,19 +49,21 @@ class RegisteredSubjects:
         ids = {
             f"{name}/{folder}": read_manifest(self.run / name / folder).content_id
             for name, usable in self.usable.items()
-            for folder in (usable.neutral, *(usable.expressions if self.steady else ()))
+            for folder in (usable.neutral, *(usable.expressions if self.stabilized_set else ()))
         }
-        return ids | ({"stabilized": stabilized.read_manifest(self.steady).content_id} if self.steady else {})
+        if self.stabilized_set:
+            ids["stabilized"] = stabilized.read_manifest(self.stabilized_set).content_id
+        return ids
 
     def __iter__(self) -> Iterator[TrainingSubject]:
         model, weights = GNM(self.model), SkullSkin.from_model(self.model).area
-        numbers = _subject_numbers(self.steady)
+        numbers = _subject_numbers(self.stabilized_set)
         for name, usable in self.usable.items():
             neutral = load_registration(self.run / name / usable.neutral)
             unposed = unpose(neutral, model)
             expressions = []
-            if self.steady is not None and usable.subject in numbers:
-                meshes = stabilized.read_subject(self.steady, numbers[usable.subject])
+            if self.stabilized_set is not None and usable.subject in numbers:
+                meshes = stabilized.read_subject(self.stabilized_set, numbers[usable.subject])
                 confidence = weights * neutral.confidence
                 for folder, label, vertices in zip(meshes.names, meshes.labels, meshes.vertices, strict=True):
                     expressions.append(
@@ -89,9 +91,13 @@ class RegisteredSubjects:
             )
 
 
-def _subject_numbers(steady: Path | None) -> dict[str, int]:
+def _subject_numbers(stabilized_set: Path | None) -> dict[str, int]:
     """Subject -> number in the stabilized set."""
-    return {} if steady is None else {name: k for k, name in enumerate(stabilized.read_manifest(steady).subjects)}
+    return (
+        {}
+        if stabilized_set is None
+        else {name: k for k, name in enumerate(stabilized.read_manifest(stabilized_set).subjects)}
+    )
 
 
 def has_truths(captures: SubjectCaptures, model: GNMData) -> bool:

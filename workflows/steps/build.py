@@ -13,7 +13,7 @@ from registration.model import gnm_npz
 from registration.progress import NullProgress, Progress
 from registration.storage import hashing
 from registration.storage.files import atomic_directory
-from workflows.pages.model import write_model_page
+from workflows.pages.model import render_model_page
 from workflows.records.dataset import read_dataset
 from workflows.records.step_results import BuildResult, RejectedRegistration
 from workflows.records.training_subjects import RegisteredSubjects
@@ -26,7 +26,7 @@ def build_next_model(
     *,
     run: str,
     names: Sequence[str],
-    steady: str | None,
+    stabilized: str | None,
     dataset: str,
     previous: str,
     out: str,
@@ -38,7 +38,7 @@ def build_next_model(
     Args:
         run: folder of the subject folders.
         names: of the subject folders to use.
-        steady: folder of the stabilized set; None: neutrals alone.
+        stabilized: folder of the stabilized set; None: neutrals alone.
         dataset: its folder, for tags and categories.
         previous: file of the previous model.
         out: folder of the model.
@@ -53,8 +53,8 @@ def build_next_model(
     """
     source, data = read_dataset(Path(dataset)), gnm_npz.read(Path(previous))
     tags = {name: source.tags(name) for name in names}
-    stabilized = None if steady is None else Path(steady)
-    subjects = RegisteredSubjects(run=Path(run), names=names, model=data, steady=stabilized, tags=tags)
+    stabilized_set = None if stabilized is None else Path(stabilized)
+    subjects = RegisteredSubjects(run=Path(run), names=names, model=data, stabilized_set=stabilized_set, tags=tags)
     settings = ModelRecipe.from_json(recipe, where="the job's recipe")
     inputs = {**subjects.inputs, "previous": gnm_npz.content_hash(data)}
     config = {"recipe": hashing.to_jsonable(settings), "categories": source.categories, "tags": tags}
@@ -75,7 +75,7 @@ def build_next_model(
     )
     with atomic_directory(folder) as temporary:
         provenance.write(built.data, built.manifest, built.coefficients, temporary / MODEL, Path(previous))
-        (temporary / PAGE).write_text(write_model_page(built.data, built.manifest), encoding="utf-8")
+        (temporary / PAGE).write_text(render_model_page(built.data, built.manifest), encoding="utf-8")
         product.write(result, temporary)
     return result.to_json()
 

@@ -16,7 +16,7 @@ from registration.progress import Progress
 from registration.storage.files import atomic_directory, refuse_foreign
 from registration.storage.hashing import input_hash, to_jsonable, versions
 from registration.storage.records import Record
-from workflows.pages.evaluation import write_evaluate_page
+from workflows.pages.evaluation import render_evaluation_page
 from workflows.records.held_out import read_held_out
 from workflows.records.step_results import EvaluateResult
 
@@ -90,7 +90,7 @@ def evaluate_models(
 def evaluate_round(
     *,
     models: Mapping[str, str],
-    people: str,
+    held_out: str,
     out: str,
     components: Sequence[int],
     samples: int = 200,
@@ -101,7 +101,7 @@ def evaluate_round(
 
     Args:
         models: name -> file, the first model first.
-        people: file of the held-out subjects.
+        held_out: file of the held-out subjects.
         out: folder of the evaluation.
         components: requested numbers of components; those that a model does not have are omitted.
         samples: random heads of each model, for specificity.
@@ -118,7 +118,7 @@ def evaluate_round(
     counts = tuple(k for k in components if k <= available) or (available,)
     paths = {name: Path(path) for name, path in models.items()}
     settings = EvaluationSettings(components=counts, samples=samples, seed=seed)
-    manifest = evaluate_models(paths, held_out=Path(people), out=Path(out), settings=settings, progress=progress)
+    manifest = evaluate_models(paths, held_out=Path(held_out), out=Path(out), settings=settings, progress=progress)
     figures = manifest.figures["models"]
     return EvaluateResult(
         input_hash=manifest.input_hash,
@@ -187,4 +187,4 @@ def _write(manifest: EvaluationManifest, evaluation: ModelEvaluation, models: Ma
             models=np.array(list(distances)),
             distance_mm=np.stack(list(distances.values())),
         )
-        (temporary / PAGE).write_text(write_evaluate_page(evaluation, models, manifest.to_json()), encoding="utf-8")
+        (temporary / PAGE).write_text(render_evaluation_page(evaluation, models, manifest.to_json()), encoding="utf-8")

@@ -22,7 +22,7 @@ from workflows.records.training_subjects import (
 )
 from workflows.steps.products import Product
 
-PEOPLE = "people.npz"
+HELD_OUT = "held_out.npz"
 
 
 def hold_out(
@@ -49,10 +49,10 @@ def hold_out(
     digests = {"topology": gnm_npz.topology_hash(data.triangles)}
     for name in names:
         digests[name] = input_hash(_digests(source, Path(registrations), name, name in with_truths), source.tags(name))
-    file = Path(out) / PEOPLE
+    file = Path(out) / HELD_OUT
     product = Product(Path(out), input_hash(digests, {"categories": source.categories}), HoldOutResult)
     if (existing := product.find()) is not None and file.is_file():
-        return replace(existing, people=str(file)).to_json()
+        return replace(existing, file=str(file)).to_json()
     subjects, lost, skin = [], list[str](), SkullSkin.from_model(data)
     for name in names:
         meshes = true_meshes(source.subjects[name], data) if name in with_truths else None
@@ -64,7 +64,7 @@ def hold_out(
     write_held_out(subjects, data.triangles, file)
     result = HoldOutResult(
         input_hash=product.input_hash,
-        people=str(file),
+        file=str(file),
         sources={s.subject: "true meshes" if s.subject in with_truths else "registrations" for s in subjects},
         lost=tuple(lost),
     )

@@ -8,7 +8,7 @@ from typing import Any
 from coregister.stopping_rule import RoundMetrics, apply_stopping_rule
 from registration.progress import Progress
 from registration.storage.records import structure, to_json
-from workflows.pages.coregistration import write_coregistration_page
+from workflows.pages.coregistration import render_coregistration_page
 from workflows.records.coregistration import (
     FIRST_MODEL,
     CoregistrationPlan,
@@ -26,7 +26,7 @@ from workflows.records.subject import read_subject
 def end_round(
     *,
     plan: str,
-    people: Mapping[str, Any],
+    held_out: Mapping[str, Any],
     rounds: Sequence[Mapping[str, Any]],
     progress: Progress | None = None,
 ) -> dict[str, Any]:
@@ -34,7 +34,7 @@ def end_round(
 
     Args:
         plan: the file `plan.json`.
-        people: a `HoldOutResult` as JSON.
+        held_out: a `HoldOutResult` as JSON.
         rounds: all rounds so far, each a `RoundProducts` as JSON; the records of their subjects are read from disk.
         progress: unused; the step is short.
 
@@ -46,10 +46,10 @@ def end_round(
     """
     where = "arguments of the step"
     record = CoregistrationPlan.read(Path(plan))
-    held_out = HoldOutResult.from_json(people, where=where)
+    held_out_result = HoldOutResult.from_json(held_out, where=where)
     products: tuple[RoundProducts, ...] = structure(rounds, tuple[RoundProducts, ...], where=where, title="rounds")
-    state = apply_verdict(initial_state(record, held_out), products)
-    write_state(state, write_coregistration_page)
+    state = apply_verdict(initial_state(record, held_out_result), products)
+    write_state(state, render_coregistration_page)
     verdict: dict[str, Any] = to_json(state.verdict)
     return verdict
 

@@ -24,7 +24,7 @@ from registration.stabilize.pipeline import (
 )
 from registration.stabilize.stabilized_folder import StoredComponents
 from registration.storage.hashing import input_hash, to_jsonable, versions
-from workflows.pages.stabilization import write_stabilize_page
+from workflows.pages.stabilization import render_stabilization_page
 from workflows.records.decisions import read_decisions
 from workflows.records.run import STABILIZED, Selection, StabilizationInputs, read_run
 from workflows.records.step_results import StabilizeResult
@@ -102,7 +102,7 @@ def stabilize_run(
         )
         manifest.write(temporary / disk.MANIFEST)
         stabilized = (disk.read_subject(temporary, k) for k in range(len(inputs.subjects)))
-        page = write_stabilize_page(manifest, components, stabilized, head)
+        page = render_stabilization_page(manifest, components, stabilized, head)
         (temporary / disk.PAGE).write_text(page, encoding="utf-8")
     return StabilizationResult(out=out, dataset=dataset, figures=figures)
 

@@ -21,7 +21,7 @@ from registration.progress import NullProgress, PrefixedProgress, Progress
 from registration.storage import hashing
 from registration.storage.registration_folder import read_manifest, update_figures
 from registration.types import Capture, Registration
-from workflows.pages.subject import thumbnail, write_subject_page
+from workflows.pages.subject import render_subject_page, thumbnail
 from workflows.records.step_results import CaptureResult, CollectResult
 from workflows.records.subject import (
     CaptureRow,
@@ -185,7 +185,7 @@ class _SubjectWriter:
         self._save()
 
     def _save(self) -> None:
-        write_subject(self.subject, self.out, write_subject_page(self.subject, self._thumbnails))
+        write_subject(self.subject, self.out, render_subject_page(self.subject, self._thumbnails))
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -22,8 +22,8 @@ STEPS: Mapping[str, Step] = {
     STABILIZE: Step(function="workflows.steps.stabilize:stabilize_subjects", path_arguments=("run", "model", "out")),
     BUILD: Step(
         function="workflows.steps.build:build_next_model",
-        path_arguments=("run", "steady", "dataset", "previous", "out"),
+        path_arguments=("run", "stabilized", "dataset", "previous", "out"),
     ),
-    EVALUATE: Step(function="workflows.steps.evaluate:evaluate_round", path_arguments=("models", "people", "out")),
+    EVALUATE: Step(function="workflows.steps.evaluate:evaluate_round", path_arguments=("models", "held_out", "out")),
     END_ROUND: Step(function="workflows.steps.round:end_round", path_arguments=("plan",)),
 }

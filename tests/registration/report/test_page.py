@@ -10,7 +10,7 @@ import pytest
 from registration.report import heat_map as heat_maps
 from registration.report.charts import ChartLine, line_charts, loss_curves
 from registration.report.inputs import ReportInputs, distance_heat_map
-from registration.report.page import headline, write_report
+from registration.report.page import headline, render_report
 from registration.storage.hashing import versions
 from registration.types import Registration
 from tests.registration.report.test_pictures import a_view
@@ -97,7 +97,7 @@ def check_page(page: str) -> None:
 
 
 def test_a_full_page():
-    page = write_report(some_inputs())
+    page = render_report(some_inputs())
     check_page(page)
     for text in ("anna", "smile", "converged", "0.123", "1.46", "cam00", "cam01", "2.0 % excluded by normals"):
         assert text in page, text
@@ -111,7 +111,7 @@ def test_a_full_page():
 def test_an_empty_page_has_no_empty_sections():
     empty = {name: {} for name in ("seconds", "history", "figures", "config", "inputs")}
     registration = a_registration(status="failed", reason="no initial guess", **empty)
-    page = write_report(some_inputs(registration=registration, views=(), heat_map=None, versions={}))
+    page = render_report(some_inputs(registration=registration, views=(), heat_map=None, versions={}))
     check_page(page + '<a href="#"></a>')
     assert "<section" not in page and "The registration failed: no initial guess." in page
 
@@ -126,7 +126,7 @@ def test_names_are_escaped():
         class_names=(markup,),
         views=(a_view(name=markup),),
     )
-    page = write_report(inputs)
+    page = render_report(inputs)
     check_page(page)
     assert "<script>alert" not in page and "&lt;script&gt;alert" in page
 
@@ -174,12 +174,12 @@ def test_remarks_name_low_weights_exclusions_and_intersections():
         "views_not_trusted": {"cam03": "silhouette 35 px off the other views"},
         "intersections": {"pairs": {"tongue in gums": row, "ears in skin": {**row, "vertices_beyond_0.3mm": 0}}},
     }
-    page = write_report(some_inputs(registration=a_registration(figures=figures)))
+    page = render_report(some_inputs(registration=a_registration(figures=figures)))
     assert "<li>View cam03 has a low weight: silhouette 35 px off the other views.</li>" in page
     assert "<li>Landmarks 2-6 of scheme 68 do not fit" in page
     assert "<li>Tongue in gums: 2 vertices deeper than in the template, by up to 0.830 mm.</li>" in page
     assert "Ears in skin" not in page
-    assert "<ul>" not in write_report(some_inputs())
+    assert "<ul>" not in render_report(some_inputs())
 
 
 def test_hidden_panels_when_stages_do_not_fill_a_row():

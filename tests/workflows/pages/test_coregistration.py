@@ -3,7 +3,7 @@
 import re
 from typing import Any
 
-from workflows.pages.coregistration import write_coregistration_page
+from workflows.pages.coregistration import render_coregistration_page
 
 PLAN = {
     "dataset": "/data/a<b>",
@@ -33,7 +33,7 @@ def a_round(name: str) -> dict[str, Any]:
 
 
 def test_a_run_without_rounds_has_a_page():
-    page = write_coregistration_page(EMPTY)
+    page = render_coregistration_page(EMPTY)
     assert "The first round is not done yet." in page
     assert "a&lt;b&gt;" in page and "<b>" not in page and "<script" not in page
 
@@ -41,7 +41,7 @@ def test_a_run_without_rounds_has_a_page():
 def test_rounds_link_to_their_results_and_failures_are_listed():
     curves = {"model 0": {"5": 1.5}, "model 1": {"5": 1.25}}
     verdict = {"proceed": False, "reason": "no gain"}
-    page = write_coregistration_page(
+    page = render_coregistration_page(
         EMPTY | {"rounds": [a_round("it 00")], "generalization_mm": curves, "at": 5, "verdict": verdict, "lost": ["z<"]}
     )
     links = [link for link in re.findall(r'href="([^"]*)"', page) if not link.startswith("#")]

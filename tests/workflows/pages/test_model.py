@@ -29,7 +29,7 @@ def test_the_page_shows_components_tables_and_rejected_subjects(monkeypatch):
     built = build_model(subjects, data)
     for name, value in {"IDENTITY": 2, "EXPRESSION": 1, "SIZE": (48, 52)}.items():
         monkeypatch.setattr(model, name, value)
-    page = model.write_model_page(built.data, built.manifest)
+    page = model.render_model_page(built.data, built.manifest)
     image_count = page.count('class="zoom"')
     assert image_count == 2 * 2 * (2 + len(built.manifest["expression"]))  # sides, ends, components
     for text in ("head_000, +2", "lower_face_region_000, −2", "p&lt;3&gt;", "20-29", "smile", "<svg"):

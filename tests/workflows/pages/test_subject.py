@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 
 from tests.registration.report.test_page import a_registration
-from workflows.pages.subject import thumbnail, write_subject_page
+from workflows.pages.subject import render_subject_page, thumbnail
 from workflows.records.subject import CaptureRow, SubjectRecord
 
 
@@ -17,7 +17,7 @@ def a_subject(*rows: CaptureRow) -> SubjectRecord:
 
 def test_the_page_shows_every_row_and_is_self_contained():
     figures = {"scan_to_mesh": {"face": {"mean_mm": 0.1234, "median_mm": 0.0456}}, "drift": {"face": {"mean_mm": 0.5}}}
-    page = write_subject_page(
+    page = render_subject_page(
         a_subject(
             CaptureRow(
                 name="rest", expression="neutral", status="converged", figures=figures, seconds=66.4, folder="rest"

@@ -72,7 +72,7 @@ def assert_refused(read: Callable[[], object], file: object, field: str = "") ->
 
 def read_registered(run: Path) -> object:
     data = gnm_npz.read(MODEL)
-    return RegisteredSubjects(run=run, names=["ann"], model=data, steady=None).usable
+    return RegisteredSubjects(run=run, names=["ann"], model=data, stabilized_set=None).usable
 
 
 def end_a_round(run: Path) -> object:
@@ -204,7 +204,7 @@ def test_a_malformed_artifact_is_refused(tmp_path: Path, damage: Callable[[dict[
 def test_a_product_is_looked_up_by_its_inputs_and_refused_if_malformed(tmp_path: Path) -> None:
     product = Product(tmp_path, "h", HoldOutResult)
     assert product.find() is None
-    result = HoldOutResult(input_hash="h", people="people.npz", sources={"ann": "registrations"}, lost=("bob",))
+    result = HoldOutResult(input_hash="h", file="held_out.npz", sources={"ann": "registrations"}, lost=("bob",))
     product.write(result)
     assert product.find() == result
     assert Product(tmp_path, "other", BuildResult).find() is None  # of other inputs, or of another version
@@ -213,7 +213,7 @@ def test_a_product_is_looked_up_by_its_inputs_and_refused_if_malformed(tmp_path:
         (truncated(result.to_json()), ""),
         ("[]", ""),
         (without("input_hash")(result.to_json()), ""),
-        (without("people")(result.to_json()), "people"),
+        (without("file")(result.to_json()), "file"),
         (with_("lost", [3])(result.to_json()), "lost[0]"),
     ):
         file.write_text(text)

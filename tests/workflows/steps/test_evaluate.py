@@ -53,20 +53,20 @@ def inputs(model, tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("evaluate")
     gnm_npz.write(model, folder / "own.npz")
     gnm_npz.write(with_identity(model, np.roll(model.vertex_identity_basis, -1, 0)), folder / "weak.npz")
-    np.savez(folder / "people.npz", **meshes(model))
+    np.savez(folder / "held_out.npz", **meshes(model))
     return folder
 
 
 @pytest.fixture(scope="module")
 def out(inputs) -> Path:
     paths = [inputs / "weak.npz", inputs / "own.npz"]
-    evaluate_models(paths, held_out=inputs / "people.npz", out=inputs / "out", settings=SETTINGS)
+    evaluate_models(paths, held_out=inputs / "held_out.npz", out=inputs / "out", settings=SETTINGS)
     return inputs / "out"
 
 
 def test_a_file_of_meshes_is_read_by_subject(inputs, model):
     arrays = meshes(model)
-    held_out = read_held_out(inputs / "people.npz")
+    held_out = read_held_out(inputs / "held_out.npz")
     assert [subject.subject for subject in held_out.subjects] == list(NAMES)
     for number, subject in enumerate(held_out.subjects):
         np.testing.assert_array_equal(subject.neutral, arrays["vertices"][6 + number])
@@ -140,19 +140,19 @@ def test_an_existing_result_is_reused_and_another_seed_is_computed(inputs, out, 
     monkeypatch.setattr(workflows.steps.evaluate, "evaluate", lambda *a: calls.append(1) or real(*a))
     paths = [inputs / "weak.npz", inputs / "own.npz"]
     saved = json.loads((out / "manifest.json").read_text())
-    again = evaluate_models(paths, held_out=inputs / "people.npz", out=out, settings=SETTINGS)
+    again = evaluate_models(paths, held_out=inputs / "held_out.npz", out=out, settings=SETTINGS)
     assert again.to_json() == saved and not calls
     other = EvaluationSettings(components=(2, 4), samples=3, draws=200, seed=1)
-    changed = evaluate_models(paths, held_out=inputs / "people.npz", out=out, settings=other)
+    changed = evaluate_models(paths, held_out=inputs / "held_out.npz", out=out, settings=other)
     assert len(calls) == 1 and changed.input_hash != saved["input_hash"]
-    back = evaluate_models(paths, held_out=inputs / "people.npz", out=out, settings=SETTINGS)
+    back = evaluate_models(paths, held_out=inputs / "held_out.npz", out=out, settings=SETTINGS)
     assert back.to_json() == saved
 
 
 def test_the_command_prints_the_metrics(inputs, tmp_path, capsys):
     arguments = ["model", "evaluate", str(inputs / "weak.npz"), str(inputs / "own.npz"), "--held-out"]
     options = ["--components", "2", "4", "--samples", "2"]
-    assert main([*arguments, str(inputs / "people.npz"), "--out", str(tmp_path / "out"), *options]) == 0
+    assert main([*arguments, str(inputs / "held_out.npz"), "--out", str(tmp_path / "out"), *options]) == 0
     printed = capsys.readouterr().out
     assert "own, 12 components: generalization 0.000 mm" in printed
     assert "own, 4 components: gain" in printed and str(tmp_path / "out" / "index.html") in printed
@@ -160,7 +160,7 @@ def test_the_command_prints_the_metrics(inputs, tmp_path, capsys):
 
 @pytest.mark.parametrize("options", [["--components", "2", "13"], ["--components", "4", "2"], ["--samples", "-1"]])
 def test_bad_settings_are_refused_before_anything_is_written(inputs, tmp_path, capsys, options):
-    arguments = ["model", "evaluate", str(inputs / "own.npz"), "--held-out", str(inputs / "people.npz")]
+    arguments = ["model", "evaluate", str(inputs / "own.npz"), "--held-out", str(inputs / "held_out.npz")]
     assert main([*arguments, "--out", str(tmp_path / "out"), *options]) == 2
     assert "fix:" in capsys.readouterr().err and not (tmp_path / "out").exists()
 
@@ -169,7 +169,7 @@ def test_foreign_folders_and_duplicate_models_are_refused(inputs, tmp_path):
     (tmp_path / "notes.txt").write_text("mine")
     for paths, out in (([inputs / "own.npz"], tmp_path), ([inputs / "own.npz"] * 2, tmp_path / "out")):
         with pytest.raises(InputError):
-            evaluate_models(paths, held_out=inputs / "people.npz", out=out, settings=SETTINGS)
+            evaluate_models(paths, held_out=inputs / "held_out.npz", out=out, settings=SETTINGS)
     assert (tmp_path / "notes.txt").read_text() == "mine"
 
 
