@@ -151,7 +151,7 @@ ATTACKS: dict[str, tuple[Callable[[Path], None], str]] = {
     "an image named ../..": (name_outside("../../../secret.png"), "image name cannot be used"),
     "an image named from /": (name_outside("/etc/secret.png"), "image name cannot be used"),
     "an image bomb": (bomb_image, "too many pixels"),
-    "a truth that is a pickle": (pickle_truth, "ground truth cannot be read"),
+    "a truth that is a pickle": (pickle_truth, "ground truth's field 'vertices' cannot be read"),
     "a truth that is a bomb": (bomb_truth, "ground truth cannot be read"),
     "a model with a pickle": (pickle_model, "head model"),
     "a model that is a pickle": (raw_pickle, "head model"),
