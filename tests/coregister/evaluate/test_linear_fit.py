@@ -54,9 +54,9 @@ def test_fewer_components_leave_the_residual_of_the_others(model, part):
         fits = linear_fit.fit_correspondence(part, shape, RANKS)
         rms[row] = [np.sqrt((fit.distance_mm**2).mean()) for fit in fits]
     for column, count in enumerate(RANKS):
-        own = np.sqrt((coefficients[:, count:] ** 2 * DEVIATIONS_MM[count:] ** 2).sum(1))  # of this sample
-        assert (rms[:, column] <= own + 1e-6).all()  # a rotation hardly reduces it
-        np.testing.assert_allclose(rms[:, column], own, rtol=2e-3, atol=1e-6)
+        residual_mm = np.sqrt((coefficients[:, count:] ** 2 * DEVIATIONS_MM[count:] ** 2).sum(1))  # of this sample
+        assert (rms[:, column] <= residual_mm + 1e-6).all()  # a rotation hardly reduces it
+        np.testing.assert_allclose(rms[:, column], residual_mm, rtol=2e-3, atol=1e-6)
         expected = (DEVIATIONS_MM[count:] ** 2).sum()
         assert (rms[:, column] ** 2).mean() == pytest.approx(expected, rel=0.15, abs=1e-9)  # mean of 200 samples
 

@@ -228,9 +228,9 @@ def test_tongue_components_displace_only_the_tongue(model):
 
 def test_identity_displacements_are_linear_and_symmetric(source, head_assembly):
     nose, ears = source.target("nose/nose-hump-incr"), source.target("head/head-oval")
-    apart = [np.concatenate(head_assembly.identity_displacement(d)) for d in (nose, ears)]
-    together = np.concatenate(head_assembly.identity_displacement(nose + 2 * ears))
-    np.testing.assert_allclose(together, apart[0] + 2 * apart[1], atol=1e-9)
+    separate = [np.concatenate(head_assembly.identity_displacement(d)) for d in (nose, ears)]
+    combined = np.concatenate(head_assembly.identity_displacement(nose + 2 * ears))
+    np.testing.assert_allclose(combined, separate[0] + 2 * separate[1], atol=1e-9)
     vertices, joints = head_assembly.identity_displacement(ears)
     symmetric = vertices[head_assembly.mirror] * (-1, 1, 1)
     np.testing.assert_allclose(symmetric, vertices, atol=0.3e-3)  # MakeHuman's targets are not exactly symmetric

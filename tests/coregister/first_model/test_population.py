@@ -127,7 +127,7 @@ def test_components_are_scaled_by_the_standard_deviation_of_the_people(projected
 def test_components_are_ordered_by_displacement(model):
     rows = np.char.startswith(model.identity_names, "head")
     magnitudes = np.sqrt((model.vertex_identity_basis[rows].astype(np.float64) ** 2).sum((1, 2)))
-    # PCA was of vertices and joints together, so a component may be a little out of order in the vertices alone.
+    # The PCA included the joints, so components may be slightly out of order in the vertices alone.
     assert (magnitudes[1:] < 1.02 * magnitudes[:-1]).all()
 
 

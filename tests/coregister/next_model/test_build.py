@@ -178,9 +178,9 @@ def test_a_built_model_can_be_the_previous_model(built: BuiltModel, subjects):
     assert again.data.expression_names.tolist()[-1] == built.data.expression_names.tolist()[-1] == "pupils_000"
     assert again.manifest["inputs"]["previous"] == built.manifest["content_id"]
     # Regressors that are rebuilt round after round keep the joints.
-    one, two = built.data, again.data
-    positions = two.joint_regressor @ one.template_vertex_positions
-    assert 1e3 * np.abs(positions - one.template_joint_positions).max() < 0.5
+    first, second = built.data, again.data
+    positions = second.joint_regressor @ first.template_vertex_positions
+    assert 1e3 * np.abs(positions - first.template_joint_positions).max() < 0.5
 
 
 def test_shrinkage_is_cross_validated_and_reported(subjects, model):

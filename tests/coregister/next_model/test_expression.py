@@ -128,7 +128,7 @@ def test_the_jaw_moves_rigidly_to_first_order(model):
 
 
 def test_an_open_jaw_moves_the_lower_teeth(displacements, bases, head_assembly, model):
-    """Ground truth: the motion of MakeHuman's own teeth."""
+    """Ground truth: the motion of MakeHuman's teeth."""
     number = EXPRESSIONS.index("jaw_open")
     skin, parts = regions.skin(model), regions.jaw_parts(model)
     flat = np.concatenate([r.basis[:, skin].reshape(len(r.basis), -1) for r in bases.values()])

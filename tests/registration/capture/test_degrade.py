@@ -401,5 +401,5 @@ def test_degraded_heads_are_valid_captures(name: str, preset: str, tmp_path: Pat
     assert report.eye_distance_mm == pytest.approx(check_capture(source).eye_distance_mm, abs=5)
     points = read_scan(source / "scan.ply").vertices
     for before, after in pairs(source, tmp_path / "copy"):
-        moved = after.camera.project(points)[0] - before.camera.project(points)[0]
-        assert np.sqrt((moved**2).sum(-1).mean()) == pytest.approx(PRESETS[preset].camera_rms_px, rel=0.05)
+        displacement_px = after.camera.project(points)[0] - before.camera.project(points)[0]
+        assert np.sqrt((displacement_px**2).sum(-1).mean()) == pytest.approx(PRESETS[preset].camera_rms_px, rel=0.05)

@@ -211,8 +211,8 @@ def test_the_contact_sheet_shows_landmarks_scan_and_mask_in_position(tmp_path: P
         assert near(tile, *xy[index], GREEN)
     assert near(tile, *xy[36], MAGENTA, reach_px=5) and not near(tile, *xy[36], GREEN, reach_px=3)
     assert near(tile, (xy[36][0] + xy[36][0] - 9 * TILE_WIDTH_PX / 120) / 2, xy[36][1], RED, reach_px=4)
-    rim = np.array([[0, 0.09 * np.sqrt(1 - (0.09 / 0.45) ** 2), 0]])  # near the top of the ball's outline
-    x, y = cam.project(rim)[0][0]
+    outline_point = np.array([[0, 0.09 * np.sqrt(1 - (0.09 / 0.45) ** 2), 0]])  # near the top of the ball's outline
+    x, y = cam.project(outline_point)[0][0]
     assert any(near(tile, x, y + offset, YELLOW) for offset in range(-8, 9, 2))
     blue = (np.abs(tile.astype(int) - BLUE).max(-1) < 30).nonzero()
     assert len(blue[0]) > 300

@@ -101,8 +101,8 @@ def test_the_rate_follows_its_schedule():
     class Recorder:
         tensors = (torch.zeros(1, requires_grad=True),)
 
-        def step(self, share: float) -> None:
-            progress.append(share)
+        def step(self, fraction: float) -> None:
+            progress.append(fraction)
 
     block = Recorder()
     minimize([block], lambda step: {"a": block.tensors[0].sum()}, 5)

@@ -73,10 +73,10 @@ def test_eyeballs_keep_their_shape() -> None:
         variables["eyes"].zero_()
         rest = variables.vertices(variables.skin_offsets())
         variables["eyes"].copy_(torch.tensor([[1e-3, 0, 2e-3, 0.05], [0, 0, 0, 0]]))
-        moved = variables.vertices(variables.skin_offsets())
+        displaced = variables.vertices(variables.skin_offsets())
     left, right = variables._eyes
-    assert torch.equal(rest[right], moved[right])
-    sizes = [torch.pdist(mesh[left][::7]) for mesh in (rest, moved)]
+    assert torch.equal(rest[right], displaced[right])
+    sizes = [torch.pdist(mesh[left][::7]) for mesh in (rest, displaced)]
     torch.testing.assert_close(sizes[1], sizes[0] * float(np.exp(0.05)), rtol=1e-3, atol=1e-6)
 
 

@@ -182,9 +182,9 @@ def test_eyes_and_lips_are_compared_only_where_classes_agree():
     """An eye on skin, or a miss, is not compared; half a lip or a soft border is."""
     pixels = Pixels.from_mask([camera()], torch.arange(HEIGHT * WIDTH).reshape(1, HEIGHT, WIDTH) < 5)
     target = targets(pixels)
-    shares = [[1.0, 0, 0], [1, 0, 0], [0, 1, 0], [0.4, 0.6, 0], [0, 0, 1]]
+    class_weights = [[1.0, 0, 0], [1, 0, 0], [0, 1, 0], [0.4, 0.6, 0], [0, 0, 1]]
     rendered = [[1.0, 0, 0], [0, 1, 0], [0, 1, 0], [0.6, 0.4, 0], [0, 1, 0]]
-    target = replace(target, classes=torch.tensor(shares, dtype=torch.float64))
+    target = replace(target, classes=torch.tensor(class_weights, dtype=torch.float64))
     shown = replace(same(target), classes=torch.tensor(rendered, dtype=torch.float64))
     assert image.pixel_agreement(shown, target, [1, 2]).tolist() == [True, False, True, True, False]
     assert image.pixel_agreement(shown, target, []).all()

@@ -52,8 +52,8 @@ def template(data: GNMData) -> torch.Tensor:
 
 
 def posed(vertices: torch.Tensor, scale: float) -> torch.Tensor:
-    turn = torch.as_tensor(Rotation.from_rotvec([0.5, -0.8, 0.3]).as_matrix(), dtype=vertices.dtype)
-    return scale * vertices @ turn.T + torch.tensor([0.7, -0.3, 1.1], dtype=vertices.dtype)
+    rotation = torch.as_tensor(Rotation.from_rotvec([0.5, -0.8, 0.3]).as_matrix(), dtype=vertices.dtype)
+    return scale * vertices @ rotation.T + torch.tensor([0.7, -0.3, 1.1], dtype=vertices.dtype)
 
 
 def squeezed(data: GNMData) -> torch.Tensor:
@@ -180,8 +180,8 @@ def outside(data: GNMData, vertices: torch.Tensor, excess: torch.Tensor) -> np.n
 def test_skin_at_the_mouth_corners_is_not_inside_the_other_lip(full, penalty):
     """Pursed lips: behind the skin next to them, through the interior, lies the oral lining of the other lip."""
     vertices, random = template(full).numpy().astype(np.float64), np.random.default_rng(5)
-    for basis, share in ((full.expression_basis[200:350], 0.5), (full.expression_basis[350:382], 0.3)):
-        vertices = vertices + np.einsum("e,evc->vc", random.normal(size=len(basis)) * share, basis)
+    for basis, scale in ((full.expression_basis[200:350], 0.5), (full.expression_basis[350:382], 0.3)):
+        vertices = vertices + np.einsum("e,evc->vc", random.normal(size=len(basis)) * scale, basis)
     basis = full.vertex_identity_basis
     head = torch.as_tensor(vertices + np.einsum("e,evc->vc", random.normal(size=len(basis)), basis)).float()
     penalty.update_candidates(head)

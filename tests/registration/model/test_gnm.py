@@ -91,25 +91,27 @@ def test_the_rest_pose_is_the_template():
 def test_the_root_rotates_about_the_neck_and_scale_precedes_translation():
     data = tiny_model()
     model = GNM(data, torch.float64)
-    turn = torch.zeros(4, 3, dtype=torch.float64)
-    turn[0, 1] = np.pi / 2
+    rotations = torch.zeros(4, 3, dtype=torch.float64)
+    rotations[0, 1] = np.pi / 2
     shift = torch.tensor([0.1, -0.2, 0.3], dtype=torch.float64)
-    moved = model(replace(model.neutral(), rotations=turn, translation=shift, scale=torch.tensor(2.0).double()))
+    transformed = model(
+        replace(model.neutral(), rotations=rotations, translation=shift, scale=torch.tensor(2.0).double())
+    )
     neck = data.template_joint_positions[0].astype(np.float64)
     x, y, z = (data.template_vertex_positions.astype(np.float64) - neck).T
     expected = 2 * (np.stack([z, y, -x], 1) + neck) + shift.numpy()
-    np.testing.assert_allclose(moved.numpy(), expected, atol=1e-6)
+    np.testing.assert_allclose(transformed.numpy(), expected, atol=1e-6)
 
 
 def test_eyes_follow_the_head():
     """Rotating the head by a and the eyes by -a about parallel axes keeps an eye's orientation."""
     data = tiny_model()
     model = GNM(data, torch.float64)
-    turn = torch.zeros(4, 3, dtype=torch.float64)
-    turn[1, 1], turn[2:, 1] = 0.4, -0.4
+    rotations = torch.zeros(4, 3, dtype=torch.float64)
+    rotations[1, 1], rotations[2:, 1] = 0.4, -0.4
     eye = data.vertex_groups[data.vertex_group_names.tolist().index("left_eye")] > 0
     before = model(model.neutral())[eye]
-    after = model(replace(model.neutral(), rotations=turn))[eye]
+    after = model(replace(model.neutral(), rotations=rotations))[eye]
     torch.testing.assert_close(after - after.mean(0), before - before.mean(0), rtol=0, atol=1e-6)
     assert (after.mean(0) - before.mean(0)).norm() > 0.02
 
@@ -118,10 +120,10 @@ def test_batch_equals_one_by_one():
     model = GNM(with_correctives(tiny_model()), torch.float64)
     p = random_parameters(model, 2, 3)
     offsets = 1e-3 * torch.randn(len(model.weights), 3, dtype=torch.float64)
-    together = model(p, offsets)
-    assert together.shape == (2, 3, len(model.weights), 3)
+    batched = model(p, offsets)
+    assert batched.shape == (2, 3, len(model.weights), 3)
     single = Parameters(**{f.name: getattr(p, f.name)[1, 2] for f in fields(p)})
-    torch.testing.assert_close(together[1, 2], model(single, offsets))
+    torch.testing.assert_close(batched[1, 2], model(single, offsets))
     each = torch.randn(2, 3, len(model.weights), 3, dtype=torch.float64)
     torch.testing.assert_close(model(p, each)[1, 2], model(single, each[1, 2]))
 
@@ -185,5 +187,5 @@ def test_the_real_posed_example_is_reproduced():
     joints = torch.from_numpy(real["bind_joints"]).double()
     posed = model.skin(bind, joints, axis_angle_to_matrix(torch.from_numpy(real["posed_rotations"]).double()))
     assert (posed - bind - torch.from_numpy(real["posed_vertex_delta"])).norm(dim=-1).max() < 1e-6
-    own = model.joints(torch.from_numpy(real["reconstructed_identity_coefficients"][who]).double())
-    torch.testing.assert_close(own, joints, rtol=0, atol=1e-6)
+    computed = model.joints(torch.from_numpy(real["reconstructed_identity_coefficients"][who]).double())
+    torch.testing.assert_close(computed, joints, rtol=0, atol=1e-6)

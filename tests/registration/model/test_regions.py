@@ -26,27 +26,29 @@ def without(data: gnm_npz.GNMData, name: str) -> gnm_npz.GNMData:
 
 
 def test_class_weights_are_fractions_of_the_groups(tiny):
-    names, shares = regions.vertex_classes(tiny)
+    names, weights = regions.vertex_classes(tiny)
     assert names == ("skin", "left_eye", "right_eye", "upper_lip", "lower_lip", "ears", "mouth_interior")
-    np.testing.assert_allclose(shares.sum(1), 1, atol=1e-6)
+    np.testing.assert_allclose(weights.sum(1), 1, atol=1e-6)
     for name in ("left_eye", "right_eye", "upper_lip", "lower_lip", "ears"):
-        np.testing.assert_array_equal(shares[:, names.index(name)], regions.group(tiny, name))
+        np.testing.assert_array_equal(weights[:, names.index(name)], regions.group(tiny, name))
     inside = np.max([regions.group(tiny, name) for name in ("mouth_sock", "teeth", "gums", "tongue")], axis=0)
-    np.testing.assert_array_equal(shares[:, -1], inside)
-    assert (regions.group(tiny, "skin")[shares[:, 0] > 0] == 1).all()
+    np.testing.assert_array_equal(weights[:, -1], inside)
+    assert (regions.group(tiny, "skin")[weights[:, 0] > 0] == 1).all()
 
 
 def test_fractional_memberships_stay_fractional(tiny):
     groups = tiny.vertex_groups.copy()
     names = tiny.vertex_group_names.tolist()
-    at = int(regions.group(tiny, "upper_lip").argmax())
-    groups[:, at] = 0
-    groups[names.index("skin"), at] = 1
-    groups[names.index("upper_lip"), at] = 0.25
-    np.testing.assert_allclose(regions.vertex_classes(replace(tiny, vertex_groups=groups))[1][at, [0, 3]], [0.75, 0.25])
-    groups[names.index("upper_lip"), at] = groups[names.index("lower_lip"), at] = 1
-    shares = regions.vertex_classes(replace(tiny, vertex_groups=groups))[1][at]
-    np.testing.assert_allclose(shares[[0, 3, 4]], [0, 0.5, 0.5])
+    vertex = int(regions.group(tiny, "upper_lip").argmax())
+    groups[:, vertex] = 0
+    groups[names.index("skin"), vertex] = 1
+    groups[names.index("upper_lip"), vertex] = 0.25
+    np.testing.assert_allclose(
+        regions.vertex_classes(replace(tiny, vertex_groups=groups))[1][vertex, [0, 3]], [0.75, 0.25]
+    )
+    groups[names.index("upper_lip"), vertex] = groups[names.index("lower_lip"), vertex] = 1
+    weights = regions.vertex_classes(replace(tiny, vertex_groups=groups))[1][vertex]
+    np.testing.assert_allclose(weights[[0, 3, 4]], [0, 0.5, 0.5])
 
 
 @pytest.mark.parametrize(
@@ -89,8 +91,8 @@ def test_vertices_of_no_component_are_refused(tiny):
 
 @needs_shared
 def test_full_head(full):
-    names, shares = regions.vertex_classes(full)
-    assert dict(zip(names, shares.sum(0).tolist(), strict=True)) == {
+    names, weights = regions.vertex_classes(full)
+    assert dict(zip(names, weights.sum(0).tolist(), strict=True)) == {
         "skin": 10716,
         "left_eye": 771,
         "right_eye": 771,
@@ -106,7 +108,7 @@ def test_full_head(full):
     assert upper > lower
     exterior = regions.exterior(full)
     assert exterior.sum() == 11460 and not exterior[regions.group(full, "mouth_sock") > 0].any()
-    assert exterior[shares[:, 3] + shares[:, 4] > 0].all() and (part[exterior] == 0).all()
+    assert exterior[weights[:, 3] + weights[:, 4] > 0].all() and (part[exterior] == 0).all()
     neck = regions.neck_other(full)
     x, y, z = full.template_vertex_positions.T
     assert neck[(part == 0) & (y < 0.15)].all() and not neck[y > 0.19].any() and 2000 < neck.sum() < 2500
@@ -152,9 +154,9 @@ def test_solids_partition_the_triangles(tiny):
     solids = regions.solids(tiny)
     assert list(solids) == ["skin", "left eye", "right eye", "teeth", "tongue"]
     part = dict(zip(tiny.mesh_component_names.tolist(), range(6), strict=True))
-    own = regions.components(tiny)
+    components = regions.components(tiny)
     for role, names in {"skin": ["skin"], "teeth": ["upper_teeth_and_gums", "lower_teeth_and_gums"]}.items():
-        assert set(own[solids[role]].ravel()) == {part[name] for name in names}
+        assert set(components[solids[role]].ravel()) == {part[name] for name in names}
     assert sorted(map(tuple, np.concatenate(list(solids.values())))) == sorted(map(tuple, tiny.triangles))
     with pytest.raises(InputError, match="no vertex group 'lower_teeth_and_gums'"):
         regions.solids(without(tiny, "lower_teeth_and_gums"))

@@ -17,7 +17,7 @@ from registration.types import Registration
 from tests.registration.register.synthetic import MODEL, Truth, make
 
 
-class Notes:
+class RecordedProgress:
     """A progress that records its calls."""
 
     def __init__(self) -> None:
@@ -40,7 +40,7 @@ class Run:
     truth: Truth
     out: Path
     result: Registration
-    progress: Notes
+    progress: RecordedProgress
 
     @property
     def error_mm(self) -> np.ndarray:
@@ -48,7 +48,7 @@ class Run:
         return 1e3 * np.linalg.norm(self.result.vertices - self.truth.vertices, axis=1)
 
 
-class Beside:
+class RegisterProcess:
     """`gnmreg register` in a separate process."""
 
     def __init__(self, truth: Truth, out: Path, *options: str):
@@ -57,18 +57,18 @@ class Beside:
         self._process = subprocess.Popen(
             [*command, "--out", str(out), *options], text=True, stdout=subprocess.PIPE, stderr=subprocess.PIPE
         )
-        self._ended: Run | None = None
+        self._result: Run | None = None
         self.stdout = ""
 
     def run(self) -> Run:
         """Wait for the process; the messages are the lines of its log."""
-        if self._ended is None:
+        if self._result is None:
             self.stdout, log = self._process.communicate(timeout=600)
             assert self._process.returncode == 0, log
-            progress = Notes()
+            progress = RecordedProgress()
             progress.notes = log.splitlines()
-            self._ended = Run(truth=self.truth, out=self.out, result=load_registration(self.out), progress=progress)
-        return self._ended
+            self._result = Run(truth=self.truth, out=self.out, result=load_registration(self.out), progress=progress)
+        return self._result
 
     def end(self) -> None:
         self._process.kill()
@@ -76,7 +76,7 @@ class Beside:
 
 
 def run(truth: Truth, out: Path, options: RegisterOptions = RegisterOptions(), **settings) -> Run:  # noqa: B008
-    progress = Notes()
+    progress = RecordedProgress()
     result = register(truth.root, MODEL, out, options, progress=progress, **settings)
     return Run(truth=truth, out=out, result=result, progress=progress)
 
@@ -92,50 +92,50 @@ def neutral(folder: Path) -> Truth:
 
 
 @pytest.fixture(scope="session")
-def again_beside(neutral: Truth, folder: Path) -> Iterator[Beside]:
-    beside = Beside(neutral, folder / "out" / "again")
-    yield beside
-    beside.end()
+def again_process(neutral: Truth, folder: Path) -> Iterator[RegisterProcess]:
+    process = RegisterProcess(neutral, folder / "out" / "again")
+    yield process
+    process.end()
 
 
 @pytest.fixture(scope="session")
-def registered(neutral: Truth, again_beside: Beside, folder: Path) -> Run:
+def registered(neutral: Truth, again_process: RegisterProcess, folder: Path) -> Run:
     """The neutral with default options."""
     return run(neutral, folder / "out" / "neutral")
 
 
 @pytest.fixture(scope="session")
-def again(again_beside: Beside) -> Run:
-    """The same registration again."""
-    return again_beside.run()
+def again(again_process: RegisterProcess) -> Run:
+    """A repetition of the registration."""
+    return again_process.run()
 
 
 @pytest.fixture(scope="session")
-def without_landmarks_beside(neutral: Truth, folder: Path) -> Iterator[Beside]:
+def without_landmarks_process(neutral: Truth, folder: Path) -> Iterator[RegisterProcess]:
     root = folder / "without_landmarks"
     shutil.copytree(neutral.root, root, ignore=shutil.ignore_patterns("landmarks"))
-    beside = Beside(replace(neutral, root=root), folder / "out" / "without_landmarks")
-    yield beside
-    beside.end()
+    process = RegisterProcess(replace(neutral, root=root), folder / "out" / "without_landmarks")
+    yield process
+    process.end()
 
 
 @pytest.fixture(scope="session")
-def without_landmarks(without_landmarks_beside: Beside) -> Run:
+def without_landmarks(without_landmarks_process: RegisterProcess) -> Run:
     """The neutral with its landmark files hidden."""
-    return without_landmarks_beside.run()
+    return without_landmarks_process.run()
 
 
 @pytest.fixture(scope="session")
-def smile(registered: Run, again: Run, without_landmarks_beside: Beside, folder: Path) -> Run:
+def smile(registered: Run, again: Run, without_landmarks_process: RegisterProcess, folder: Path) -> Run:
     """Another expression of the subject, from its neutral."""
     return run(make(folder / "smile", "smile"), folder / "out" / "smile", neutral=registered.out)
 
 
 @pytest.fixture(scope="session")
-def deterministic(neutral: Truth, folder: Path) -> Iterator[list[Beside]]:
+def deterministic(neutral: Truth, folder: Path) -> Iterator[list[RegisterProcess]]:
     """Two runs side by side with `--deterministic`, three views and another seed."""
     options = ("--views", "3", "--seed", "5", "--deterministic")
-    pair = [Beside(neutral, folder / "out" / f"deterministic_{i}", *options) for i in range(2)]
+    pair = [RegisterProcess(neutral, folder / "out" / f"deterministic_{i}", *options) for i in range(2)]
     yield pair
-    for beside in pair:
-        beside.end()
+    for process in pair:
+        process.end()

@@ -76,8 +76,8 @@ def make(root: Path, expression: str = "neutral") -> Truth:
     views = []
     for number, (camera, image) in enumerate(zip(cameras, images, strict=True)):
         points = scheme.points(vertices)
-        seen = visible(points, vertices, data.triangles, camera, 2e-3)
-        landmarks = np.column_stack([camera.project(points)[0], np.where(seen, 1.0, 0.2)])
+        is_visible = visible(points, vertices, data.triangles, camera, 2e-3)
+        landmarks = np.column_stack([camera.project(points)[0], np.where(is_visible, 1.0, 0.2)])
         views.append(_view(f"cam{number}", camera, image, GAINS[number], landmarks))
     write_capture(
         root,

@@ -18,7 +18,7 @@ from registration.pipeline import register
 from registration.render import backend
 from registration.storage.registration_folder import FILES, load_registration
 from registration.types import Parameters, Registration
-from tests.registration.register.conftest import Beside, Run
+from tests.registration.register.conftest import RegisterProcess, Run
 from tests.registration.register.synthetic import GAINS, MODEL
 from workflows.cli.app import main
 
@@ -155,8 +155,8 @@ def test_equal_seeds_give_equal_results(registered: Run, again: Run):
     assert motion.max() < 0.01
 
 
-def test_deterministic_runs_are_bitwise_equal(deterministic: list[Beside]):
-    first, second = (beside.run().out for beside in deterministic)
+def test_deterministic_runs_are_bitwise_equal(deterministic: list[RegisterProcess]):
+    first, second = (process.run().out for process in deterministic)
     with np.load(first / "registration.npz") as a, np.load(second / "registration.npz") as b:
         assert a.files == b.files
         for name in a.files:
@@ -167,7 +167,7 @@ def test_deterministic_runs_are_bitwise_equal(deterministic: list[Beside]):
     assert len(ids) == 1
 
 
-def test_the_command_prints_and_uses_the_requested_views(deterministic: list[Beside]):
+def test_the_command_prints_and_uses_the_requested_views(deterministic: list[RegisterProcess]):
     ended = deterministic[0].run()
     result, log = ended.result, "\n".join(ended.progress.notes)
     assert deterministic[0].stdout == f"{result.status}: {result.reason}\n{ended.out}\n"
@@ -194,13 +194,15 @@ def test_expression_from_its_neutral(registered: Run, smile: Run):
     np.testing.assert_array_equal(result.identity, start.identity)
     assert result.scale == start.scale
     skin = face(smile)
-    moved = 1e3 * np.linalg.norm(result.offsets - start.offsets, axis=1)[skin]
+    offset_change_mm = 1e3 * np.linalg.norm(result.offsets - start.offsets, axis=1)[skin]
     error = smile.error_mm[skin]
-    print(f"smile: vertices {error.mean():.3f} mm, offsets moved {moved.mean():.3f} mm, {scan_to_mesh(smile)}")
+    print(
+        f"smile: vertices {error.mean():.3f} mm, offset change {offset_change_mm.mean():.3f} mm, {scan_to_mesh(smile)}"
+    )
     assert result.status == "converged", result.reason
     assert scan_to_mesh(smile)["mean_mm"] < 0.15
     assert error.mean() < 0.6
-    assert moved.mean() < 0.5
+    assert offset_change_mm.mean() < 0.5
     jaw = list(read(MODEL).expression_names).index("lower_face_region_000")
     assert result.expression[jaw] - start.expression[jaw] == pytest.approx(0.35, abs=0.25)
     free = {name for stage in result.config["recipe"]["stages"] for name, _ in stage["free"]}
@@ -208,8 +210,8 @@ def test_expression_from_its_neutral(registered: Run, smile: Run):
     assert set(result.inputs) == {"capture", "model", "landmarks 68", "neutral"}
 
 
-def test_landmarks_hidden(registered: Run, without_landmarks: Run):
-    assert any("estimating the head's pose from the masks" in note for note in without_landmarks.progress.notes)
+def test_registration_without_landmarks(registered: Run, without_landmarks: Run):
+    assert any("estimating the head's pose from the masks" in message for message in without_landmarks.progress.notes)
     error = without_landmarks.error_mm[face(without_landmarks)]
     print(f"without landmarks: vertices {error.mean():.3f} mm, {scan_to_mesh(without_landmarks)}")
     assert without_landmarks.result.status == "converged", without_landmarks.result.reason

@@ -30,9 +30,11 @@ def head() -> tuple[np.ndarray, np.ndarray]:
 
 def disc(corners: int = 720) -> tuple[np.ndarray, np.ndarray]:
     angle = 2 * np.pi * np.arange(corners) / corners
-    rim = RADIUS * np.stack([np.cos(angle), np.sin(angle), 0 * angle], 1)
+    circle = RADIUS * np.stack([np.cos(angle), np.sin(angle), 0 * angle], 1)
     after = np.roll(np.arange(corners), -1)
-    return np.concatenate([rim, np.zeros((1, 3))]), np.stack([np.arange(corners), after, np.full(corners, corners)], 1)
+    return np.concatenate([circle, np.zeros((1, 3))]), np.stack(
+        [np.arange(corners), after, np.full(corners, corners)], 1
+    )
 
 
 class Scene:
@@ -56,9 +58,9 @@ class Scene:
         return Renderer(self.triangles, uvs, np.ones((len(self.vertices), 1), np.float32), pixel_samples=samples)
 
     def mask(self, renderer: Renderer, shift_px: np.ndarray) -> torch.Tensor:
-        """With the mesh moved to the right and upwards."""
-        moved = self.vertices + [*shift_px * self.pixel_m, 0]
-        return renderer(torch.tensor(moved, dtype=torch.float32), None, self.pixels).mask.double()
+        """With the mesh translated to the right and upwards."""
+        vertices = self.vertices + [*shift_px * self.pixel_m, 0]
+        return renderer(torch.tensor(vertices, dtype=torch.float32), None, self.pixels).mask.double()
 
 
 @pytest.mark.parametrize("side_px", [256, 512])

@@ -63,7 +63,7 @@ def test_gradients_of_a_ball_rising_from_a_board(rays):
 
 def test_occlusion_without_contact_has_no_intersection_curve():
     """A ball before the board: silhouettes alone, whether or not the two are declared as parts."""
-    _, apart = shown_area(0.06)
-    _, together = shown_area(0.06, parts=np.zeros(len(TRIANGLES), int))
-    torch.testing.assert_close(apart, together, rtol=0, atol=0)
-    assert apart.abs().max() > 0
+    _, two_parts = shown_area(0.06)
+    _, single_part = shown_area(0.06, parts=np.zeros(len(TRIANGLES), int))
+    torch.testing.assert_close(two_parts, single_part, rtol=0, atol=0)
+    assert two_parts.abs().max() > 0

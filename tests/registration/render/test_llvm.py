@@ -14,7 +14,7 @@ needs_old = pytest.mark.skipif(not OLD, reason="no libLLVM 14 or 15 on this mach
 
 
 @pytest.fixture(autouse=True)
-def fresh(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def clean_environment(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     """No library set, nothing cached; settings of a test are undone after it."""
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     monkeypatch.setenv(llvm.ENVIRONMENT, "")

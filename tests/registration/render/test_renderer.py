@@ -343,8 +343,8 @@ def test_many_rays_per_pixel_measure_an_area():
     """A disc's mask sums up to its projected area; its outline is grey."""
     corners = 256
     angle = 2 * np.pi * np.arange(corners) / corners
-    rim = 0.06 * np.stack([np.cos(angle), np.sin(angle), 0 * angle], 1)
-    vertices = torch.tensor(np.concatenate([rim, [[0, 0, 0]]]), dtype=torch.float32)
+    circle = 0.06 * np.stack([np.cos(angle), np.sin(angle), 0 * angle], 1)
+    vertices = torch.tensor(np.concatenate([circle, [[0, 0, 0]]]), dtype=torch.float32)
     after = np.roll(np.arange(corners), -1)
     triangles = np.stack([np.arange(corners), after, np.full(corners, corners)], 1)
     uvs, classes = np.zeros((corners, 3, 2), np.float32), np.ones((corners + 1, 1), np.float32)

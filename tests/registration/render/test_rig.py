@@ -18,8 +18,8 @@ def test_the_rig_frames_the_head_from_its_specified_angles():
         np.degrees(np.arctan2(out[:, 0], out[:, 2])),
         np.degrees(np.arcsin(out[:, 1] / np.linalg.norm(out, axis=1))),
     )
-    for angles, spread in ((yaw, SPREAD_DEG[0]), (pitch, SPREAD_DEG[1])):
-        assert np.ptp(angles) == pytest.approx(spread, abs=6)
+    for angles, spread_deg in ((yaw, SPREAD_DEG[0]), (pitch, SPREAD_DEG[1])):
+        assert np.ptp(angles) == pytest.approx(spread_deg, abs=6)
     assert np.linalg.norm(out, axis=1) == pytest.approx(1.2, rel=0.05)
     tall = np.array([[0, -0.17, 0], [0, 0.17, 0]])
     for camera in cameras:
@@ -47,8 +47,8 @@ def test_the_lens_displaces_corners_by_a_few_pixels():
         straight = cv2.undistortPoints(
             corners[:, None], camera.intrinsics, np.array(camera.distortion), P=camera.intrinsics
         )
-        moved = np.linalg.norm(straight[:, 0] - corners, axis=1)
-        assert 0.5 < moved.max() < 30
+        displacement_px = np.linalg.norm(straight[:, 0] - corners, axis=1)
+        assert 0.5 < displacement_px.max() < 30
 
 
 @pytest.mark.parametrize(

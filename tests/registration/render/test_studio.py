@@ -310,9 +310,9 @@ def test_subdivision_preserves_shape_and_attributes():
     np.testing.assert_allclose(area(fine).reshape(4, -1).sum(0), area(surface), rtol=1e-9, atol=1e-15)
     rng = np.random.default_rng(0)
     values = rng.random((len(surface.vertices), 3))
-    moved = subdivide(replace(surface, vertices=values))
+    uv_surface = subdivide(replace(surface, vertices=values))
     uvs = subdivide(replace(surface, corner_uvs=values[surface.triangles][..., :2]))
-    np.testing.assert_allclose(uvs.corner_uvs, moved.vertices[moved.triangles][..., :2], atol=1e-12)
+    np.testing.assert_allclose(uvs.corner_uvs, uv_surface.vertices[uv_surface.triangles][..., :2], atol=1e-12)
 
 
 def test_noise_is_a_function_of_space():
@@ -373,10 +373,10 @@ def test_facial_features_are_painted_at_their_vertices():
 
 
 def test_the_hairline_does_not_cover_face_and_ears():
-    reach = depth_inside_hairline(TINY)
+    depth_m = depth_inside_hairline(TINY)
     points = TINY.template_vertex_positions
-    assert (reach[(group(TINY, "hockey_mask") > 0.5) | (group(TINY, "ears") > 0.5)] < 0).all()
-    assert reach[points[:, 1].argmax()] > 0.02 and (reach[points[:, 1] < 0.2] < 0).all()
+    assert (depth_m[(group(TINY, "hockey_mask") > 0.5) | (group(TINY, "ears") > 0.5)] < 0).all()
+    assert depth_m[points[:, 1].argmax()] > 0.02 and (depth_m[points[:, 1] < 0.2] < 0).all()
 
 
 def test_sampled_appearances_differ_and_are_plausible():

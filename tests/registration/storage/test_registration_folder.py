@@ -265,10 +265,10 @@ def test_the_capture_hash_depends_on_content_and_not_on_location(tmp_path):
     os.utime(b.views[0].image, (0, 0))
     assert hash_capture(a) == hash_capture(b)
     first, second = a.views
-    moved = replace(first, camera=replace(first.camera, T_cam_world=np.diag([1.0, 1, 1, 1]) * 1.0001))
+    other_camera = replace(first, camera=replace(first.camera, T_cam_world=np.diag([1.0, 1, 1, 1]) * 1.0001))
     marked = replace(first, landmarks={"68": np.ones((68, 3))})
     unmarked = replace(first, landmarks={})
-    for changed in (moved, marked, unmarked):
+    for changed in (other_camera, marked, unmarked):
         assert hash_capture(replace(a, views=(changed, second))) != hash_capture(a)
     assert hash_capture(replace(a, views=(first,))) != hash_capture(a)
     assert hash_capture(replace(a, scan=first.image)) != hash_capture(a)

@@ -169,15 +169,15 @@ def test_hair_and_outlines_of_other_objects_have_no_weight(pyramid, level):
     for number, camera in enumerate(targets.pixels.cameras):
         world, depth = world_directions(camera)
         label = np.where(depth > 0, labels_of(world), 0)
-        rim = np.abs(depth) < 1.5 * 0.45 / camera.intrinsics[0, 0]
+        near_outline = np.abs(depth) < 1.5 * 0.45 / camera.intrinsics[0, 0]
         borders = [np.roll(label, step, axis) != label for axis in (0, 1) for step in (-1, 1)]
-        pure = ~np.any(borders, axis=0) & ~rim
+        pure = ~np.any(borders, axis=0) & ~near_outline
         inner = {"hair": pure & (label == 3), "neck": pure & (label == 2), "head": pure & np.isin(label, (1, 4))}
         assert all((w[number][inner["hair"]] == 0).all() for w in weights.values())
         outline = weights["mask_weight"][number]
         margin = 0.08 * np.ptp(np.flatnonzero(np.isin(label, (1, 4)).any(1))) + 2
         to_head, to_other = (distance_transform_edt(~np.isin(label, k)) for k in ((1, 4), (2, 3)))
-        background = (depth < 0) & ~rim
+        background = (depth < 0) & ~near_outline
         clear = np.abs(to_head - to_other) > 2
         inner["beside head"] = background & clear & (to_head < to_other) & (to_head < margin - 1)
         inner["beside others"] = background & clear & (to_other < to_head)
