@@ -48,7 +48,7 @@ def held_out_subjects(
             HeldOutSubject(
                 subject=f"person_{number}",
                 neutral=neutral,
-                expressions=np.stack([expressions.apply_expression(head, one, neutral, joints) for one in performed]),
+                expressions=np.stack([expressions.apply_expression(head, item, neutral, joints) for item in performed]),
                 categories=tuple(expression.category for expression in performed),
                 tags=person.tags,
                 scan=barycentric_points(neutral, face, triangles, barycentric),

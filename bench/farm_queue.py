@@ -35,8 +35,8 @@ def main() -> None:
     options = parser.parse_args()
     with tempfile.TemporaryDirectory(prefix="gnmreg-queue-") as name:
         if options.db == "postgres":
-            with server() as made:
-                _measure(made.url, Path(name), options)
+            with server() as running:
+                _measure(running.url, Path(name), options)
         else:
             url = default_url(Path(name)) if options.db == "sqlite" else options.db
             _measure(url, Path(name), options)
@@ -49,27 +49,29 @@ def _measure(url: str, folder: Path, options: argparse.Namespace) -> None:
     queue, reader = QueueClient(url), QueueReader(url)
     arguments = {"capture": "/data/captures/subject_0000/expression_00", "model": "/data/model.npz", "seed": 0}
     jobs = (Job(id=f"bench/s{n:05d}", step="nothing", arguments={**arguments, "key": n}) for n in range(captures))
-    begun = time.perf_counter()
+    start = time.perf_counter()
     queue.submit(jobs)
-    took = time.perf_counter() - begun
+    seconds = time.perf_counter() - start
     queue.submit([FlowJob(id="bench", flow="batch", queue=DRIVER)])
-    _row("enqueue", f"{captures / took:.0f} jobs/s ({captures:,} in {took:.1f} s)")
+    _row("enqueue", f"{captures / seconds:.0f} jobs/s ({captures:,} in {seconds:.1f} s)")
     full = _size_mb(url)
     _row("database", f"{(full - empty) * 10_000 / captures:.1f} MB per 10,000 jobs that wait")
-    _row("status, all waiting", f"{_asked(reader):.3f} s; as a command {_command(url, folder):.2f} s")
-    processes = {kind: _started(kind, url, folder, kind) for kind in ("coordinator",)}
+    _row("status, all waiting", f"{_status_seconds(reader):.3f} s; as a command {_command_seconds(url, folder):.2f} s")
+    processes = {kind: _start(kind, url, folder, kind) for kind in ("coordinator",)}
     time.sleep(options.settle)
     _row("coordinator", f"{_rss_mb(processes['coordinator'].pid):.0f} MB while {captures:,} jobs wait")
     for number in (0, 1):
-        processes[f"worker{number}"] = _started("worker", url, folder, f"worker{number}")
+        processes[f"worker{number}"] = _start("worker", url, folder, f"worker{number}")
     while not ended(reader.counts("bench")):
         time.sleep(0.2)
-    first, begun = ended(reader.counts("bench")), time.perf_counter()
+    first, start = ended(reader.counts("bench")), time.perf_counter()
     time.sleep(options.seconds)
     done = ended(reader.counts("bench"))
-    took = time.perf_counter() - begun
-    _row("complete, 2 workers", f"{(done - first) / took:.1f} jobs/s, {(done - first) / took * 86_400:,.0f} a day")
-    _row("status, at work", f"{_asked(reader):.3f} s")
+    seconds = time.perf_counter() - start
+    _row(
+        "complete, 2 workers", f"{(done - first) / seconds:.1f} jobs/s, {(done - first) / seconds * 86_400:,.0f} a day"
+    )
+    _row("status, at work", f"{_status_seconds(reader):.3f} s")
     grown = (_size_mb(url) - full) * 10_000 / max(done, 1)
     _row("database", f"{(full - empty) * 10_000 / captures + grown:.1f} MB per 10,000 jobs that are done")
     _row("memory", ", ".join(f"{name} {_rss_mb(process.pid):.0f} MB" for name, process in processes.items()))
@@ -79,23 +81,23 @@ def _measure(url: str, folder: Path, options: argparse.Namespace) -> None:
     queue.close()
 
 
-def _started(kind: str, url: str, folder: Path, name: str) -> "subprocess.Popen[bytes]":
+def _start(kind: str, url: str, folder: Path, name: str) -> "subprocess.Popen[bytes]":
     command = [sys.executable, "-m", "bench.support.farm_queue_process", kind, url, str(folder), name]
     return subprocess.Popen(command, cwd=Path(__file__).parents[1], stdout=subprocess.DEVNULL)
 
 
-def _asked(reader: QueueReader) -> float:
-    begun = time.perf_counter()
+def _status_seconds(reader: QueueReader) -> float:
+    start = time.perf_counter()
     reader.metrics("bench")
-    return time.perf_counter() - begun
+    return time.perf_counter() - start
 
 
-def _command(url: str, folder: Path) -> float:
-    begun = time.perf_counter()
+def _command_seconds(url: str, folder: Path) -> float:
+    start = time.perf_counter()
     command = [sys.executable, "-m", "workflows.cli", "status", "--folder", str(folder)]
     environment = {**os.environ, "GNMREG_DB": url}
     subprocess.run(command, cwd=Path(__file__).parents[1], env=environment, check=True, stdout=subprocess.DEVNULL)
-    return time.perf_counter() - begun
+    return time.perf_counter() - start
 
 
 def _size_mb(url: str) -> float:

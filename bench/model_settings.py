@@ -51,7 +51,7 @@ def model_samples(data: GNMData, count: int, draw: int) -> Float[np.ndarray, "N 
 
 
 def add_noise(heads: Float[np.ndarray, "N V 3"], rms_mm: float, draw: int) -> Float[np.ndarray, "N V 3"]:
-    """Return the heads with smooth noise, another one each."""
+    """Return the heads with smooth noise, sampled for each head."""
     rng = np.random.default_rng([_SEED, draw, 1])
     noisy = []
     for head in heads:

@@ -49,13 +49,13 @@ def measure(capture: Path, model: Path, recipe: str) -> Measured:
     with tempfile.TemporaryDirectory() as folder:
         out, log = Path(folder) / "out", Path(folder) / "log"
         command = [sys.executable, "-m", "workflows.cli", "register", str(capture), "--model", str(model)]
-        begun = time.perf_counter()
+        start = time.perf_counter()
         with log.open("w") as stream:
             process = subprocess.Popen(
                 [*command, "--out", str(out), "--recipe", recipe], stdout=stream, stderr=subprocess.STDOUT
             )
             usage = os.wait4(process.pid, 0)[2]  # of this process alone; subprocess does not report it
-        seconds = time.perf_counter() - begun
+        seconds = time.perf_counter() - start
         manifest = out / "manifest.json"
         return Measured(
             seconds=seconds,

@@ -79,14 +79,14 @@ class Case:
         shapes = ((count, 3), (count, 3), (count,), (count, CLASSES))
         self.adjoint = [torch.rand(shape, generator=generator).to(device) for shape in shapes]
         displacements = MOTION * torch.randn((8, *self.rest.shape), generator=generator).to(device)
-        self._moved = itertools.cycle([(self.rest + delta).requires_grad_() for delta in displacements])
+        self._vertices = itertools.cycle([(self.rest + delta).requires_grad_() for delta in displacements])
 
-    def moved(self) -> torch.Tensor:
+    def next_vertices(self) -> torch.Tensor:
         """Return other vertices than before, so that the BVH is rebuilt."""
-        return next(self._moved)
+        return next(self._vertices)
 
     def iterate(self) -> None:
-        vertices = self.moved()
+        vertices = self.next_vertices()
         rendered = self.renderer(vertices, self.texture, self.pixels)
         image = (rendered.rgb, rendered.normals, rendered.mask, rendered.classes)
         torch.autograd.grad(image, (vertices, self.texture), self.adjoint)
@@ -168,25 +168,27 @@ def measure(case: Case) -> dict[str, float]:
         cast()
     clock = Clock({})
     originals = [(owner, name, getattr(owner, name)) for owner, name in _stages(Renderer, TriangleScene)]
-    found: dict[str, list[float]] = {}
+    samples: dict[str, list[float]] = {}
     for _ in range(REPEATS):
-        found.setdefault(CAST, []).append(timed(cast))
-        found.setdefault(WHOLE, []).append(timed(case.iterate))
+        samples.setdefault(CAST, []).append(timed(cast))
+        samples.setdefault(WHOLE, []).append(timed(case.iterate))
         for (owner, name, _original), stage in zip(originals, STAGES, strict=True):
             clock.wrap(owner, name, stage)
         case.iterate()
         for owner, name, original in originals:
             setattr(owner, name, original)
         for stage, seconds in clock.take().items():
-            found.setdefault(stage, []).append(seconds)
-    return {stage: statistics.median(seconds) for stage, seconds in found.items()}
+            samples.setdefault(stage, []).append(seconds)
+    return {stage: statistics.median(seconds) for stage, seconds in samples.items()}
 
 
 def measure_stock(case: Case) -> dict[str, float]:
     """Return the median seconds of the baseline, of our iteration and of Mitsuba's integrator."""
     from bench.support import stock_renderer
 
-    stock = stock_renderer.iteration(case.all.cameras, case.triangles, case.corner_uvs, case.texture, case.moved)
+    stock = stock_renderer.iteration(
+        case.all.cameras, case.triangles, case.corner_uvs, case.texture, case.next_vertices
+    )
     calls = {CAST: baseline(case), WHOLE: case.iterate, STOCK: stock}
     for _ in range(3):
         for call in calls.values():

@@ -35,9 +35,9 @@ MARGIN_MM = 0.05
 def cost(data: GNMData) -> Table:
     """Return median wall-clock milliseconds on the template and on a head with crossed lips."""
     table = Table("head", "construct", "refresh", "call", "call and backward", "a step, refreshed every 10")
-    begun = time.perf_counter()
+    start = time.perf_counter()
     penalty = SelfIntersectionPenalty(data, torch.device("cpu"))
-    built = 1e3 * (time.perf_counter() - begun)
+    built = 1e3 * (time.perf_counter() - start)
     template = torch.as_tensor(data.template_vertex_positions)
     for name, vertices in {"template": template, "crossed lips": crossed_parts.raised_lower_lip(data, 2.0)}.items():
         vertices = vertices.clone().requires_grad_(True)
@@ -54,30 +54,30 @@ def cost(data: GNMData) -> Table:
 def median_ms(work: Callable[[], object]) -> float:
     seconds = []
     for _ in range(REPEATS):
-        begun = time.perf_counter()
+        start = time.perf_counter()
         work()
-        seconds.append(time.perf_counter() - begun)
+        seconds.append(time.perf_counter() - start)
     return 1e3 * statistics.median(seconds)
 
 
 def pushed_tongue(data: GNMData, penalty: SelfIntersectionPenalty) -> Table:
-    """Return vertices with the tongue pushed into the teeth."""
+    """Return depths and their errors for the tongue pushed into the teeth."""
     table = Table("tongue pushed", "by, mm", "vertices inside", "deepest, mm", "largest error, mm")
     tongue, teeth = regions.tongue(data), crossed_parts.teeth_of(data)
     for name, direction in DIRECTIONS.items():
         for push in PUSHES_MM:
-            vertices = crossed_parts.moved(data, tongue, tuple(push * axis for axis in direction))
+            vertices = crossed_parts.translated_part(data, tongue, tuple(push * axis for axis in direction))
             penalty.update_candidates(vertices)
-            found = penalty.excess_mm(vertices)["tongue-teeth"].numpy()[tongue]
+            depth_mm = penalty.excess_mm(vertices)["tongue-teeth"].numpy()[tongue]
             points = vertices.numpy().astype(np.float64)
             truth = crossed_parts.tooth_depths_mm(points[tongue], points, teeth)
-            error = np.abs(found - np.maximum(truth - MARGIN_MM, 0)).max()
+            error = np.abs(depth_mm - np.maximum(truth - MARGIN_MM, 0)).max()
             table.add_row(name, f"{push:g}", f"{(truth > 0).sum()}", f"{truth.max():.2f}", f"{error:.3f}")
     return table
 
 
 def recovered(data: GNMData) -> Table:
-    """Lips and a lid that crossed, after the penalty was minimised over the skin's offsets."""
+    """Return depths of crossed lips and lids before and after the penalty was minimized over the skin's offsets."""
     table = Table("crossed", "by, mm", "too deep, mm", "after", "cheeks moved, mm", "skin moved, mm", "seconds")
     template = torch.as_tensor(data.template_vertex_positions)
     for name, cross, measure, rate in (  # the rate is per mm of displacement to undo
@@ -86,11 +86,11 @@ def recovered(data: GNMData) -> Table:
     ):
         rest = measure(data, template)
         for by_mm in (1.0, 2.0, 3.0):
-            begun = time.perf_counter()
-            found = crossed_parts.recover(data, cross(data, by_mm), steps=100, rate=rate * by_mm)
-            seconds = time.perf_counter() - begun
-            before, after = ((measure(data, head) - rest).max() for head in (found.before, found.after))
-            motion = (found.moved_mm(crossed_parts.cheeks(data)), found.moved_mm(regions.exterior(data)))
+            start = time.perf_counter()
+            result = crossed_parts.recover(data, cross(data, by_mm), steps=100, rate=rate * by_mm)
+            seconds = time.perf_counter() - start
+            before, after = ((measure(data, head) - rest).max() for head in (result.before, result.after))
+            motion = (result.max_motion_mm(crossed_parts.cheeks(data)), result.max_motion_mm(regions.exterior(data)))
             numbers = (before, after, *motion, seconds)
             table.add_row(name, f"{by_mm:g}", *(f"{number:.2f}" for number in numbers))
     return table
@@ -113,21 +113,21 @@ def faces(data: GNMData, samples: Path | None) -> Iterator[tuple[str, Tensor]]:
             yield name, torch.as_tensor(template + move, dtype=torch.float32)
 
 
-def own_overlap(data: GNMData, penalty: SelfIntersectionPenalty, samples: Path | None) -> Table:
+def model_intersections(data: GNMData, penalty: SelfIntersectionPenalty, samples: Path | None) -> Table:
     """Return penetrating vertices and greatest depth of the faces beyond the template; medians of random ones."""
     table = Table("face", *penalty.pairs, title="vertices / deepest, mm; for random faces the median / the worst")
-    found: dict[str, list[dict[str, tuple[int, float]]]] = {}
+    metrics_by_name: dict[str, list[dict[str, tuple[int, float]]]] = {}
     for name, vertices in faces(data, samples):
         penalty.update_candidates(vertices)
         excess = penalty.excess_mm(vertices)
-        figures = {pair: (int((mm > 0).sum()), float(mm.max())) for pair, mm in excess.items()}
-        found.setdefault(name, []).append(figures)
-    for name, heads in found.items():
+        metrics = {pair: (int((mm > 0).sum()), float(mm.max())) for pair, mm in excess.items()}
+        metrics_by_name.setdefault(name, []).append(metrics)
+    for name, heads in metrics_by_name.items():
         cells = []
         for pair in penalty.pairs:
             count, deepest = statistics.median(h[pair][0] for h in heads), max(h[pair][1] for h in heads)
-            middle = f"{statistics.median(h[pair][1] for h in heads):.2f} / " if len(heads) > 1 else ""
-            cells.append(f"{count:g} / {middle}{deepest:.2f}" if deepest > 0 else "")
+            median = f"{statistics.median(h[pair][1] for h in heads):.2f} / " if len(heads) > 1 else ""
+            cells.append(f"{count:g} / {median}{deepest:.2f}" if deepest > 0 else "")
         table.add_row(name, *cells)
     return table
 
@@ -140,7 +140,7 @@ def main() -> None:
     data, console = gnm_npz.read(arguments.model), Console()
     console.print(cost(data))
     penalty = SelfIntersectionPenalty(data, torch.device("cpu"))
-    for table in (pushed_tongue(data, penalty), recovered(data), own_overlap(data, penalty, arguments.samples)):
+    for table in (pushed_tongue(data, penalty), recovered(data), model_intersections(data, penalty, arguments.samples)):
         console.print(table)
 
 

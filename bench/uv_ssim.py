@@ -59,11 +59,11 @@ class Photo:
 
     def __call__(self, vertices: torch.Tensor) -> torch.Tensor:
         batch, texture = self._batch, self._texture.contiguous()
-        drawn = self._renderer(vertices, texture, batch.pixels)
-        hit = drawn.mask > 0.5
-        loss = image.rgb_l1(drawn, batch, hit) + 0.2 * image.rgb_ssim(drawn, batch, hit)
+        rendered = self._renderer(vertices, texture, batch.pixels)
+        hit = rendered.mask > 0.5
+        loss = image.rgb_l1(rendered, batch, hit) + 0.2 * image.rgb_ssim(rendered, batch, hit)
         with torch.no_grad():
-            change, weight = batch.rgb - drawn.rgb, batch.rgb_weight * hit
+            change, weight = batch.rgb - rendered.rgb, batch.rgb_weight * hit
             total, density = self._renderer.unwrap(vertices, change, weight, batch.pixels, len(texture))
             step = torch.where(density > 1e-3, 0.5 / density.clamp_min(1e-3), 0.0)
             self._texture = (texture + step[..., None] * total).clamp(0, 1)
@@ -75,12 +75,12 @@ def terms(
 ) -> dict[str, Term]:
     """Return the surface term and the requested others; batches are used in turn."""
     surface, loss, steps = OnSurface(problem), problem.loss(size_px), iter(range(10**9))
-    found: dict[str, Term] = {"surface": lambda vertices: held * surface(vertices)}
+    selected: dict[str, Term] = {"surface": lambda vertices: held * surface(vertices)}
     if photo:
-        found["photo"] = Photo(problem, size_px)
+        selected["photo"] = Photo(problem, size_px)
     if batches:
-        found["slide"] = lambda vertices: SLIDE * loss(vertices, batches[next(steps) % len(batches)])
-    return found
+        selected["slide"] = lambda vertices: SLIDE * loss(vertices, batches[next(steps) % len(batches)])
+    return selected
 
 
 def row(name: str, problem: Problem, vertices: np.ndarray) -> tuple[str, ...]:
@@ -90,7 +90,7 @@ def row(name: str, problem: Problem, vertices: np.ndarray) -> tuple[str, ...]:
 
 
 def recovery(table: Table, name: str, problem: Problem, size_px: int, photo: bool, batches: Sequence[Targets]) -> None:
-    table.add_row(*row(f"{name}: start", problem, problem.start))
+    table.add_row(*row(f"{name}: start", problem, problem.initial))
     cases = {"surface alone": terms(problem, size_px)}
     if photo:
         cases["photometric term"] = terms(problem, size_px, photo=True)
@@ -98,7 +98,7 @@ def recovery(table: Table, name: str, problem: Problem, size_px: int, photo: boo
     if photo:
         cases["both"] = terms(problem, size_px, batches, photo=True)
     for case, used in cases.items():
-        table.add_row(*row(f"{name}: {case}", problem, sliding.fit(problem, used, problem.start, STAGES)))
+        table.add_row(*row(f"{name}: {case}", problem, sliding.fit(problem, used, problem.initial, STAGES)))
 
 
 def disturbances(problem: Problem, size_px: int) -> Table:
@@ -107,15 +107,15 @@ def disturbances(problem: Problem, size_px: int) -> Table:
     )
     still = sliding.fit(problem, terms(problem, size_px, [problem.batch], held=HELD), problem.truth, STILL)
 
-    def moves(name: str, from_: np.ndarray, to: np.ndarray) -> None:
-        length = MM_PER_M * np.linalg.norm(to - from_, axis=1)[problem.moves]
+    def add_displacement(name: str, from_: np.ndarray, to: np.ndarray) -> None:
+        length = MM_PER_M * np.linalg.norm(to - from_, axis=1)[problem.free]
         table.add_row(name, *(f"{figure:.3f}" for figure in np.quantile(length, [0.5, 0.99, 1])))
 
-    moves("undisturbed, against the truth", problem.truth, still)
+    add_displacement("undisturbed, against the truth", problem.truth, still)
     for name, gain, blush in (("gain +20 %", 1.2, 0.0), ("blush +30 %", 1.0, 0.3), ("both", 1.2, 0.3)):
         batch = problem.disturbed(gain, blush)
         used = terms(problem, size_px, [batch], held=HELD)
-        moves(name, still, sliding.fit(problem, used, problem.truth, STILL))
+        add_displacement(name, still, sliding.fit(problem, used, problem.truth, STILL))
     return table
 
 
@@ -127,17 +127,17 @@ def costs(problem: Problem, size_px: int) -> Table:
     def clocks() -> np.ndarray:
         return np.array([time.perf_counter(), time.process_time()])
 
-    begun = clocks()
+    start = clocks()
     loss = problem.loss(size_px)
     built = clocks()
     loss(vertices, problem.batch)
-    spent = {"build": [built - begun], "first call, visibility of all views": [clocks() - built]}
+    spent = {"build": [built - start], "first call, visibility of all views": [clocks() - built]}
     for _ in range(REPEATS):
-        begun = clocks()
+        start = clocks()
         value = loss(vertices, problem.batch)
         forward = clocks()
         value.backward()
-        spent.setdefault("forward", []).append(forward - begun)
+        spent.setdefault("forward", []).append(forward - start)
         spent.setdefault("backward", []).append(clocks() - forward)
     for name, times in spent.items():
         table.add_row(name, *(f"{1e3 * seconds:.0f}" for seconds in np.median(times, 0)))
@@ -153,21 +153,21 @@ def captured(data: GNMData, neutral: Path, expression: Path, head_px: int, size_
         level = build_pyramid(capture, class_map(capture.classes), finest_head_px=head_px, levels=1)[0]
         batches.append(level.select(range(len(level.names)), device))
         truths.append(np.load(capture.ground_truth)["vertices"].astype(np.float64))
-    seen, rest = batches[0], torch.as_tensor(truths[0], dtype=torch.float32)
+    reference, rest = batches[0], torch.as_tensor(truths[0], dtype=torch.float32)
     renderer = Renderer(data.triangles, corner_uvs, vertex_classes(data)[1])
-    total, density = renderer.unwrap(rest, seen.rgb, seen.rgb_weight.square(), seen.pixels, size_px)
+    total, density = renderer.unwrap(rest, reference.rgb, reference.rgb_weight.square(), reference.pixels, size_px)
     truth, outside, cameras = truths[1], exterior(data), batches[1].pixels.cameras
-    judged = outside & (group(data, "hockey_mask") > 0.5) & (lids(data) < 0.5) & (inner_lips(data) < 0.5)
-    often = sliding.times_seen(truths[0], data.triangles, seen.pixels.cameras)
+    evaluated = outside & (group(data, "hockey_mask") > 0.5) & (lids(data) < 0.5) & (inner_lips(data) < 0.5)
+    view_count = sliding.visible_camera_count(truths[0], data.triangles, reference.pixels.cameras)
     return Problem(
         triangles=data.triangles,
         corner_uvs=corner_uvs,
         texture=torch.where(density[..., None] > 1e-3, total / density.clamp_min(1e-3)[..., None], 0.3),
-        weights=sliding.confident_texels(data, often / (often + 1)),
+        weights=sliding.confident_texels(data, view_count / (view_count + 1)),
         truth=truth,
-        start=sliding.slid(truth, data.triangles, outside, slide_mm),
-        moves=outside,
-        judged=judged & (sliding.times_seen(truth, data.triangles, cameras) > 1),
+        initial=sliding.slide(truth, data.triangles, outside, slide_mm),
+        free=outside,
+        evaluated=evaluated & (sliding.visible_camera_count(truth, data.triangles, cameras) > 1),
         cheek=np.zeros(len(truth)),
         batch=batches[1],
     )

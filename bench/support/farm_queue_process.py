@@ -9,7 +9,7 @@ from workflows.farm.flows import FLOWS
 
 
 def nothing(**arguments: object) -> None:
-    """What a job does here."""
+    """Do nothing: the step of every job of the benchmark."""
 
 
 if __name__ == "__main__":

@@ -23,13 +23,13 @@ NAMES = (
 )
 COUNT = len(NAMES)
 JAW, BROWS = ("jaw_open", "jaw_left", "jaw_right"), ("brows_up", "brows_down")
-_STRENGTH = (0.7, 1.0)  # of each unit of an expression: subjects differ
+_STRENGTH = (0.7, 1.0)  # range of each unit's weight, sampled for each subject
 _WAVES = 200  # of a random smooth field
 
 
 @dataclass(frozen=True, kw_only=True)
 class TrueSubject:
-    """A subject's true meshes, the skull where the neutral has it: metres, the model's frame."""
+    """A subject's true meshes with the skull at its position in the neutral: metres, the model's frame."""
 
     name: str
     neutral: np.ndarray  # V 3
@@ -120,7 +120,7 @@ def observe(
 
 
 def _patches(points: np.ndarray, fraction: float, rng: np.random.Generator) -> np.ndarray:
-    """Balls of 15 mm radius around random vertices that contain this fraction of the vertices."""
+    """Return the vertices in balls of 15 mm radius around random vertices, at least this fraction of all."""
     hidden, tree = np.zeros(len(points), bool), cKDTree(points)
     while hidden.mean() < fraction:
         hidden[tree.query_ball_point(points[rng.integers(len(points))], 15e-3)] = True

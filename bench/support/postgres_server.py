@@ -1,4 +1,4 @@
-"""A real PostgreSQL server for tests: made in a folder, started as an ordinary user, thrown away."""
+"""A temporary PostgreSQL server for tests and benchmarks, started in a folder as an unprivileged user."""
 
 import os
 import pwd
@@ -10,25 +10,27 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-PLACES = ("/usr/lib/postgresql/*/bin", "/usr/local/pgsql/bin")
+PATTERNS = ("/usr/lib/postgresql/*/bin", "/usr/local/pgsql/bin")
 USERS = ("postgres", "nobody")  # initdb refuses root
 
 
 def programs() -> Path | None:
-    """The folder of initdb and pg_ctl of the newest PostgreSQL here, or None."""
-    found = [path for place in PLACES for path in Path("/").glob(place.lstrip("/")) if (path / "initdb").exists()]
+    """Return the folder with initdb and pg_ctl of the newest installed PostgreSQL, or None."""
+    folders = [
+        path for pattern in PATTERNS for path in Path("/").glob(pattern.lstrip("/")) if (path / "initdb").exists()
+    ]
     on_path = shutil.which("initdb")
-    return max(found, key=str, default=Path(on_path).parent if on_path else None)
+    return max(folders, key=str, default=Path(on_path).parent if on_path else None)
 
 
 class Server:
-    """One server on a free port of this machine."""
+    """A server on a free port of this machine."""
 
     def __init__(self, folder: Path) -> None:
-        """`folder` is to be readable by all: what pytest makes is not."""
-        found = programs()
-        assert found is not None
-        self._programs, self._data = found, folder / "data"
+        """Create and start the server in `folder`, which all users must be able to read (pytest's folders are not)."""
+        installed = programs()
+        assert installed is not None
+        self._programs, self._data = installed, folder / "data"
         self._user = next((u for u in USERS if _exists(u)), None) if os.getuid() == 0 else None
         folder.mkdir(parents=True, exist_ok=True)
         if self._user:
@@ -54,7 +56,7 @@ class Server:
 
     def _run(self, program: str, *arguments: str) -> None:
         command = [str(self._programs / program), *arguments]
-        # Not a pipe: the server that pg_ctl starts would keep it open.
+        # No pipe, as the server that pg_ctl starts would keep it open.
         done = subprocess.run(command, user=self._user, group=self._user, cwd="/", stdout=subprocess.DEVNULL)
         assert done.returncode == 0, command
 
@@ -63,11 +65,11 @@ class Server:
 def server() -> Iterator[Server]:
     with tempfile.TemporaryDirectory(prefix="gnmreg-postgres-") as name:
         Path(name).chmod(0o755)
-        made = Server(Path(name) / "server")
+        running = Server(Path(name) / "server")
         try:
-            yield made
+            yield running
         finally:
-            made.stop()
+            running.stop()
 
 
 def _exists(user: str) -> bool:

@@ -1,7 +1,7 @@
-"""Surfaces whose skin has slid: images and texture of a known mesh, and the same mesh slid along its own surface.
+"""Problems of tangential sliding: images and texture of a known mesh, and initial vertices slid along its surface.
 
-The texture is noise in space, alike everywhere on the skin; the images are the renderer's, with sixteen rays a pixel.
-What is to be put right lies on the true surface, every vertex one to three millimetres from its place.
+The texture is spatial noise with equal statistics on the whole skin; the images are rendered with sixteen rays a pixel.
+The initial vertices are on the true surface, one to three millimetres from their true positions.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -30,7 +30,7 @@ from registration.render.renderer import Renderer
 from registration.types import Camera, Pixels, Targets
 
 SKIN = np.array([0.45, 0.33, 0.27])  # linear
-_FRAME = 1.1  # an image's height over what it shows
+_FRAME = 1.1  # height of an image over `height_px`
 _SLIDE_STEPS = 6
 _SURFACE_EVERY = 10  # steps between two searches for the closest points of the true surface
 
@@ -39,33 +39,34 @@ Term = Callable[[Tensor], Tensor]
 
 @dataclass(frozen=True, kw_only=True)
 class Problem:
-    """What is known, and where the search begins."""
+    """Images and texture, the true vertices, and the initial vertices of the fit."""
 
     triangles: Int[np.ndarray, "F 3"]
     corner_uvs: Float[np.ndarray, "F 3 2"]
     texture: Float[Tensor, "R R 3"]  # the neutral's
     weights: Float[np.ndarray, "V"]
     truth: Float[np.ndarray, "V 3"]
-    start: Float[np.ndarray, "V 3"]
-    moves: Bool[np.ndarray, "V"]  # the skin; the rest stays where it is
-    judged: Bool[np.ndarray, "V"]
-    cheek: Float[np.ndarray, "V"]  # what may blush
+    initial: Float[np.ndarray, "V 3"]
+    free: Bool[np.ndarray, "V"]  # the skin; all other vertices are fixed
+    evaluated: Bool[np.ndarray, "V"]
+    cheek: Float[np.ndarray, "V"]  # weight of the blush
     batch: Targets
 
     def tangential_mm(self, vertices: Float[np.ndarray, "V 3"]) -> Float[np.ndarray, "M"]:
-        """How far along the skin each judged vertex is from its true place."""
-        away, normals = vertices - self.truth, normals_of(self.truth, self.triangles)
-        return MM_PER_M * np.linalg.norm(away - (away * normals).sum(1, keepdims=True) * normals, axis=1)[self.judged]
+        """Return the tangential distance of each evaluated vertex from its true position."""
+        difference, normals = vertices - self.truth, normals_of(self.truth, self.triangles)
+        tangential = difference - (difference * normals).sum(1, keepdims=True) * normals
+        return MM_PER_M * np.linalg.norm(tangential, axis=1)[self.evaluated]
 
     def loss(self, size_px: int, dtype: torch.dtype = torch.float32) -> SurfaceTexture:
         return SurfaceTexture(self.triangles, self.corner_uvs, self.texture.to(dtype), self.weights, size_px)
 
     def disturbed(self, gain: float, blush: float) -> Targets:
-        """The images with a gain, and with a smooth reddish brightening of the cheek."""
+        """Return the images with a gain and a smooth reddish brightening of the cheek."""
         renderer = Renderer(self.triangles, self.corner_uvs, self.cheek[:, None].astype(np.float32))
-        drawn = renderer(torch.as_tensor(self.truth, dtype=torch.float32), None, self.batch.pixels)
-        share = blush * drawn.classes * torch.tensor([1.0, 0.4, 0.4])
-        return replace(self.batch, rgb=(gain * self.batch.rgb * (1 + share)).clamp(0, 1))
+        rendered = renderer(torch.as_tensor(self.truth, dtype=torch.float32), None, self.batch.pixels)
+        brightening = blush * rendered.classes * torch.tensor([1.0, 0.4, 0.4])
+        return replace(self.batch, rgb=(gain * self.batch.rgb * (1 + brightening)).clamp(0, 1))
 
 
 def normals_of(vertices: Float[np.ndarray, "V 3"], triangles: Int[np.ndarray, "F 3"]) -> Float[np.ndarray, "V 3"]:
@@ -75,7 +76,7 @@ def normals_of(vertices: Float[np.ndarray, "V 3"], triangles: Int[np.ndarray, "F
 def noise(
     points: Float[np.ndarray, "P 3"], wavelengths_mm: tuple[float, float], seed: int, waves: int = 60
 ) -> Float[np.ndarray, "P"]:
-    """Band-limited noise in space, of variance 1: plane waves in all directions, their frequencies in a band."""
+    """Return band-limited spatial noise of variance 1: plane waves in random directions with frequencies in a band."""
     rng = np.random.default_rng(seed)
     direction = rng.standard_normal((waves, 3))
     direction /= np.linalg.norm(direction, axis=1, keepdims=True)
@@ -85,9 +86,9 @@ def noise(
 
 
 def camera(centre: np.ndarray, yaw: float, pitch: float, height_m: float, height_px: int) -> Camera:
-    """A camera a metre away that looks at the centre, +Y up; so much height, in so many pixels, in a larger image."""
-    turn, lift = np.radians([yaw, pitch])
-    out = np.array([np.sin(turn) * np.cos(lift), np.sin(lift), np.cos(turn) * np.cos(lift)])
+    """Return a camera at 1 m from the centre, +Y up, that shows `height_m` in `height_px` pixels of a larger image."""
+    azimuth, elevation = np.radians([yaw, pitch])
+    out = np.array([np.sin(azimuth) * np.cos(elevation), np.sin(elevation), np.cos(azimuth) * np.cos(elevation)])
     right = np.cross([0.0, 1.0, 0.0], out)
     right /= np.linalg.norm(right)
     pose = np.eye(4)
@@ -107,13 +108,13 @@ def noise_texture(
     contrast: float,
     wavelengths_mm: tuple[float, float],
 ) -> Float[Tensor, "R R 3"]:
-    """Linear; the noise is drawn in the space of the vertices at rest, with a contrast over the mean colour."""
+    """Return a linear texture with noise in the space of the rest vertices, of a contrast relative to the mean."""
     atlas = texels(triangles, corner_uvs, size_px)
     colour = SKIN * (1 + contrast * noise(atlas.interpolate(rest, triangles), wavelengths_mm, seed=1)[:, None])
     return torch.as_tensor(atlas.image(colour, 0.3).clip(0.02, 0.95), dtype=torch.float32)
 
 
-def photograph(
+def render_targets(
     triangles: np.ndarray,
     corner_uvs: np.ndarray,
     vertices: np.ndarray,
@@ -122,10 +123,10 @@ def photograph(
     cameras: Sequence[Camera],
     pixel_noise: float = 0.0,
 ) -> Targets:
-    """All pixels of all views; those that show nothing but compared vertices have a weight."""
+    """Return all pixels of all views; only pixels that show compared vertices alone have a weight."""
     renderer = Renderer(triangles, corner_uvs, compared[:, None].astype(np.float32), pixel_samples=16)
     pixels = Pixels.full(cameras)
-    drawn = renderer(torch.tensor(vertices, dtype=torch.float32), texture, pixels)
+    rendered = renderer(torch.tensor(vertices, dtype=torch.float32), texture, pixels)
     count = len(pixels.view)
     grain = pixel_noise * torch.randn(count, 3, generator=torch.Generator().manual_seed(0))
     none = torch.zeros(count)
@@ -133,42 +134,44 @@ def photograph(
         names=tuple(f"cam{k}" for k in range(len(cameras))),
         class_names=("skin",),
         pixels=pixels,
-        rgb=(drawn.rgb + grain).clamp(0, 1),
-        rgb_weight=(drawn.classes[:, 0] > 0.99).float(),
+        rgb=(rendered.rgb + grain).clamp(0, 1),
+        rgb_weight=(rendered.classes[:, 0] > 0.99).float(),
         normals=torch.zeros(count, 3),
         normal_weight=none,
-        mask=drawn.mask,
+        mask=rendered.mask,
         mask_weight=none,
-        classes=drawn.classes,
+        classes=rendered.classes,
         class_weight=none,
         landmarks={},
         px_per_head=cameras[0].height_px / _FRAME,
     )
 
 
-def times_seen(vertices: np.ndarray, triangles: np.ndarray, cameras: Sequence[Camera]) -> Int[np.ndarray, "V"]:
-    """How many cameras see each vertex, at 60 degrees from its normal or less."""
+def visible_camera_count(
+    vertices: np.ndarray, triangles: np.ndarray, cameras: Sequence[Camera]
+) -> Int[np.ndarray, "V"]:
+    """Return the number of cameras that see each vertex at 60 degrees from its normal or less."""
     total, normals = np.zeros(len(vertices), np.int64), normals_of(vertices, triangles)
     for view in cameras:
-        away = view.centre - vertices
-        cosine = (away * normals).sum(1) / np.linalg.norm(away, axis=1)
+        direction = view.centre - vertices
+        cosine = (direction * normals).sum(1) / np.linalg.norm(direction, axis=1)
         total += (cosine > 0.5) & visible(vertices, vertices, triangles, view)
     return total
 
 
-def slid(truth: np.ndarray, triangles: np.ndarray, moves: np.ndarray, amount_mm: float) -> Float[np.ndarray, "V 3"]:
-    """The skin moved along itself by this length (rms), smoothly: in small steps, each put back onto the surface."""
+def slide(truth: np.ndarray, triangles: np.ndarray, free: np.ndarray, amount_mm: float) -> Float[np.ndarray, "V 3"]:
+    """Return vertices slid smoothly along the surface by this rms length, in small steps projected onto the surface."""
     field = np.stack([noise(truth, (60, 120), seed=seed, waves=20) for seed in (11, 12, 13)], 1)
     normals = normals_of(truth, triangles)
-    length = np.sqrt(np.square(field - (field * normals).sum(1, keepdims=True) * normals)[moves].sum(1).mean())
+    length = np.sqrt(np.square(field - (field * normals).sum(1, keepdims=True) * normals)[free].sum(1).mean())
     field *= amount_mm / MM_PER_M / length / _SLIDE_STEPS
-    faces = triangles[moves[triangles].all(1)]
+    faces = triangles[free[triangles].all(1)]
     out = truth.copy()
     for _ in range(_SLIDE_STEPS):
         normals = normals_of(out, triangles)
         step = field - (field * normals).sum(1, keepdims=True) * normals
-        _, face, barycentric = closest_points((out + step)[moves], truth, faces)
-        out[moves] = barycentric_points(truth, faces, face, barycentric)
+        _, face, barycentric = closest_points((out + step)[free], truth, faces)
+        out[free] = barycentric_points(truth, faces, face, barycentric)
     return out
 
 
@@ -183,7 +186,7 @@ def head(
     contrast: float = 0.15,
     pixel_noise: float = 0.0,
 ) -> Problem:
-    """An expression of a model's head.
+    """Return the problem of an expression of a model's head.
 
     Args:
         coefficients: of the first expression modes.
@@ -198,14 +201,14 @@ def head(
     parameters.expression[: len(coefficients)] = torch.tensor(coefficients)
     truth = model(parameters).double().numpy()
     face, outside = group(data, "hockey_mask") > 0.5, exterior(data)
-    middle = (truth[face].min(0) + truth[face].max(0)) / 2
+    centre = (truth[face].min(0) + truth[face].max(0)) / 2
     height = 1.6 * float(np.ptp(truth[face, 1]))
-    cameras = [camera(middle, *view, height, head_px) for view in views]
+    cameras = [camera(centre, *view, height, head_px) for view in views]
     rest, triangles = data.template_vertex_positions, data.triangles
     texture = noise_texture(triangles, corner_uvs, rest, texture_px, contrast=contrast, wavelengths_mm=(5.0, 20.0))
-    apart = vertex_classes(data)[1][:, [1, 2, 6]].sum(1)  # eyes and mouth interior
-    judged = face & outside & (lids(data) < 0.5) & (inner_lips(data) < 0.5)
-    judged &= times_seen(truth, triangles, cameras) > 1
+    excluded = vertex_classes(data)[1][:, [1, 2, 6]].sum(1)  # eyes and mouth interior
+    evaluated = face & outside & (lids(data) < 0.5) & (inner_lips(data) < 0.5)
+    evaluated &= visible_camera_count(truth, triangles, cameras) > 1
     left_cheek = truth[(blush(data) > 0.5) & (rest[:, 0] > 0)].mean(0)
     return Problem(
         triangles=triangles,
@@ -213,57 +216,53 @@ def head(
         texture=texture,
         weights=confident_texels(data, np.ones(len(truth))),
         truth=truth,
-        start=slid(truth, triangles, outside, slide_mm),
-        moves=outside,
-        judged=face
-        & outside
-        & (lids(data) < 0.5)
-        & (inner_lips(data) < 0.5)
-        & (times_seen(truth, triangles, cameras) > 1),
+        initial=slide(truth, triangles, outside, slide_mm),
+        free=outside,
+        evaluated=evaluated,
         cheek=np.exp(-0.5 * np.square((truth - left_cheek) / 0.025).sum(1)),
-        batch=photograph(triangles, corner_uvs, truth, texture, 1 - apart, cameras, pixel_noise),
+        batch=render_targets(triangles, corner_uvs, truth, texture, 1 - excluded, cameras, pixel_noise),
     )
 
 
 class OnSurface:
-    """Mean squared distance from the true surface, in mm^2: nothing that tells where on it a vertex belongs."""
+    """Mean squared distance from the true surface, mm^2; it does not constrain tangential positions."""
 
     def __init__(self, problem: Problem):
         self._truth = problem.truth
-        self._faces = problem.triangles[problem.moves[problem.triangles].all(1)]
-        self._moves = torch.as_tensor(np.flatnonzero(problem.moves))
+        self._faces = problem.triangles[problem.free[problem.triangles].all(1)]
+        self._free = torch.as_tensor(np.flatnonzero(problem.free))
         self._calls = 0
 
     def __call__(self, vertices: Tensor) -> Tensor:
-        own = vertices.index_select(0, self._moves)
+        points = vertices.index_select(0, self._free)
         if self._calls % _SURFACE_EVERY == 0:
-            _, face, barycentric = closest_points(own.detach().numpy(), self._truth, self._faces)
+            _, face, barycentric = closest_points(points.detach().numpy(), self._truth, self._faces)
             a, b, c = (self._truth[self._faces[face, k]] for k in range(3))
             normal = np.cross(b - a, c - a)
             normal /= np.linalg.norm(normal, axis=1, keepdims=True)
             foot = barycentric_points(self._truth, self._faces, face, barycentric)
             self._foot, self._normal = (torch.as_tensor(p, dtype=torch.float32) for p in (foot, normal))
         self._calls += 1
-        return (MM_PER_M * ((own - self._foot) * self._normal).sum(1)).square().mean()
+        return (MM_PER_M * ((points - self._foot) * self._normal).sum(1)).square().mean()
 
 
 def fit(
     problem: Problem,
     terms: Mapping[str, Term],
-    start: Float[np.ndarray, "V 3"],
+    initial: Float[np.ndarray, "V 3"],
     stages: Sequence[tuple[int, float, float, float]],
 ) -> Float[np.ndarray, "V 3"]:
-    """Move the skin's vertices by large steps; stages are steps, smoothing (mm), first and last rate (m)."""
-    moves = np.flatnonzero(problem.moves)
-    local = np.cumsum(problem.moves) - 1
-    own = local[problem.triangles[problem.moves[problem.triangles].all(1)]]
-    ends = problem.truth[moves][edges(own).vertices]
+    """Fit the skin's vertices by large steps; stages are steps, smoothing (mm), first and last rate (m)."""
+    free = np.flatnonzero(problem.free)
+    local = np.cumsum(problem.free) - 1
+    skin = local[problem.triangles[problem.free[problem.triangles].all(1)]]
+    ends = problem.truth[free][edges(skin).vertices]
     edge_length = float(np.median(np.linalg.norm(ends[:, 0] - ends[:, 1], axis=1)))
-    base, index = torch.as_tensor(start, dtype=torch.float32), torch.as_tensor(moves)
-    offsets = torch.zeros(len(moves), 3)
+    base, index = torch.as_tensor(initial, dtype=torch.float32), torch.as_tensor(free)
+    offsets = torch.zeros(len(free), 3)
     for steps, smoothing_mm, first, last in stages:
         large = LargeSteps(
-            own, len(moves), edge_length_m=edge_length, smoothing_m=smoothing_mm / MM_PER_M, device=base.device
+            skin, len(free), edge_length_m=edge_length, smoothing_m=smoothing_mm / MM_PER_M, device=base.device
         )
         latent = large.latent(offsets).requires_grad_()
 

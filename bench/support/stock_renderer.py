@@ -26,7 +26,7 @@ def iteration(
     triangles: Int[np.ndarray, "F 3"],
     corner_uvs: Float[np.ndarray, "F 3 2"],
     texture: Float[torch.Tensor, "R R 3"],
-    moved: Callable[[], Float[torch.Tensor, "V 3"]],
+    next_vertices: Callable[[], Float[torch.Tensor, "V 3"]],
 ) -> Callable[[], None]:
     """Return a function that renders all views and propagates random adjoint images to vertices and texture.
 
@@ -35,7 +35,7 @@ def iteration(
         triangles: of vertices that are not duplicated at uv seams.
         corner_uvs: of the atlas.
         texture: linear.
-        moved: returns the vertices of each iteration.
+        next_vertices: returns the vertices of each iteration.
     """
     import drjit as dr
     import mitsuba as mi
@@ -51,7 +51,7 @@ def iteration(
     properties["bsdf"] = mi.load_dict({"type": "twosided", "bsdf": {"type": "diffuse", "reflectance": image}})
     mesh = mi.Mesh("head", len(rows), len(triangles), has_vertex_texcoords=True, props=properties)
     params = mi.traverse(mesh)
-    params["vertex_positions"] = _split(moved(), welded)
+    params["vertex_positions"] = _split(next_vertices(), welded)
     params["vertex_texcoords"] = mi.Float(uvs.astype(np.float32).ravel())
     params["faces"] = mi.UInt32(faces.astype(np.uint32).ravel())
     params.update()
@@ -70,7 +70,7 @@ def iteration(
 
     def iterate() -> None:
         nonlocal seed
-        positions, texels = mi.Float(moved().detach().reshape(-1)), mi.TensorXf(texture.detach())
+        positions, texels = mi.Float(next_vertices().detach().reshape(-1)), mi.TensorXf(texture.detach())
         dr.enable_grad(positions, texels)
         params[positions_key] = dr.ravel(dr.gather(mi.Point3f, positions, welded))
         params[texels_key] = texels

@@ -8,11 +8,11 @@ from scipy.spatial.transform import Rotation
 
 from bench.support.crossed_parts import (
     displaced,
-    moved,
     pressed_lid,
     raised_lower_lip,
     teeth_of,
     tooth_depths_mm,
+    translated_part,
     winding,
 )
 from registration.errors import InputError
@@ -66,12 +66,12 @@ def squeezed(data: GNMData) -> torch.Tensor:
 
 CROSSED: dict[str, Callable[[GNMData], torch.Tensor]] = {
     "lids-eyeballs": lambda data: pressed_lid(data, 1.0),
-    "lips-teeth": lambda data: moved(data, regions.lips(data)[0], (0.0, 0.0, -6.0)),
+    "lips-teeth": lambda data: translated_part(data, regions.lips(data)[0], (0.0, 0.0, -6.0)),
     "upper-lower lip": lambda data: raised_lower_lip(data, 2.0),
-    "tongue-teeth": lambda data: moved(data, regions.tongue(data), (4.0, 0.0, 0.0)),
-    "tongue-lips": lambda data: moved(data, regions.tongue(data), (0.0, 2.0, 15.0)),
-    "tongue-palate": lambda data: moved(data, regions.tongue(data), (0.0, 14.0, 0.0)),
-    "tongue-gums": lambda data: moved(data, regions.tongue(data), (0.0, -4.0, 6.0)),
+    "tongue-teeth": lambda data: translated_part(data, regions.tongue(data), (4.0, 0.0, 0.0)),
+    "tongue-lips": lambda data: translated_part(data, regions.tongue(data), (0.0, 2.0, 15.0)),
+    "tongue-palate": lambda data: translated_part(data, regions.tongue(data), (0.0, 14.0, 0.0)),
+    "tongue-gums": lambda data: translated_part(data, regions.tongue(data), (0.0, -4.0, 6.0)),
     "ears-head": squeezed,
 }
 
@@ -110,7 +110,7 @@ def test_a_part_without_vertices_has_no_contacts(name):
 def test_a_tooth_in_the_tongue_displaces_both():
     data = tiny_model()
     penalty = SelfIntersectionPenalty(data, CPU)
-    vertices = moved(data, regions.tongue(data), (0.0, -8.0, 0.0)).requires_grad_(True)
+    vertices = translated_part(data, regions.tongue(data), (0.0, -8.0, 0.0)).requires_grad_(True)
     penalty.update_candidates(vertices)
     penalty(vertices)["tongue-teeth"].backward()
     up, tongue, teeth = vertices.grad[:, 1], regions.tongue(data), regions.teeth(data)
@@ -153,7 +153,7 @@ def test_excess_depths_are_in_millimetres_of_the_scaled_head(full, penalty):
 def test_accepted_rest_depths_cost_nothing_in_their_pairs_alone():
     data = tiny_model()
     penalty = SelfIntersectionPenalty(data, CPU)
-    crossed = moved(data, regions.tongue(data), (0.0, -8.0, 0.0))
+    crossed = translated_part(data, regions.tongue(data), (0.0, -8.0, 0.0))
 
     def cost(pair: str) -> float:
         penalty.update_candidates(crossed)
@@ -216,7 +216,7 @@ def test_a_tongue_pushed_into_the_teeth(full, penalty, direction):
     assert len(teeth) == 32
     deepest = []
     for push in (0.0, 1.0, 2.0, 3.0, 4.0, 5.0):
-        vertices = moved(full, tongue, tuple(push * axis for axis in direction))
+        vertices = translated_part(full, tongue, tuple(push * axis for axis in direction))
         penalty.update_candidates(vertices)
         excess = penalty.excess_mm(vertices)["tongue-teeth"].numpy()[tongue]
         points = vertices.numpy().astype(np.float64)

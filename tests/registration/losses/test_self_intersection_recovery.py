@@ -29,8 +29,8 @@ def test_crossed_lips_are_separated(data):
     recovery = recover(data, raised_lower_lip(data, 2.0), steps=100, rate=2e-4)
     assert (lip_depths_mm(data, recovery.before) - rest).max() > 1.2
     assert (lip_depths_mm(data, recovery.after) - rest).max() < 0.1
-    assert recovery.moved_mm(cheeks(data)) < 0.3
-    assert recovery.moved_mm(np.logical_or(*regions.lips(data))) < 2.5
+    assert recovery.max_motion_mm(cheeks(data)) < 0.3
+    assert recovery.max_motion_mm(np.logical_or(*regions.lips(data))) < 2.5
 
 
 def test_an_eyelid_is_moved_out_of_the_eyeball_and_no_further(data):
@@ -40,4 +40,4 @@ def test_an_eyelid_is_moved_out_of_the_eyeball_and_no_further(data):
     assert (pressed - rest).max() > 0.7 and (freed - rest).max() < 0.1
     # Vertices in the eyeball at rest remain there: contact is no intersection.
     assert (freed > 0.1).sum() > 0.8 * (rest > 0.1).sum()
-    assert recovery.moved_mm(regions.exterior(data)) < 1.3 and recovery.moved_mm(cheeks(data)) < 0.05
+    assert recovery.max_motion_mm(regions.exterior(data)) < 1.3 and recovery.max_motion_mm(cheeks(data)) < 0.05

@@ -47,11 +47,11 @@ def problem() -> Problem:
         texture=texture,
         weights=skin.astype(float),
         truth=points,
-        start=sliding.slid(points, triangles, skin, 2.0),
-        moves=skin,
-        judged=skin & (sliding.times_seen(points, triangles, cameras) > 1),
+        initial=sliding.slide(points, triangles, skin, 2.0),
+        free=skin,
+        evaluated=skin & (sliding.visible_camera_count(points, triangles, cameras) > 1),
         cheek=np.exp(-0.5 * np.square((points - [0, -0.02, RADIUS]) / 0.025).sum(1)),
-        batch=sliding.photograph(triangles, corner_uvs, points, texture, skin.astype(float), cameras, 0.005),
+        batch=sliding.render_targets(triangles, corner_uvs, points, texture, skin.astype(float), cameras, 0.005),
     )
 
 
@@ -63,13 +63,13 @@ def cost(problem: Problem, vertices: np.ndarray, batch: Targets | None = None, *
 def test_the_cost_of_sliding_exceeds_that_of_the_truth(problem):
     at_truth = cost(problem, problem.truth)
     assert 0 < at_truth < 0.03
-    assert cost(problem, problem.start) > 5 * at_truth
+    assert cost(problem, problem.initial) > 5 * at_truth
     # A uniform texture gives no information.
-    assert cost(problem, problem.start, texture=torch.full_like(problem.texture, 0.3)) > 0.3
+    assert cost(problem, problem.initial, texture=torch.full_like(problem.texture, 0.3)) > 0.3
 
 
 def test_unknown_textures_and_pixels_cost_nothing(problem):
-    vertices = torch.tensor(problem.start, dtype=torch.float32, requires_grad=True)
+    vertices = torch.tensor(problem.initial, dtype=torch.float32, requires_grad=True)
     for silent in (
         replace(problem, weights=np.zeros(len(problem.truth))),
         replace(problem, batch=replace(problem.batch, rgb_weight=torch.zeros_like(problem.batch.rgb_weight))),
@@ -87,7 +87,7 @@ def test_gradient_equals_finite_differences(problem):
     loss = problem.loss(SIZE_PX, torch.float64)
     rgb = problem.batch.rgb.double()
     batch = replace(problem.batch, rgb=rgb, rgb_weight=torch.ones_like(rgb[:, 0]))
-    start = torch.as_tensor(problem.start).requires_grad_()
+    start = torch.as_tensor(problem.initial).requires_grad_()
     (gradient,) = torch.autograd.grad(loss(start, batch), start)
     rng = np.random.default_rng(0)
     for _ in range(3):
@@ -96,7 +96,7 @@ def test_gradient_equals_finite_differences(problem):
         with torch.no_grad():
             difference = (loss(start + step * direction, batch) - loss(start - step * direction, batch)) / (2 * step)
         assert (gradient * direction).sum().item() == pytest.approx(difference.item(), rel=1e-5)
-    unobserved = torch.as_tensor(~problem.moves | (problem.truth[:, 2] < -0.06))
+    unobserved = torch.as_tensor(~problem.free | (problem.truth[:, 2] < -0.06))
     assert not gradient[unobserved].any()
 
 
@@ -106,7 +106,7 @@ def test_repeated_evaluations_are_equal(problem):
     try:
         runs = []
         for _ in range(4):
-            vertices = torch.tensor(problem.start, dtype=torch.float32, requires_grad=True)
+            vertices = torch.tensor(problem.initial, dtype=torch.float32, requires_grad=True)
             value = problem.loss(SIZE_PX)(vertices, problem.batch)
             runs.append((value, *torch.autograd.grad(value, vertices)))
     finally:
@@ -120,9 +120,9 @@ def test_pixels_without_weight_have_no_effect(problem):
     image = batch.pixels.x > 50  # the right half of every image
     weight = batch.rgb_weight * ~image
     randomized = torch.where(image[:, None], torch.rand(batch.rgb.shape), batch.rgb)
-    clean = cost(problem, problem.start, replace(batch, rgb_weight=weight))
-    assert cost(problem, problem.start, replace(batch, rgb=randomized, rgb_weight=weight)) == clean
-    assert cost(problem, problem.start, replace(batch, rgb=randomized)) > clean + 0.05
+    clean = cost(problem, problem.initial, replace(batch, rgb_weight=weight))
+    assert cost(problem, problem.initial, replace(batch, rgb=randomized, rgb_weight=weight)) == clean
+    assert cost(problem, problem.initial, replace(batch, rgb=randomized)) > clean + 0.05
 
 
 def test_hidden_texels_are_not_compared(problem):
@@ -148,7 +148,9 @@ def test_resolutions_of_the_reference_agree(problem):
     half = torch.nn.functional.avg_pool2d(problem.texture.permute(2, 0, 1), 2).permute(1, 2, 0)
     double = problem.texture.repeat_interleave(2, 0).repeat_interleave(2, 1)
     for texture in (half, double):
-        assert cost(problem, problem.start, texture=texture) == pytest.approx(cost(problem, problem.start), rel=1e-4)
+        assert cost(problem, problem.initial, texture=texture) == pytest.approx(
+            cost(problem, problem.initial), rel=1e-4
+        )
 
 
 def test_windows_contain_one_chart(problem):
@@ -190,13 +192,15 @@ STAGES = ((40, 20.0, 4e-3, 2e-3), (40, 8.0, 2e-3, 1e-4))
 
 
 def test_slid_vertices_are_recovered(problem):
-    before = rms(problem.tangential_mm(problem.start))
+    before = rms(problem.tangential_mm(problem.initial))
     assert 1.5 < before < 2.5
-    without = search(problem, problem.start, None, STAGES)
+    without = search(problem, problem.initial, None, STAGES)
     assert rms(problem.tangential_mm(without)) > 0.7 * before
-    back = search(problem, problem.start, problem.batch, STAGES)
+    back = search(problem, problem.initial, problem.batch, STAGES)
     assert rms(problem.tangential_mm(back)) < 0.3
-    distance_m = np.linalg.norm(back[problem.judged], axis=1) - np.linalg.norm(problem.truth[problem.judged], axis=1)
+    distance_m = np.linalg.norm(back[problem.evaluated], axis=1) - np.linalg.norm(
+        problem.truth[problem.evaluated], axis=1
+    )
     assert 1e3 * rms(distance_m) < 0.1  # still on the surface
 
 
@@ -230,7 +234,7 @@ def test_an_expression_of_the_full_head():
     problem = sliding.head(
         data, coefficients=coefficients.tolist(), views=views, head_px=160, texture_px=1024, slide_mm=2.0
     )
-    before = rms(problem.tangential_mm(problem.start))
-    back = search(problem, problem.start, problem.batch, (*STAGES, (30, 4.0, 1e-3, 5e-5)), 320)
+    before = rms(problem.tangential_mm(problem.initial))
+    back = search(problem, problem.initial, problem.batch, (*STAGES, (30, 4.0, 1e-3, 5e-5)), 320)
     print(before, rms(problem.tangential_mm(back)))
     assert before > 1.5 and rms(problem.tangential_mm(back)) < 0.3
