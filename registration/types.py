@@ -224,3 +224,13 @@ class Registration:
     figures: Mapping[str, Any] = field(default_factory=dict)
     config: Mapping[str, Any] = field(default_factory=dict)  # the resolved configuration
     inputs: Mapping[str, str] = field(default_factory=dict)  # name -> sha256
+
+
+# Distance metrics among a registration's figures, as the report and the command line title them.
+METRIC_TITLES = {
+    "scan_to_mesh": "Scan to mesh",
+    "scan_to_mesh_by_area": "Scan to mesh, by area",
+    "mesh_to_scan": "Mesh to scan",
+    "vertex_error": "Vertex error",
+    "drift": "Drift from the neutral",
+}

@@ -9,14 +9,12 @@ registration can avoid. What counts is the excess over the depth in the template
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from registration.errors import InputError
-from registration.evaluate.console_table import print_audit
 from registration.frames import MM_PER_M
 from registration.geometry.closest_point import closest_points
 from registration.geometry.self_overlap import SelfOverlap
@@ -24,7 +22,6 @@ from registration.geometry.topology import connected_parts
 from registration.geometry.winding import Winding, closed
 from registration.model import gnm_npz, regions
 from registration.model.gnm_npz import GNMData
-from registration.storage.registration_folder import load_registration, update_figures
 
 TOLERANCE_MM = 0.3
 BEYOND_KEY = f"vertices_beyond_{TOLERANCE_MM}mm"
@@ -111,34 +108,6 @@ def audit_penetration(vertices: Float[np.ndarray, "V 3"], data: GNMData, scale: 
         members = np.flatnonzero((depth > 0) | (baseline > 0))
         pairs.append(PartPair(name=name, vertices=members, depth_mm=depth[members], baseline_mm=baseline[members]))
     return PenetrationAudit(pairs=tuple(pairs))
-
-
-def audit_folder(registration_dir: Path, model: Path) -> PenetrationAudit:
-    """Audit a registration folder, print the table and add the metrics to its manifest.
-
-    Args:
-        registration_dir: the registration folder.
-        model: the model that the registration was computed with.
-
-    Returns:
-        The audit.
-
-    Raises:
-        InputError: the folder or the model cannot be read, or the model has another topology.
-    """
-    registration, data = load_registration(registration_dir), gnm_npz.read(model)
-    if not np.array_equal(registration.triangles, data.triangles):
-        raise InputError(
-            "Registration and model have different topologies",
-            where=model,
-            expected=f"the triangles of {registration_dir}",
-            got="others",
-            fix="give the model that the registration was computed with",
-        )
-    audit = audit_penetration(registration.vertices, data, float(registration.scale))
-    update_figures(registration_dir, {"intersections": audit.metrics})
-    print_audit(audit.metrics, title=f"{registration_dir}: {registration.status}")
-    return audit
 
 
 # By the model's content hash; only the last model, which all captures of a process usually share.

@@ -12,15 +12,8 @@ from registration.report.inputs import ReportInputs, ReportView
 from registration.report.pictures import CLASS_COLOURS, data_uri, view_images
 from registration.report.templates import environment
 from registration.storage.hashing import to_jsonable
-from registration.types import Registration
+from registration.types import METRIC_TITLES, Registration
 
-METRIC_TITLES = {
-    "scan_to_mesh": "Scan to mesh",
-    "scan_to_mesh_by_area": "Scan to mesh, 100,000 points by area",
-    "mesh_to_scan": "Mesh to scan",
-    "vertex_error": "Vertex error against the ground truth",
-    "drift": "Drift from the neutral",
-}
 STATISTICS = {"mean_mm": "mean", "median_mm": "median", "std_mm": "std", "p95_mm": "p95"}
 _OPEN_VIEWS = 4  # whose normals and classes are unfolded at first
 

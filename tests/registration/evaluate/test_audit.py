@@ -1,23 +1,18 @@
 import dataclasses
-import io
 
 import numpy as np
 import pytest
 import torch
 import trimesh
-from rich.console import Console
 
 from registration.errors import InputError
-from registration.evaluate.audit import BEYOND_KEY, PartPair, PenetrationAudit, audit_folder, audit_penetration
-from registration.evaluate.console_table import print_audit
+from registration.evaluate.audit import BEYOND_KEY, PartPair, PenetrationAudit, audit_penetration
 from registration.geometry.topology import vertex_normals
 from registration.geometry.winding import closed
 from registration.model import gnm_npz, regions
 from registration.model.gnm_npz import GNMData
-from registration.storage.registration_folder import load_registration, save_registration
 from tests.conftest import SHARED, needs_shared
 from tests.fixtures.make_fixtures import tiny_model
-from tests.registration.evaluate.test_evaluation import a_registration
 from tests.registration.geometry.sausage import RADIUS, end, sausage
 from tests.registration.geometry.test_winding import by_ray
 
@@ -205,31 +200,6 @@ def test_a_mesh_that_is_not_the_models_is_rejected():
     with pytest.raises(InputError, match="cannot be audited") as caught:
         audit_penetration(broken, data)
     assert "1 not finite" in caught.value.got
-
-
-def test_a_folder_is_audited_printed_and_keeps_its_metrics(tmp_path, capsys):
-    data = balls()
-    gnm_npz.write(data, tmp_path / "model.npz")
-    vertices = data.template_vertex_positions.copy()
-    vertices[regions.tongue(data)] -= np.float32([0.007, 0, 0])
-    save_registration(a_registration(vertices, data.triangles), tmp_path / "r")
-    metrics = audit_folder(tmp_path / "r", tmp_path / "model.npz").metrics
-    assert load_registration(tmp_path / "r").figures["intersections"] == metrics
-    assert metrics[BEYOND_KEY] == metrics["pairs"]["tongue in teeth"][BEYOND_KEY] > 10
-    assert "tongue in teeth" in capsys.readouterr().out
-    save_registration(a_registration(vertices, data.triangles[1:]), tmp_path / "other")
-    with pytest.raises(InputError, match="different topologies"):
-        audit_folder(tmp_path / "other", tmp_path / "model.npz")
-
-
-def test_the_table_has_a_row_for_every_pair():
-    row = {"template_vertices": 1049, "template_max_mm": 4.441, BEYOND_KEY: 7, "max_excess_mm": 0.809}
-    console = Console(file=io.StringIO(), width=120)
-    pairs = {"tongue in gums": row, "skin in itself": {**row, BEYOND_KEY: 0}}
-    print_audit({BEYOND_KEY: 6, "pairs": pairs}, "title", console)
-    text = console.file.getvalue()
-    for piece in ("title", "tongue in gums", "skin in itself", "1,049", "4.44", "7", "0.81", "6 vertices", "0.3 mm"):
-        assert piece in text
 
 
 # --- the real model

@@ -190,7 +190,7 @@ def test_the_table_prints_every_metric(tmp_path):
     console = Console(file=io.StringIO(), width=120)
     print_metrics(metrics, "title", console)
     text = console.file.getvalue()
-    for name in ("scan to mesh", "scan to mesh, by area", "mesh to scan", "vertex error", "1.000"):
+    for name in ("Scan to mesh", "Scan to mesh, by area", "Mesh to scan", "Vertex error", "1.000"):
         assert name in text
     assert "drift" not in text
 
@@ -210,7 +210,7 @@ def test_the_truth_has_no_error_and_metrics_are_stored(tmp_path, capsys):
     assert stored["vertex_error"]["face"]["mean_mm"] == 0 and stored["scan_to_mesh"]["face"]["p95_mm"] < 1e-6
     assert stored["face_ball"]["landmarks"] == "capture"
     assert 4000 < stored["scan_to_mesh"]["face"]["points"] < 7000
-    assert stored == evaluation.metrics and "vertex error" in capsys.readouterr().out
+    assert stored == evaluation.metrics and "Vertex error" in capsys.readouterr().out
     assert (tmp_path / "r" / "report.html").read_text() == "kept"
 
 
