@@ -45,7 +45,7 @@ from workflows.farm.coregistration import coregister
 from workflows.farm.plan import RoundSettings, make_plan
 from workflows.records.coregistration import FIRST_MODEL as FIRST
 from workflows.records.held_out import read_held_out
-from workflows.steps.hold_out import PEOPLE
+from workflows.steps.hold_out import HELD_OUT
 from workflows.steps.synthesize import Population, synth_dataset
 
 COMPONENTS = (10, 20, 40)
@@ -148,7 +148,7 @@ def main() -> None:
     if result.stopped:
         sys.exit(result.stopped)
     print(f"captures {count} seconds {captured - start:.0f}; rounds {time.perf_counter() - captured:.0f}")
-    subjects = read_held_out(options.out / "rounds" / "held_out" / PEOPLE).subjects
+    subjects = read_held_out(options.out / "rounds" / "held_out" / HELD_OUT).subjects
     models = {name: gnm_npz.read(Path(file)) for name, file in result.state.models.items()}
     names = list(models)
     samples = model_samples(models[FIRST], options.training, options.seed)

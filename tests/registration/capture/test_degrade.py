@@ -18,16 +18,8 @@ from registration.capture.scan import read_scan
 from registration.errors import InputError
 from registration.types import Capture, View
 from tests.conftest import SHARED, needs_shared
-from tests.registration.capture.small import (
-    CLASSES,
-    DISTORTIONS,
-    ball,
-    camera,
-    distorted,
-    landmarks_68,
-    make,
-    synthetic_view,
-)
+from tests.registration.capture import small
+from tests.registration.capture.small import CLASSES, DISTORTIONS, ball, camera, landmarks_68, make
 
 YAWS_RAD = (-1.2, -0.8, -0.3, 0.1, 0.4, 0.8, 1.1)
 MANY = 1000  # landmarks of a second scheme, for statistics
@@ -43,8 +35,8 @@ def source(tmp_path_factory: pytest.TempPathFactory) -> Path:
     for number, yaw_rad in enumerate(YAWS_RAD):
         lens = DISTORTIONS["OPENCV"] if number == 2 else ()
         cam = camera(yaw_rad, distortion=lens, width_px=240, height_px=320)
-        view = synthetic_view(f"left/cam{number}" if number < 2 else f"cam{number}", cam)
-        many = np.column_stack([distorted(cam, sphere), np.where(np.arange(MANY) % 2, 1.0, 0.2)])
+        view = small.synthetic_view(f"left/cam{number}" if number < 2 else f"cam{number}", cam)
+        many = np.column_stack([small.distorted(cam, sphere), np.where(np.arange(MANY) % 2, 1.0, 0.2)])
         views.append(replace(view, landmarks={**view.landmarks, "many": many}))
     root = tmp_path_factory.mktemp("source") / "capture"
     tags = {"age": 30, "notes": 'with "quotes"'}
@@ -102,7 +94,7 @@ def test_camera_errors_equal_those_of_the_preset(source: Path, degraded: Path) -
     angles, distances, zooms = [], [], []
     for before, after in pairs(source, degraded):
         old, new = before.camera, after.camera
-        plain = [distorted(replace(cam, distortion=()), points) for cam in (old, new)]
+        plain = [small.distorted(replace(cam, distortion=()), points) for cam in (old, new)]
         error_px = np.sqrt(((plain[1] - plain[0]) ** 2).sum(-1).mean())
         assert error_px == pytest.approx(0.3 * preset_factor(degraded), rel=0.03)
         assert new.distortion == pytest.approx(old.distortion)
