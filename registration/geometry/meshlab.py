@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 
+import lagrange  # noqa: F401  before PyMeshLab: with PyMeshLab's older TBB loaded first, Lagrange cannot start
 import numpy as np
 from jaxtyping import Float, Int
 
