@@ -27,6 +27,7 @@ _MODELS: dict[str, Callable[..., tuple[float, ...]]] = {
     "FULL_OPENCV": lambda *parameters: parameters,
 }
 _WRITTEN = {0: "PINHOLE", 4: "OPENCV", 5: "FULL_OPENCV", 8: "FULL_OPENCV"}  # by number of distortion coefficients
+_NEEDED = ("cameras", "images")  # files of a model; points, rigs and frames may be missing
 _GREY = 128  # colour of points that have none
 _SAME_POSE = 1e-6  # entries of two matrices of one pose, metres and cosines
 
@@ -161,9 +162,6 @@ def _model_folder(sparse: Path) -> Path:
 def _kinds(folder: Path) -> list[str]:
     """Which of the two kinds of files hold cameras and images."""
     return [kind for kind in ("bin", "txt") if all((folder / f"{name}.{kind}").is_file() for name in _NEEDED)]
-
-
-_NEEDED = ("cameras", "images")
 
 
 def _read_model(folder: Path) -> ColmapModel:

@@ -20,6 +20,7 @@ from registration.capture.colmap_model import (
     ColmapModel,
     Pose,
     malformed,
+    rig_files,
 )
 from registration.errors import InputError
 
@@ -48,13 +49,12 @@ def read_binary_model(folder: Path) -> ColmapModel:
             cameras[number] = ColmapCamera(
                 model=name, width_px=width, height_px=height, parameters=parameters, where=where
             )
-    rigs, frames = folder / "rigs.bin", folder / "frames.bin"
-    both = rigs.is_file() and frames.is_file()
+    rigs = rig_files(folder, "bin")
     return ColmapModel(
         cameras=cameras,
         images=tuple(_binary_images(folder / "images.bin")),
-        sensors_from_rig=_binary_rigs(rigs) if both else {},
-        frames=tuple(_binary_frames(frames)) if both else (),
+        sensors_from_rig=_binary_rigs(rigs[0]) if rigs else {},
+        frames=tuple(_binary_frames(rigs[1])) if rigs else (),
     )
 
 

@@ -1,6 +1,7 @@
 """What a capture needs of a COLMAP model, as its files hold it: https://colmap.github.io/format.html."""
 
 from dataclasses import dataclass
+from pathlib import Path
 
 from registration.errors import InputError
 
@@ -68,3 +69,9 @@ def malformed(where: object, expected: object, got: object) -> InputError:
         got=got,
         fix="export the model again with COLMAP's model_converter, or see docs/formats.md",
     )
+
+
+def rig_files(folder: Path, suffix: str) -> tuple[Path, Path] | None:
+    """Return the files of rigs and of frames if the model has both; COLMAP before 3.12 wrote neither."""
+    rigs, frames = folder / f"rigs.{suffix}", folder / f"frames.{suffix}"
+    return (rigs, frames) if rigs.is_file() and frames.is_file() else None

@@ -16,6 +16,7 @@ from registration.capture.colmap_model import (
     ColmapModel,
     Pose,
     malformed,
+    rig_files,
 )
 from registration.errors import InputError
 
@@ -42,13 +43,12 @@ def read_text_model(folder: Path) -> ColmapModel:
         cameras[number] = ColmapCamera(
             model=model, width_px=size[0], height_px=size[1], parameters=parameters, where=where
         )
-    rigs, frames = folder / "rigs.txt", folder / "frames.txt"
-    both = rigs.is_file() and frames.is_file()
+    rigs = rig_files(folder, "txt")
     return ColmapModel(
         cameras=cameras,
         images=tuple(_text_images(folder / "images.txt")),
-        sensors_from_rig=_text_rigs(rigs) if both else {},
-        frames=tuple(_text_frames(frames)) if both else (),
+        sensors_from_rig=_text_rigs(rigs[0]) if rigs else {},
+        frames=tuple(_text_frames(rigs[1])) if rigs else (),
     )
 
 
