@@ -148,6 +148,7 @@ def _context(inputs: RegistrationInputs, seed: int, device: torch.device, progre
         recipe=recipe,
         seed=seed,
         neutral=inputs.neutral,
+        triangulated=inputs.landmarks,
     )
 
 

@@ -1,7 +1,7 @@
 """The parts of a fit that do not depend on the initial guess: model, targets, recipe, and what is derived from them."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
@@ -39,6 +39,8 @@ class FitContext:
     recipe: Recipe
     seed: int
     neutral: Registration | None = None  # of the subject, if the capture shows an expression
+    # Landmarks of the capture by scheme, triangulated over its views; world, metres; NaN where not possible.
+    triangulated: Mapping[str, Float[np.ndarray, "L 3"]] = field(default_factory=dict)
 
     @property
     def device(self) -> torch.device:

@@ -17,7 +17,7 @@ from registration.fit.optimizer import AdamBlock, AdamUniformBlock, History, Par
 from registration.fit.recipes import Lengths, Stage, rigid_stage
 from registration.fit.terms import StageContext, StepState, Term, make_terms
 from registration.fit.variables import InitialGuess, Variables
-from registration.fit.view_weights import HEAD_PX, ViewErrors, ViewWeights, view_errors
+from registration.fit.view_weights import HEAD_PX, MIN_ERROR_PX, ViewErrors, ViewWeights, view_errors
 from registration.frames import MM_PER_M
 from registration.geometry.large_steps import LargeSteps
 from registration.losses import image, landmark
@@ -26,6 +26,7 @@ from registration.types import Rendered, Targets
 
 _MOTION_FRACTION = 0.1  # of the last stage's steps, over which the motion of the vertices is measured
 _MAX_STEP_MM = 2.0  # of a region with a rate scale of its own, unless the stage itself steps further
+_AGREEING_VIEWS = 3  # that locate a landmark; of two, a wrong one moves the point along the other's ray
 _CONFIDENCE_BATCH = 4  # views rendered together at the finest level
 
 
@@ -214,7 +215,10 @@ class FitProblem:
         targets, vertices = self._coarsest_targets(), self.vertices()
         with torch.no_grad():
             rendered = self.context.renderer(vertices, None, targets.pixels)
-        residuals = list(self._landmark_residuals_by_view(vertices).values())
+        residuals = [
+            self._disagreement_px(name, residual_px)
+            for name, residual_px in self._landmark_residuals_by_view(vertices).items()
+        ]
         unknown = torch.full((self.context.view_count,), torch.nan)
         landmark_px = torch.cat(residuals, 1).nanmedian(1).values if residuals else unknown
         return view_errors(rendered, targets, landmark_px)
@@ -233,6 +237,25 @@ class FitProblem:
             used = (counted > 0) & torch.as_tensor(self.landmarks_used[name], device=self.context.device)
             residuals[name] = torch.where(used, residual_px, torch.nan)
         return residuals
+
+    def _disagreement_px(self, scheme: str, residual_px: Float[Tensor, "N L"]) -> Float[Tensor, "N L"]:
+        """The residuals from the mesh, or from where the views locate the landmark, whichever are smaller.
+
+        The mesh may be wrong at a landmark, or the scheme's definition of it: the views that see it, perhaps only
+        those of one side, agree with one another and not with the mesh. That is no fault of theirs.
+        """
+        points = self.context.triangulated.get(scheme)
+        if points is None:
+            return residual_px
+        finest = self.context.pyramid[0]
+        detected, located = (
+            torch.as_tensor(values, dtype=residual_px.dtype, device=residual_px.device)
+            for values in (finest.landmarks[scheme], points)
+        )
+        distance_px, counted = landmark.residuals(finest.pixels.cameras, located, detected, finest.px_per_head)
+        agree = (counted > 0) & (distance_px < MIN_ERROR_PX)  # not where it could not be triangulated: NaN
+        located_px = torch.where(agree.sum(0) >= _AGREEING_VIEWS, distance_px, torch.inf)
+        return torch.where(residual_px.isnan(), torch.nan, torch.minimum(residual_px, located_px))
 
     def landmark_residuals_px(self, triangulated: Mapping[str, Float[np.ndarray, "L 3"]]) -> dict[str, float]:
         """Return the median distance of the used landmarks from their points on the mesh, per scheme.

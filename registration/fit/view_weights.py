@@ -15,7 +15,7 @@ from torch import Tensor
 from registration.types import Rendered, Targets
 
 HEAD_PX = 512  # height of the head to which errors in pixels are scaled
-_MIN_ERROR_PX = 6.0  # at that height; below it no view is suspected
+MIN_ERROR_PX = 6.0  # at that height; below it no view is suspected
 _MAX_MEDIAN_RATIO = 3.0
 _MIN_LOG_BRIGHTNESS = 0.6  # difference of the logarithm: 1.8 times
 _MAX_MAD_RATIO = 6.0
@@ -23,7 +23,8 @@ _MAX_MAD_RATIO = 6.0
 
 @dataclass(frozen=True, kw_only=True)
 class ViewErrors:
-    """How far each view is from a mesh, px at 512 px of head height (NaN: unknown), and how bright it is."""
+    """How far each view is from a mesh and from the other views, px at 512 px of head height (NaN: unknown), and how
+    bright it is."""
 
     names: tuple[str, ...]
     outline_px: Float[Tensor, "N"]
@@ -60,7 +61,7 @@ class ViewWeights:
         geometry = torch.ones(len(errors.names))
         notes: dict[str, str] = {}
         for what, values in (("silhouette", errors.outline_px), ("landmarks", errors.landmark_px)):
-            limit = max(_MIN_ERROR_PX, _MAX_MEDIAN_RATIO * values.nanmedian().nan_to_num(0.0).item())
+            limit = max(MIN_ERROR_PX, _MAX_MEDIAN_RATIO * values.nanmedian().nan_to_num(0.0).item())
             for view in (values.nan_to_num(0.0) > limit).nonzero()[:, 0].tolist():
                 geometry[view] = min(geometry[view].item(), (limit / values[view].item()) ** 4)
                 notes.setdefault(errors.names[view], f"{what} {values[view].item():.0f} px off the other views")
@@ -101,7 +102,7 @@ def view_errors(rendered: Rendered, targets: Targets, landmark_px: Float[Tensor,
     Args:
         rendered: the mesh at the pixels of the targets.
         targets: of all views.
-        landmark_px: median residual of each view, px at 512 px of head height; NaN without landmarks.
+        landmark_px: median deviation of each view, px at 512 px of head height; NaN without landmarks.
 
     Returns:
         The outline's error is the area where the masks differ over the length of the target's outline.
