@@ -1,15 +1,20 @@
 """Read the meshes of a capture: its raw scan and the ground truth of synthetic ones, metres, capture world."""
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
-import trimesh
 from jaxtyping import Float, Int
 
 from registration.errors import InputError
 from registration.storage.npz import NpzSchema
+from registration.storage.ply import read_ply
 
+SCAN = "scan.ply"
+MAX_COORDINATE_M = 1e9  # beyond it, distances between vertices lose their meaning even in float64
+_MESH_SUFFIXES = frozenset(".ply .obj .stl .off .glb .gltf .fbx .dae .3ds .x3d .wrl .xyz .pts .pcd .las .e57".split())
+_PACKED_SUFFIXES = frozenset(".gz .bz2 .xz .zst .zip .7z".split())
 _TRUTH = NpzSchema(
     title="ground truth",
     fix="np.savez(path, vertices=...) with float (N, 3) vertices in metres, capture world",
@@ -24,27 +29,70 @@ class Scan:
 
     vertices: Float[np.ndarray, "V 3"]  # m, capture world
     triangles: Int[np.ndarray, "F 3"]
+    unused_vertices: int = 0  # of the file, left out here: no face has them
+    unused_faces: int = 0  # of the file, left out here: with fewer than three different corners, or repeated
+    unread: Mapping[str, int] = field(default_factory=dict)  # elements of the file that are not read -> their number
 
 
 def read_scan(path: Path) -> Scan:
     """Read a PLY file, vertices in the file's order, larger faces split into triangles.
 
+    Vertices that no face uses are left out: mesh programs leave them behind, off the surface. So are faces without an
+    area and repeated faces. A file whose faces are all unusable is a point cloud.
+
     Raises:
         InputError: the file cannot be read, has fewer than three vertices, non-finite vertices or wrong indices.
     """
     try:
-        mesh = trimesh.load(path, file_type="ply", process=False, maintain_order=True)
-        vertices = np.array(getattr(mesh, "vertices", ()), np.float64)
-        triangles = np.array(getattr(mesh, "faces", np.zeros((0, 3))), np.int64)
-    except Exception as error:  # a damaged file makes trimesh's parsers raise nearly anything
-        raise _input_error(path, "a PLY file with vertices and faces", f"{type(error).__name__}: {error}") from None
-    if vertices.ndim != 2 or vertices.shape[1:] != (3,) or len(vertices) < 3:
+        mesh = read_ply(path)
+    except (OSError, ValueError, MemoryError) as error:
+        raise _input_error(path, "a PLY file with vertices and faces", str(error) or type(error).__name__) from None
+    vertices, triangles = mesh.vertices, mesh.triangles
+    if len(vertices) < 3:
         raise _input_error(path, "at least three vertices", f"vertices of shape {vertices.shape}")
-    if not np.isfinite(vertices).all():
-        raise _input_error(path, "finite vertices", f"vertex {np.argwhere(~np.isfinite(vertices))[0, 0]} is not")
     if len(triangles) and not (triangles.min() >= 0 and triangles.max() < len(vertices)):
         raise _input_error(path, f"face indices below {len(vertices)}", f"{triangles.min()} to {triangles.max()}")
-    return Scan(vertices=vertices, triangles=triangles)
+    distinct = triangles[_distinct(triangles)]
+    used = np.ones(len(vertices), bool)
+    if len(distinct):
+        used = np.zeros(len(vertices), bool)
+        used[distinct] = True
+    broken = used & ~(np.abs(vertices) < MAX_COORDINATE_M).all(-1)
+    if broken.any():
+        got = f"vertex {int(np.flatnonzero(broken)[0])} is not, and {int(broken.sum()) - 1} more"
+        raise _input_error(path, "finite vertices", got)
+    return Scan(
+        vertices=vertices[used],
+        triangles=(np.cumsum(used) - 1)[distinct],
+        unused_vertices=int((~used).sum()),
+        unused_faces=len(triangles) - len(distinct),
+        unread=mesh.unread,
+    )
+
+
+def _distinct(triangles: Int[np.ndarray, "F 3"]) -> Int[np.ndarray, "D"]:
+    """Return the triangles with three different corners, the first of those with the same three, in order."""
+    if not len(triangles):
+        return np.zeros(0, np.int64)
+    corners = np.sort(triangles, 1)
+    valid = np.flatnonzero((corners[:, 0] < corners[:, 1]) & (corners[:, 1] < corners[:, 2]))
+    corners = corners[valid]
+    order = np.lexsort(corners.T)  # stable: of equal triangles the first in the file comes first
+    new = np.ones(len(order), bool)
+    new[1:] = (np.diff(corners[order], axis=0) != 0).any(1)
+    return np.sort(valid[order[new]])
+
+
+def unread_scans(root: Path) -> list[str]:
+    """Return the names of files in a capture folder that look like a scan but are not read: only scan.ply is."""
+    names = []
+    for path in sorted(root.iterdir()) if root.is_dir() else []:
+        name = path.name.lower()
+        packed = Path(name).suffix in _PACKED_SUFFIXES
+        suffix = Path(Path(name).stem).suffix if packed else Path(name).suffix
+        if path.name != SCAN and suffix in _MESH_SUFFIXES and path.is_file():
+            names.append(path.name)
+    return names
 
 
 def read_truth(path: Path) -> Float[np.ndarray, "N 3"]:
