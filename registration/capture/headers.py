@@ -1,5 +1,6 @@
 """Checks of image files without decoding their pixels: size, bit depth, truncation."""
 
+import mmap
 import os
 import struct
 import warnings
@@ -8,6 +9,7 @@ from pathlib import Path
 
 from PIL import Image, UnidentifiedImageError
 
+from registration.capture.tiff import is_tiff, read_tiff_header, refuse_tiff
 from registration.errors import InputError
 
 MAX_PIXELS = 2**28  # 16384 x 16384: beyond any camera, and a hostile header must not make us allocate more
@@ -43,10 +45,15 @@ def read_header(path: Path, role: str) -> Header:
             fix="add the file, or remove its view from the COLMAP model",
         )
     try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", Image.DecompressionBombWarning)  # MAX_PIXELS below is our limit
-            with Image.open(path) as image:
-                width_px, height_px = image.size
+        with path.open("rb") as file:
+            start = file.read(26)
+        if is_tiff(start):  # its own size, not that of the picture as displayed
+            width_px, height_px = _tiff_size(path, role)
+        else:
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore", Image.DecompressionBombWarning)  # MAX_PIXELS below is our limit
+                with Image.open(path) as image:
+                    width_px, height_px = image.size
     except Image.DecompressionBombError as error:
         raise _too_large(path, role, str(error)) from None
     except (UnidentifiedImageError, OSError, ValueError, SyntaxError) as error:
@@ -54,15 +61,21 @@ def read_header(path: Path, role: str) -> Header:
             f"The {role} is not a readable image",
             where=path,
             expected="a PNG, JPEG or TIFF file",
-            got=error,
-            fix="write the file again; its header is damaged",
+            got=f"a file that starts with {start[:8]!r}" if isinstance(error, UnidentifiedImageError) else error,
+            fix="convert it to PNG, JPEG or TIFF; if it is one, write it again: its header is damaged",
         ) from None
     if width_px * height_px > MAX_PIXELS:
         raise _too_large(path, role, f"{width_px} x {height_px}")
-    with path.open("rb") as file:
-        start = file.read(26)
     bits = start[24] if start.startswith(_PNG_SIGNATURE) and len(start) == 26 else None
     return Header(width_px=width_px, height_px=height_px, png_bits=bits)
+
+
+def _tiff_size(path: Path, role: str) -> tuple[int, int]:
+    with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
+        header = read_tiff_header(data)
+    if header.defect is not None:
+        raise refuse_tiff(path, role, header.defect)
+    return header.width_px, header.height_px
 
 
 def require_size(path: Path, role: str, width_px: int, height_px: int) -> Header:

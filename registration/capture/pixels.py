@@ -15,6 +15,7 @@ from jaxtyping import Float, UInt8
 from PIL import Image
 
 from registration.capture.headers import require_complete, require_size
+from registration.capture.tiff import decode_tiff, is_tiff
 from registration.errors import InputError
 from registration.frames import opencv_intrinsics, srgb_to_linear
 from registration.types import Camera, Capture, View, ViewPixels
@@ -153,7 +154,9 @@ def read_labels(path: Path, camera: Camera, classes: tuple[str, ...]) -> UInt8[n
 def _imread(path: Path, role: str, camera: Camera, flags: int) -> np.ndarray:
     require_size(path, role, camera.width_px, camera.height_px)
     require_complete(path, role)
-    pixels = cv2.imread(str(path), flags)
+    with path.open("rb") as file:
+        tiff = is_tiff(file.read(4))
+    pixels = decode_tiff(path, grey=flags == _GRAY) if tiff else cv2.imread(str(path), flags)
     if pixels is None or pixels.shape[:2] != (camera.height_px, camera.width_px):
         raise _input_error(path, role, "a decoding error")
     return pixels
