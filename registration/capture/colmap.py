@@ -27,6 +27,7 @@ _MODELS: dict[str, Callable[..., tuple[float, ...]]] = {
     "FULL_OPENCV": lambda *parameters: parameters,
 }
 _WRITTEN = {0: "PINHOLE", 4: "OPENCV", 5: "FULL_OPENCV", 8: "FULL_OPENCV"}  # by number of distortion coefficients
+_READERS = {"bin": read_binary_model, "txt": read_text_model}
 _NEEDED = ("cameras", "images")  # files of a model; points, rigs and frames may be missing
 _GREY = 128  # colour of points that have none
 _SAME_POSE = 1e-6  # entries of two matrices of one pose, metres and cosines
@@ -175,16 +176,17 @@ def _read_model(folder: Path) -> ColmapModel:
             got=", ".join(sorted(path.name for path in folder.iterdir())) or "an empty folder",
             fix="export the model again with COLMAP's model_converter",
         )
-    readers = {"bin": read_binary_model, "txt": read_text_model}
-    model, *others = [readers[kind](folder) for kind in kinds]
-    if others and (name := _difference(model, others[0])):
-        raise InputError(
-            "The COLMAP model is there twice, with other cameras",
-            where=folder,
-            expected="one model, or the same as .bin and as .txt",
-            got=f"they differ in {name}",
-            fix="remove the files that are out of date",
-        )
+    model = _READERS[kinds[0]](folder)
+    copies = [(folder, kind) for kind in kinds[1:]] + [(folder / "0", kind) for kind in _kinds(folder / "0")]
+    for place, kind in copies:
+        if name := _difference(model, _READERS[kind](place)):
+            raise InputError(
+                "The COLMAP model is there twice, with other cameras",
+                where=folder,
+                expected="one model, or the same as .bin and as .txt, and in the folder 0",
+                got=f"images.{kinds[0]} and {(place / f'images.{kind}').relative_to(folder)} differ in {name}",
+                fix="remove the files that are out of date",
+            )
     return model
 
 
@@ -214,11 +216,14 @@ def _check_frames(model: ColmapModel) -> None:
     for frame in model.frames:
         for camera_id, image_id in frame.images:
             image = images.get(image_id)
-            if image is None or (frame.rig_id, camera_id) not in model.sensors_from_rig:
+            if image is None:  # its view was removed
                 continue
+            key = (frame.rig_id, camera_id)
+            if key not in model.sensors_from_rig and (model.sensors_from_rig or len(frame.images) > 1):
+                continue  # without rigs a camera that is alone in its frame is the frame
             where = f"{image.where}: image {image.name}"
             rig_from_world = _matrix((frame.quaternion_wxyz, frame.translation), f"frame of image {image.name}")
-            sensor = model.sensors_from_rig[frame.rig_id, camera_id]
+            sensor = model.sensors_from_rig.get(key)
             expected = (
                 rig_from_world if sensor is None else _matrix(sensor, f"rig of image {image.name}") @ rig_from_world
             )
@@ -240,7 +245,8 @@ def _camera(source: ColmapCamera, T_cam_world: Float[np.ndarray, "4 4"], where: 
             where=where,
             expected=", ".join(_MODELS),
             got=source.model,
-            fix="undistort the images with COLMAP's image_undistorter, or calibrate with a supported model",
+            fix="undistort the images with `colmap image_undistorter`, and masks, normals, labels and landmarks likewise; "
+            "or calibrate again with a supported model, OPENCV or FULL_OPENCV for wide lenses",
         )
     fx, fy, cx, cy, *distortion = _MODELS[source.model](*source.parameters)
     if not all(map(math.isfinite, (fx, fy, cx, cy, *distortion))) or fx <= 0 or fy <= 0:

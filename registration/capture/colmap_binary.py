@@ -30,7 +30,7 @@ _MAX_NAME_BYTES = 4096
 
 
 def read_binary_model(folder: Path) -> ColmapModel:
-    """Read cameras.bin and images.bin, and rigs.bin and frames.bin where both are there.
+    """Read cameras.bin and images.bin, and rigs.bin and frames.bin where they are there.
 
     Raises:
         InputError: a file is missing, cut short, has a count that its size cannot hold, or an unknown camera model.
@@ -49,12 +49,12 @@ def read_binary_model(folder: Path) -> ColmapModel:
             cameras[number] = ColmapCamera(
                 model=name, width_px=width, height_px=height, parameters=parameters, where=where
             )
-    rigs = rig_files(folder, "bin")
+    rigs, frames = rig_files(folder, "bin")
     return ColmapModel(
         cameras=cameras,
         images=tuple(_binary_images(folder / "images.bin")),
-        sensors_from_rig=_binary_rigs(rigs[0]) if rigs else {},
-        frames=tuple(_binary_frames(rigs[1])) if rigs else (),
+        sensors_from_rig=_binary_rigs(rigs) if rigs else {},
+        frames=tuple(_binary_frames(frames)) if frames else (),
     )
 
 

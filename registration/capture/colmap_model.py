@@ -71,7 +71,7 @@ def malformed(where: object, expected: object, got: object) -> InputError:
     )
 
 
-def rig_files(folder: Path, suffix: str) -> tuple[Path, Path] | None:
-    """Return the files of rigs and of frames if the model has both; COLMAP before 3.12 wrote neither."""
+def rig_files(folder: Path, suffix: str) -> tuple[Path | None, Path | None]:
+    """Return the files of rigs and of frames, None for one that is missing; COLMAP before 3.12 wrote neither."""
     rigs, frames = folder / f"rigs.{suffix}", folder / f"frames.{suffix}"
-    return (rigs, frames) if rigs.is_file() and frames.is_file() else None
+    return rigs if rigs.is_file() else None, frames if frames.is_file() else None

@@ -1,6 +1,8 @@
 """Read the text files of a COLMAP model; every malformed line is an `InputError` that names it."""
 
+import codecs
 import math
+import re
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -22,7 +24,7 @@ from registration.errors import InputError
 
 
 def read_text_model(folder: Path) -> ColmapModel:
-    """Read cameras.txt and images.txt, and rigs.txt and frames.txt where both are there.
+    """Read cameras.txt and images.txt, and rigs.txt and frames.txt where they are there.
 
     An image may lack its line of image points, as hand-written models do. An image's name is the rest of its line.
 
@@ -43,12 +45,12 @@ def read_text_model(folder: Path) -> ColmapModel:
         cameras[number] = ColmapCamera(
             model=model, width_px=size[0], height_px=size[1], parameters=parameters, where=where
         )
-    rigs = rig_files(folder, "txt")
+    rigs, frames = rig_files(folder, "txt")
     return ColmapModel(
         cameras=cameras,
         images=tuple(_text_images(folder / "images.txt")),
-        sensors_from_rig=_text_rigs(rigs[0]) if rigs else {},
-        frames=tuple(_text_frames(rigs[1])) if rigs else (),
+        sensors_from_rig=_text_rigs(rigs) if rigs else {},
+        frames=tuple(_text_frames(frames)) if frames else (),
     )
 
 
@@ -114,15 +116,20 @@ def _is_number(word: str) -> bool:
 def _lines(file: Path, blank: bool = False) -> Iterator[_Line]:
     """Yield the lines of a text file but for comments, and for blank ones unless asked for."""
     try:
-        text = file.read_text("utf-8-sig")
+        content = file.read_bytes().removeprefix(codecs.BOM_UTF8)
     except FileNotFoundError:
         raise malformed(file, "the file, in UTF-8", "no such file") from None
-    except (OSError, UnicodeDecodeError) as error:
+    except OSError as error:
         raise malformed(file, "a text file in UTF-8", error) from None
-    for number, line in enumerate(text.splitlines(), 1):
-        if line.lstrip().startswith("#") or not (blank or line.strip()):
+    for number, raw in enumerate(
+        re.split(rb"\r\n|\n|\r", content), 1
+    ):  # no other character ends a line: names have them
+        if raw.lstrip().startswith(b"#") or not (blank or raw.strip()):
             continue
-        yield _Line(file, number, line)
+        try:
+            yield _Line(file, number, raw.decode("utf-8"))
+        except UnicodeDecodeError as error:
+            raise malformed(f"{file}, line {number}", "a text file in UTF-8", error) from None
 
 
 def _text_images(file: Path) -> Iterator[ColmapImage]:

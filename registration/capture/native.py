@@ -3,7 +3,7 @@
 import json
 import re
 import tomllib
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -11,6 +11,7 @@ from jaxtyping import Float
 
 from registration.capture.colmap import read_cameras
 from registration.capture.headers import require_size
+from registration.capture.image_names import image_file
 from registration.errors import InputError
 from registration.types import Camera, Capture, View
 
@@ -64,15 +65,7 @@ def natural_key(name: str) -> list[tuple[int, int, str]]:
 
 
 def _read_view(root: Path, file_name: str, camera: Camera) -> View:
-    relative = PurePosixPath(file_name)
-    if relative.is_absolute() or ".." in relative.parts or not relative.suffix:
-        raise InputError(
-            "An image name cannot be used",
-            where=root / "sparse",
-            expected="a path inside images/, with a suffix",
-            got=file_name,
-            fix="rename the image",
-        )
+    relative = image_file(root, file_name)
     image = _inside(root, root / "images" / relative)
     require_size(image, "image", camera.width_px, camera.height_px)
     landmarks = _optional(root, root / "landmarks" / relative.with_suffix(".json"))
@@ -106,15 +99,17 @@ def _inside(root: Path, path: Path) -> Path:
 
 def _check_names(root: Path, views: tuple[View, ...]) -> None:
     lengths: dict[str, tuple[int, str]] = {}
-    for first, second in zip(views, views[1:], strict=False):
-        if first.name == second.name:
+    images: dict[str, Path] = {}
+    for view in views:
+        if view.name in images:
             raise InputError(
                 "Two images differ in their suffix only",
                 where=root / "images",
                 expected="names that stay unique without it: they also name masks and landmarks",
-                got=f"{first.image.name} and {second.image.name}",
+                got=f"{images[view.name].name} and {view.image.name}",
                 fix="rename one of them",
             )
+        images[view.name] = view.image
     for view in views:
         for scheme, points in view.landmarks.items():
             count, name = lengths.setdefault(scheme, (len(points), view.name))

@@ -1,7 +1,7 @@
 """Decode TIFF images as they are stored, whatever their tags for display say.
 
-OpenCV turns TIFF images by their orientation tag whatever its flags, multiplies colours by an alpha channel, and returns
-zeros for 16 bit RGB unless it is asked for unchanged pixels. Both tags are neutralized in memory before it decodes.
+OpenCV turns TIFF images by their orientation tag whatever its flags, multiplies colours by an alpha channel, and
+returns zeros for 16 bit RGB unless it is asked for unchanged pixels. Both tags are neutralized before it decodes.
 """
 
 import mmap

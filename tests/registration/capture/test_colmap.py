@@ -211,3 +211,51 @@ def test_an_image_without_its_camera_is_refused(sparse: Path) -> None:
     edit("images.txt", " 1 cam0.png", " 9 cam0.png")(sparse)
     with pytest.raises(InputError, match="has no camera"):
         read_cameras(sparse)
+
+
+def test_frames_without_rigs_must_have_the_images_poses(sparse: Path) -> None:
+    images = [line.split() for line in (sparse / "images.txt").read_text().splitlines()[3::2]]
+    rows = [f"{n} 1 {' '.join(words[1:8])} 1 CAMERA {words[8]} {words[0]}\n" for n, words in enumerate(images)]
+    (sparse / "frames.txt").write_text("".join(rows))
+    assert_same(read_cameras(sparse), cameras())
+    edit("frames.txt", images[0][5], "7.5")(sparse)
+    with pytest.raises(InputError, match="not that of its frame"):
+        read_cameras(sparse)
+
+
+def test_a_second_model_in_folder_0_must_be_the_same(sparse: Path) -> None:
+    (sparse / "0").mkdir()
+    for file in sparse.glob("*.txt"):
+        (sparse / "0" / file.name).write_bytes(file.read_bytes())
+    assert_same(read_cameras(sparse), cameras())
+    edit("cameras.txt", "600.5", "650.5")(sparse / "0")
+    with pytest.raises(InputError, match="there twice") as caught:
+        read_cameras(sparse)
+    assert "0/images.txt" in caught.value.got
+
+
+@pytest.mark.parametrize("ending", ["\n", "\r\n", "\r"])
+def test_text_files_of_other_systems_are_read(sparse: Path, ending: str) -> None:
+    for file in sparse.iterdir():
+        text = file.read_text("utf-8").replace("\n", ending)
+        file.write_bytes("# f\xfcr".encode("latin-1") + ending.encode() + text.encode())
+    assert_same(read_cameras(sparse), cameras())
+    file = sparse / "images.txt"
+    file.write_bytes(b"\xef\xbb\xbf" + file.read_bytes())
+    assert_same(read_cameras(sparse), cameras())
+
+
+@pytest.mark.parametrize(
+    "name", ["Kopf Süd (1) v1.png", "a%20b#1.png", "rig\\cam.png", "a\u2028b  c.png", "a\x0bb.png"]
+)
+def test_names_are_whole(sparse: Path, name: str) -> None:
+    edit("images.txt", NAMES[0], name)(sparse)
+    assert name in read_cameras(sparse)
+
+
+def test_a_fisheye_lens_is_refused_with_the_way_out(sparse: Path) -> None:
+    edit("cameras.txt", "PINHOLE", "OPENCV_FISHEYE")(sparse)
+    edit("cameras.txt", "160.125", "160.125 0.1 0 0 0")(sparse)
+    with pytest.raises(InputError, match="camera model is not supported") as caught:
+        read_cameras(sparse)
+    assert "image_undistorter" in caught.value.fix and "masks" in caught.value.fix

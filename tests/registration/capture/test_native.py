@@ -121,6 +121,24 @@ def test_names_that_leave_the_folder_are_refused(tmp_path: Path, name: str) -> N
     assert caught.value.got == name
 
 
+def test_names_that_differ_in_their_suffix_only_are_found_wherever_they_sort(tmp_path: Path) -> None:
+    root = make(tmp_path / "capture")
+    listing = root / "sparse" / "images.txt"
+    text = listing.read_text()
+    for old, new in (("cam0.png", "a.jpg"), ("cam1.png", "a.k.png"), ("cam2.png", "a.png")):
+        text = text.replace(old, new)
+        image = cv2.imread(str(root / "images" / old))
+        cv2.imwrite(str(root / "images" / new), image)
+    listing.write_text(text)
+    with pytest.raises(InputError, match="differ in their suffix only") as caught:
+        native.read_capture(root)
+    assert caught.value.got == "a.jpg and a.png"
+    listing.write_text(text.replace("a.png", "b.png").replace("a.jpg", "./a.k.png"))
+    cv2.imwrite(str(root / "images" / "b.png"), image)
+    with pytest.raises(InputError, match="differ in their suffix only"):
+        native.read_capture(root)
+
+
 def test_schemes_must_have_one_length(tmp_path: Path) -> None:
     root = make(tmp_path / "capture")
     path = root / "landmarks" / "cam3.json"
