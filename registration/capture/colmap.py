@@ -245,7 +245,7 @@ def _camera(source: ColmapCamera, T_cam_world: Float[np.ndarray, "4 4"], where: 
             where=where,
             expected=", ".join(_MODELS),
             got=source.model,
-            fix="undistort the images with `colmap image_undistorter`, and masks, normals, labels and landmarks likewise; "
+            fix="undistort the images with `colmap image_undistorter`, masks, normals, labels and landmarks likewise; "
             "or calibrate again with a supported model, OPENCV or FULL_OPENCV for wide lenses",
         )
     fx, fy, cx, cy, *distortion = _MODELS[source.model](*source.parameters)
