@@ -60,3 +60,10 @@ def test_without_identity_writes_a_model(tmp_path):
     done = run("without_identity", *map(str, files))
     assert done.returncode == 0, done.stderr[-2000:]
     assert out.is_file()
+
+
+@needs_shared
+def test_cases_are_tried_and_judged():
+    done = run("cases", str(SHARED / "cases"), str(SHARED / "data" / "captures" / "ict_pop_00" / "neutral"), "one_view")
+    assert done.returncode == 0, done.stderr[-2000:]
+    assert "one_view: refused, green" in done.stdout
