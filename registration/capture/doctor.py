@@ -1,7 +1,7 @@
 """The report of `gnmreg capture check`: what a capture offers, and what may be wrong with it."""
 
 import io
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -14,9 +14,10 @@ from rich.table import Table
 from rich.text import Text
 from scipy.spatial import cKDTree
 
-from registration.capture import native, pixels, triangulation
+from registration.capture import leftovers, native, pixels, triangulation
 from registration.capture.contact_sheet import draw_contact_sheet
 from registration.capture.scan import Scan, read_scan, read_truth
+from registration.capture.text import listed
 from registration.capture.validation import eye_distance, validate_capture
 from registration.frames import MM_PER_M, opencv_intrinsics
 from registration.geometry.meshlab import scan_topology
@@ -139,7 +140,10 @@ def check_capture(path: Path, sheet: Path | None = None) -> CaptureReport:
         schemes={name: (len(xyz), int(np.isfinite(xyz).all(-1).sum())) for name, xyz in triangulated.items()},
         eye_distance_mm=None if distance is None else MM_PER_M * distance,
         scan=scan,
-        warnings=tuple(_warnings(views, triangulated, scan)),
+        warnings=(
+            *_warnings(views, triangulated, scan),
+            *leftovers.warnings(capture, leftovers.match_files(capture)),
+        ),
         sheet=sheet,
     )
 
@@ -174,19 +178,19 @@ def _warnings(
         ("landmarks", [view.name for view in views if not view.landmarks]),
     ):
         if missing:
-            warnings.append(f"{len(missing)} of {len(views)} views without {part}: {_listed(missing)}")
+            warnings.append(f"{len(missing)} of {len(views)} views without {part}: {listed(missing)}")
     for view in views:
         if view.outliers:
-            warnings.append(f"{view.name}: landmarks that contradict the other views: {_listed(view.outliers)}")
+            warnings.append(f"{view.name}: landmarks that contradict the other views: {listed(view.outliers)}")
         if _folds(view.camera):
             warnings.append(f"{view.name}: the distortion folds the image over itself; check its coefficients")
     for scheme, points in triangulated.items():
         if lost := np.flatnonzero(~np.isfinite(points).all(-1)).tolist():
-            warnings.append(f"landmarks {scheme}: not triangulated, no two views agree: {_listed(lost)}")
+            warnings.append(f"landmarks {scheme}: not triangulated, no two views agree: {listed(lost)}")
     points = triangulated.get("68", np.zeros((0, 3)))
     if len(points) == 68 and (jaw := triangulation.reversed_jaw_points(points)):
         warnings.append(
-            f"landmarks 68: {_listed(jaw)} go backwards; the jaw must run from the right ear over the chin to the left"
+            f"landmarks 68: {listed(jaw)} go backwards; the jaw must run from the right ear over the chin to the left"
         )
     if scan is None:
         warnings.append("no scan: distances to it cannot be evaluated")
@@ -196,11 +200,6 @@ def _warnings(
         if distance > MAX_SCAN_DISTANCE_MM:
             warnings.append(f"the scan is {distance:.0f} mm from the landmarks; check its frame and unit")
     return warnings
-
-
-def _listed(items: Sequence[object]) -> str:
-    shown = ", ".join(map(str, items[:10]))
-    return shown if len(items) <= 10 else f"{shown} and {len(items) - 10} more"
 
 
 def _folds(camera: Camera) -> bool:

@@ -1,21 +1,15 @@
 """Read native capture folders: `capture.toml`, a COLMAP model, and image files (docs/formats.md)."""
 
-import json
 import re
-import tomllib
 from pathlib import Path
-from typing import Any
-
-import numpy as np
-from jaxtyping import Float
 
 from registration.capture.colmap import read_cameras
 from registration.capture.headers import require_size
 from registration.capture.image_names import image_file
+from registration.capture.landmark_files import read_landmarks
+from registration.capture.settings import read_settings
 from registration.errors import InputError
 from registration.types import Camera, Capture, View
-
-_RESERVED = ("subject", "expression", "units", "segmentation")
 
 
 def read_capture(root: Path) -> Capture:
@@ -40,7 +34,7 @@ def read_capture(root: Path) -> Capture:
             got="no such folder",
             fix="check the path",
         )
-    settings = _read_settings(_inside(root, root / "capture.toml"))
+    settings = read_settings(_inside(root, root / "capture.toml"))
     for path in (root / "sparse", *sorted((root / "sparse").rglob("*"))):
         _inside(root, path)
     cameras = read_cameras(root / "sparse")
@@ -49,11 +43,11 @@ def read_capture(root: Path) -> Capture:
     scan, truth = root / "scan.ply", root / "ground_truth.npz"
     return Capture(
         root=root,
-        subject=settings["subject"],
-        expression=settings["expression"],
+        subject=settings.subject,
+        expression=settings.expression,
         views=views,
-        classes=tuple(settings.get("segmentation", {}).get("classes", ())),
-        tags={key: value for key, value in settings.items() if key not in _RESERVED},
+        classes=settings.classes,
+        tags=settings.tags,
         scan=_optional(root, scan),
         ground_truth=_optional(root, truth),
     )
@@ -121,67 +115,3 @@ def _check_names(root: Path, views: tuple[View, ...]) -> None:
                     got=f"{len(points)} points",
                     fix="give every view the whole scheme, with confidence 0 where a point is not visible",
                 )
-
-
-def read_landmarks(path: Path) -> dict[str, Float[np.ndarray, "L 3"]]:
-    """Read the landmark schemes of one view.
-
-    Returns:
-        Scheme -> rows (x_px, y_px, confidence), in pixels of the distorted image.
-
-    Raises:
-        InputError: the file is malformed.
-    """
-
-    def refuse(expected: str, got: object) -> InputError:
-        return InputError(
-            "The landmark file is malformed",
-            where=path,
-            expected=expected,
-            got=got,
-            fix='write {"<scheme>": [[x_px, y_px, confidence], ...]}',
-        )
-
-    try:
-        content = json.loads(path.read_text("utf-8"))
-    except (ValueError, RecursionError, OSError) as error:
-        raise refuse("JSON", error) from None
-    if not isinstance(content, dict):
-        raise refuse("an object of schemes", type(content).__name__)
-    landmarks = {}
-    for scheme, rows in content.items():
-        try:
-            points = np.array(rows, np.float64)
-        except (ValueError, TypeError, OverflowError) as error:
-            raise refuse(f'three numbers a point in scheme "{scheme}"', error) from None
-        if points.ndim != 2 or points.shape[1] != 3:
-            raise refuse(f'three numbers a point in scheme "{scheme}"', f"an array of shape {points.shape}")
-        if not np.isfinite(points).all():
-            broken = int(np.argwhere(~np.isfinite(points))[0, 0])
-            raise refuse(f'finite numbers in scheme "{scheme}"', f"point {broken}: {rows[broken]}")
-        landmarks[scheme] = points
-    return landmarks
-
-
-def _read_settings(path: Path) -> dict[str, Any]:
-    def refuse(what: str, expected: str, got: object) -> InputError:
-        return InputError(what, where=path, expected=expected, got=got, fix="see the capture folder in docs/formats.md")
-
-    try:
-        settings = tomllib.loads(path.read_text("utf-8"))
-    except FileNotFoundError:
-        raise refuse("capture.toml is missing", "subject, expression and units", "no such file") from None
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError, OSError) as error:
-        raise refuse("capture.toml cannot be read", "TOML", error) from None
-    for key in ("subject", "expression"):
-        if not isinstance(settings.get(key), str):
-            raise refuse(f'capture.toml lacks "{key}"', f'{key} = "..."', settings.get(key, "nothing"))
-    if settings.get("units") != "m":
-        raise refuse("The units are not metres", 'units = "m"', settings.get("units", "nothing"))
-    segmentation = settings.get("segmentation", {})
-    classes = segmentation.get("classes", []) if isinstance(segmentation, dict) else None
-    if not isinstance(classes, list) or not all(isinstance(name, str) for name in classes):
-        raise refuse("The segmentation classes are malformed", 'classes = ["background", ...]', segmentation)
-    if len(set(classes)) != len(classes):
-        raise refuse("A segmentation class is named twice", "unique names", ", ".join(classes))
-    return settings

@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from registration.capture import headers, pixels, triangulation
+from registration.capture import headers, leftovers, pixels, triangulation
 from registration.capture.scan import read_scan, read_truth
 from registration.errors import InputError
 from registration.types import Capture, View
@@ -36,6 +36,7 @@ def validate_capture(capture: Capture) -> None:
     for view in capture.views:
         _check_camera(capture, view)
         _check_headers(capture, view)
+    leftovers.match_files(capture)
     _check_landmarks(capture)
     if capture.scan is not None:
         read_scan(capture.scan)

@@ -5,10 +5,9 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
+from registration.capture.class_names import BACKGROUND, NECK
 from registration.model.regions import CLASSES
 
-BACKGROUND = "background"
-NECK = "neck_other"
 SKIN = CLASSES[0]
 
 

@@ -252,7 +252,7 @@ def landmarks_that_are_no_json(root: Path) -> None:
     cut(root / "landmarks" / "cam1.json")
 
 
-@bad("The landmark file is malformed", where="landmarks/cam1.json", got="(68, 2)", fix="scheme")
+@bad("The landmark file is malformed", where="landmarks/cam1.json", got="(68, 2)", fix="add a confidence")
 def landmarks_without_confidence(root: Path) -> None:
     (root / "landmarks" / "cam1.json").write_text(json.dumps({"68": [[1, 2]] * 68}))
 

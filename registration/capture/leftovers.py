@@ -1,0 +1,170 @@
+"""Files of a capture folder that nothing reads, each with what it probably was meant to be."""
+
+import difflib
+import os
+import re
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath
+
+from registration.capture.text import listed
+from registration.errors import InputError
+from registration.types import Capture
+
+SUFFIXES = {"masks": ".png", "normals": ".png", "segmentation": ".png", "landmarks": ".json"}  # besides images/
+_ROOT_FILES = ("capture.toml", "scan.ply", "ground_truth.npz")
+_OTHER_FOLDERS = {
+    "image": "images",
+    "rgb": "images",
+    "input": "images",
+    "mask": "masks",
+    "matte": "masks",
+    "mattes": "masks",
+    "alpha": "masks",
+    "silhouettes": "masks",
+    "normal": "normals",
+    "normal_maps": "normals",
+    "labels": "segmentation",
+    "label": "segmentation",
+    "seg": "segmentation",
+    "segm": "segmentation",
+    "segmentations": "segmentation",
+    "semantic": "segmentation",
+    "semantics": "segmentation",
+    "parsing": "segmentation",
+    "landmark": "landmarks",
+    "lmk": "landmarks",
+    "lmks": "landmarks",
+    "keypoints": "landmarks",
+}
+_SUFFIXES = "png|jpe?g|tiff?|bmp|webp|exr|json|txt|pts|csv|npy|npz"
+_ROLES = "mask|matte|alpha|normals?|labels?|seg|segmentation|parsing|landmarks?|lmks?|keypoints"
+_NO_CONTENT = ("thumbs.db", "desktop.ini", "readme", "readme.md", "readme.txt", "license", "license.txt", "licenses.md")
+
+
+@dataclass(frozen=True, kw_only=True)
+class FolderFiles:
+    """The files of one channel's folder."""
+
+    files: int  # on disk
+    matched: int  # that belong to a view
+    unmatched: Mapping[str, str | None]  # path below the folder -> the path that it probably was meant to have
+
+
+def match_files(capture: Capture) -> dict[str, FolderFiles]:
+    """Match the files of images/, masks/, normals/, segmentation/ and landmarks/ with the views.
+
+    Raises:
+        InputError: a folder has files, and none of them belongs to a view.
+    """
+    result = {}
+    for folder, expected in _expected(capture).items():
+        on_disk = files_in(capture.root / folder)
+        unmatched = [name for name in on_disk if name not in expected]
+        missing = set(expected) - set(on_disk)
+        found = FolderFiles(
+            files=len(on_disk),
+            matched=len(on_disk) - len(unmatched),
+            unmatched={name: nearest(name, missing) or nearest(name, expected) for name in unmatched},
+        )
+        if unmatched and not found.matched:
+            name = next((name for name, near in found.unmatched.items() if near is not None), unmatched[0])
+            near = found.unmatched[name] or next(iter(expected))
+            raise InputError(
+                f"No file in {folder}/ belongs to a view",
+                where=capture.root / folder,
+                expected=f"the names of the views, as {near}",
+                got=f"{len(unmatched)} other files, as {name}",
+                fix=_conversion(name, near),
+            )
+        result[folder] = found
+    return result
+
+
+def warnings(capture: Capture, files: Mapping[str, FolderFiles]) -> list[str]:
+    """Name the files and folders that are not read, one line for each folder."""
+    lines = []
+    for folder, found in files.items():
+        if not found.unmatched:
+            continue
+        shown = [name if near is None else f"{name} (near {near})" for name, near in found.unmatched.items()]
+        what = "are not calibrated, the COLMAP model does not name them" if folder == "images" else "belong to no view"
+        lines.append(f"{len(shown)} files in {folder}/ {what}: {listed(shown, 5)}")
+    known = {"sparse", *files}
+    for path in sorted(capture.root.iterdir()):
+        if path.name.startswith(".") or path.name in known or path.name in _ROOT_FILES:
+            continue
+        if path.is_dir():
+            plain = path.name.casefold()
+            meant = plain if plain in known else _OTHER_FOLDERS.get(plain)
+            if meant is not None and (count := len(files_in(path))):
+                lines.append(f"{path.name}/ with {count} files is not read; rename it to {meant}/")
+        elif (meant := _meant_root_file(path)) is not None and not (capture.root / meant).exists():
+            lines.append(f"{path.name} is not read; convert or rename it to {meant}")
+    return lines
+
+
+def files_in(folder: Path) -> list[str]:
+    """Return the paths of all files below a folder, relative to it, sorted; hidden ones and notes are left out."""
+    found = []
+    for parent, folders, names in os.walk(folder):
+        folders[:] = [name for name in folders if not name.startswith((".", "__MACOSX"))]
+        found += [
+            (Path(parent) / name).relative_to(folder).as_posix()
+            for name in names
+            if not name.startswith(".") and name.casefold() not in _NO_CONTENT
+        ]
+    return sorted(found)
+
+
+def nearest(name: str, candidates: Iterable[str]) -> str | None:
+    """Return the candidate that a path probably was meant to be: equal but for case, suffixes, folders or a letter."""
+    names = sorted(candidates)
+    for key in (str.casefold, _stem, _last):
+        equal = [candidate for candidate in names if key(candidate) == key(name)]
+        if equal and (key is not _last or len(equal) == 1):
+            return equal[0]
+    # Numbers must be equal: cam02 is no misspelling of cam01.
+    by_stem = {_stem(candidate): candidate for candidate in names if _digits(candidate) == _digits(name)}
+    close = difflib.get_close_matches(_stem(name), by_stem, 1, 0.7)
+    return by_stem[close[0]] if close else None
+
+
+def _expected(capture: Capture) -> dict[str, list[str]]:
+    """Folder -> the paths below it that belong to the views."""
+    images = capture.root / "images"
+    expected = {"images": [view.image.relative_to(images).as_posix() for view in capture.views]}
+    names = [view.name for view in capture.views]
+    return expected | {folder: [name + suffix for name in names] for folder, suffix in SUFFIXES.items()}
+
+
+def _meant_root_file(path: Path) -> str | None:
+    name = path.name.casefold()
+    for expected in _ROOT_FILES:
+        if name == expected or (PurePosixPath(name).stem == PurePosixPath(expected).stem):
+            return expected
+    return "scan.ply" if path.suffix.casefold() in (".ply", ".obj", ".stl", ".off", ".glb") else None
+
+
+def _conversion(name: str, near: str) -> str:
+    """How to turn the file into one that is read."""
+    have, want = PurePosixPath(name).suffix.casefold(), PurePosixPath(near).suffix.casefold()
+    if have == want:
+        return f"rename the files as their views, e.g. {name} to {near}"
+    kind = want.removeprefix(".").upper()
+    return f"convert the files to {kind} and name them as their views, e.g. {name} to {near}"
+
+
+def _stem(path: str) -> str:
+    """The path without case, suffixes, a leading images/ and what says that it is a mask or the like."""
+    plain = path.replace("\\", "/").casefold().removeprefix("./").removeprefix("images/")
+    plain = re.sub(rf"(\.({_SUFFIXES}))+$", "", plain)
+    return re.sub(rf"(^|/)({_ROLES})[-_. ]|[-_. ]({_ROLES})$", r"\1", plain)
+
+
+def _last(path: str) -> str:
+    return _stem(path).rpartition("/")[2]
+
+
+def _digits(path: str) -> list[int]:
+    return [int(digits) for digits in re.findall(r"\d+", _stem(path))]

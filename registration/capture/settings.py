@@ -1,0 +1,92 @@
+"""Read `capture.toml`: subject, expression, units, tags and the names of the label classes."""
+
+import difflib
+import tomllib
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from registration.capture.class_names import canonical
+from registration.capture.text import read_text
+from registration.errors import InputError
+
+_RESERVED = ("subject", "expression", "units", "segmentation")
+
+
+@dataclass(frozen=True, kw_only=True)
+class CaptureSettings:
+    """The contents of `capture.toml`."""
+
+    subject: str
+    expression: str
+    classes: tuple[str, ...]  # known ones as `class_names.canonical` spells them
+    tags: Mapping[str, Any]
+
+
+def read_settings(path: Path) -> CaptureSettings:
+    """Read `capture.toml` (docs/formats.md).
+
+    Raises:
+        InputError: the file is missing or no TOML, or a required key is missing, misspelt or malformed.
+    """
+
+    def refuse(
+        what: str, expected: str, got: object, fix: str = "see the capture folder in docs/formats.md"
+    ) -> InputError:
+        return InputError(what, where=path, expected=expected, got=got, fix=fix)
+
+    try:
+        settings = tomllib.loads(read_text(path))
+    except FileNotFoundError:
+        raise refuse("capture.toml is missing", "subject, expression and units", "no such file") from None
+    except (ValueError, RecursionError, OSError) as error:  # ValueError: TOML's and Unicode's errors too
+        raise refuse("capture.toml cannot be read", "TOML in UTF-8", error) from None
+    for key in ("subject", "expression"):
+        if not isinstance(settings.get(key), str):
+            got = settings.get(key, _misspelt(key, settings))
+            raise refuse(f'capture.toml lacks "{key}"', f'{key} = "..."', got)
+    if settings.get("units") != "m":
+        raise refuse("The units are not metres", 'units = "m"', settings.get("units", _misspelt("units", settings)))
+    if "segmentation" not in settings:
+        near = _nearest("segmentation", [key for key, value in settings.items() if isinstance(value, dict)])
+        if near is not None:
+            fix = "rename the table to [segmentation]; if it is a tag, give it another name"
+            raise refuse("A table of capture.toml is misspelt", "[segmentation]", f"[{near}]", fix)
+    return CaptureSettings(
+        subject=settings["subject"],
+        expression=settings["expression"],
+        classes=_classes(path, settings.get("segmentation", {})),
+        tags={key: value for key, value in settings.items() if key not in _RESERVED},
+    )
+
+
+def _classes(path: Path, segmentation: object) -> tuple[str, ...]:
+    """The names of the label indices. Raises InputError."""
+
+    def refuse(what: str, expected: str, got: object) -> InputError:
+        return InputError(what, where=path, expected=expected, got=got, fix="see the capture folder in docs/formats.md")
+
+    if not isinstance(segmentation, dict):
+        raise refuse("The segmentation classes are malformed", 'classes = ["background", ...]', segmentation)
+    if "classes" not in segmentation and (near := _nearest("classes", segmentation, ("labels", "names"))) is not None:
+        raise refuse("[segmentation] lacks the class names", 'classes = ["background", ...]', f"{near} = ...")
+    classes = segmentation.get("classes", [])
+    if not isinstance(classes, list) or not all(isinstance(name, str) for name in classes):
+        raise refuse("The segmentation classes are malformed", 'classes = ["background", ...]', segmentation)
+    names = tuple(canonical(name) for name in classes)
+    if len(set(names)) != len(names):
+        raise refuse("A segmentation class is named twice", "unique names", ", ".join(classes))
+    return names
+
+
+def _misspelt(key: str, settings: Iterable[str]) -> str:
+    near = _nearest(key, settings)
+    return "nothing" if near is None else f'nothing; is "{near}" meant?'
+
+
+def _nearest(key: str, keys: Iterable[str], aliases: tuple[str, ...] = ()) -> str | None:
+    """The key that is probably a misspelling of `key`."""
+    by_name = {name.casefold(): name for name in keys}
+    found = [*(alias for alias in aliases if alias in by_name), *difflib.get_close_matches(key, by_name, 1, 0.75)]
+    return by_name[found[0]] if found else None
