@@ -12,7 +12,7 @@ from dbos import DBOSClient, EnqueueOptions
 from registration.errors import InputError
 from workflows.engine.database import BELOW, below, checked_url, engine, require_queue, table
 from workflows.engine.jobs import MAX_BYTES, FlowJob, Job
-from workflows.engine.serialization import APPLICATION, VERSION, JsonSerializer
+from workflows.engine.serialization import APPLICATION, VERSION, JsonSerializer, UnreadableRow
 from workflows.ids import check_id
 
 CHUNK = 1000  # jobs submitted in one transaction
@@ -73,6 +73,7 @@ class QueueClient:
         """Restart flows that have ended, under their ids. Returns the ids of those."""
         ended = [i for i in ids for row in [self._rows(i).get(i)] if row is not None and row["status"] not in ACTIVE]
         queues = self._queues(ended)
+        ended = [identity for identity in ended if identity in queues]
         for identity in ended:
             self._client.rewind_workflow(identity, start_step=1, queue_name=queues[identity])
         return ended
@@ -108,6 +109,7 @@ class QueueClient:
             }
         ordered = sorted(chosen, key=lambda i: (-i.count("/"), i))  # jobs before the flows that wait for them
         queues = self._queues(ordered)
+        ordered = [identity for identity in ordered if identity in queues]
         for identity in ordered:
             self._client.rewind_workflow(identity, start_step=1, queue_name=queues[identity])
         return ordered
@@ -155,7 +157,10 @@ class QueueClient:
             }
 
     def _queues(self, ids: Sequence[str]) -> dict[str, str]:
-        """The queue of each job, from its input: rows of dead and cancelled jobs have lost it."""
+        """The queue of each job, from its input: rows of dead and cancelled jobs have lost it.
+
+        Rows without one were not written by this package: they cannot run, and are left out.
+        """
         queues = {}
         query = sa.text(
             f"SELECT w.workflow_uuid, coalesce(i.inputs, w.inputs) FROM {table(self.url, 'workflow_status')} w "
@@ -165,8 +170,17 @@ class QueueClient:
         with self._engine.connect() as connection:
             for chunk in _chunks(ids):
                 for identity, inputs in connection.execute(query, {"ids": chunk}):
-                    queues[identity] = json.loads(inputs)["kwargs"]["queue"]
+                    if queue := _queue(inputs):
+                        queues[identity] = queue
         return queues
+
+
+def _queue(inputs: Any) -> str | None:
+    try:
+        queue = JsonSerializer().deserialize(inputs)["kwargs"]["queue"]
+    except (UnreadableRow, TypeError, KeyError):
+        return None
+    return queue if isinstance(queue, str) else None
 
 
 def _ancestors(identity: str) -> list[str]:

@@ -21,6 +21,7 @@ from workflows.engine.child import RETRIED, StepOutcome, StepProcess
 from workflows.engine.database import ENVIRONMENT, checked_url, prepare
 from workflows.engine.jobs import DRIVER, GPU, REBUILD, SUBJECTS, Step, validate_arguments
 from workflows.engine.liveness import Liveness, LivenessTimeouts
+from workflows.engine.row_check import refuse_unreadable_rows
 from workflows.engine.scope import FlowScope
 from workflows.engine.serialization import APPLICATION, VERSION, JobFailed, JsonSerializer
 from workflows.ids import check_id, redact, resolve_roots
@@ -82,6 +83,7 @@ def serve(process: EngineProcess) -> NoReturn:
     if child is not None:
         child.warm()
     _register_workflows(process, url, child)
+    refuse_unreadable_rows()
     DBOS(config=_config(url, name))
     DBOS.listen_queues(list(process.queues))
     DBOS.launch()

@@ -4,6 +4,7 @@ import json
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
+from decimal import Decimal
 from typing import Any
 
 from workflows.engine.database import BELOW, Ask, below, checked_url, reading, require_queue, table
@@ -116,7 +117,7 @@ class QueueReader:
                 parameters,
             )
             failures = self._failures(ask, among, parameters)
-        done, since = last[0]
+        done, since = last[0][0], _number(last[0][1])
         return QueueMetrics(
             counts=_by_state([row[1:] for row in jobs if row[0] == "job"]),
             flows=_by_state([row[1:] for row in jobs if row[0] == "flow"]),
@@ -177,23 +178,36 @@ def _row(row: Any) -> JobRow:
         kind=kind,
         state=state,
         executor=executor,
-        spec=_parsed(inputs, {"args": [{}]})["args"][0],
-        result=_parsed(output, None),
+        spec=_spec(inputs),
+        result=_object(output),
         failure=_failure(error, dead) if state == FAILED else None,
-        created=created / 1000,
-        ended=ended_ms / 1000 if ended_ms else None,
+        created=_number(created) / 1000,
+        ended=_number(ended_ms) / 1000 if ended_ms else None,
     )
 
 
-def _failure(error: str | None, dead: str) -> dict[str, Any]:
-    record = _parsed(error, {}).get("error") if error else None
+def _spec(inputs: Any) -> dict[str, Any]:
+    """The job or flow in a row's inputs; empty for a row that this package did not write."""
+    args = (_object(inputs) or {}).get("args")
+    return args[0] if isinstance(args, list) and args and isinstance(args[0], dict) else {}
+
+
+def _failure(error: Any, dead: str) -> dict[str, Any]:
+    record = (_object(error) or {}).get("error")
     if isinstance(record, dict):
         return {"status": "failed", "reason": "", **record}
-    return {"status": "dead", "reason": dead} if dead else {"status": "failed", "reason": str(error)}
+    return {"status": "dead", "reason": dead} if dead else {"status": "failed", "reason": str(error)[:2000]}
 
 
-def _parsed(text: str | None, default: Any) -> Any:
+def _object(text: Any) -> dict[str, Any] | None:
+    """The JSON object in a column, None if it holds anything else: others can write to the database, too."""
     try:
-        return json.loads(text) if text else default
-    except ValueError:
-        return default
+        value = json.loads(text)
+    except (TypeError, ValueError, RecursionError):
+        return None
+    return value if isinstance(value, dict) else None
+
+
+def _number(value: Any) -> float:
+    """A time in a column; 0 for anything else, which SQLite allows in any column."""
+    return float(value) if isinstance(value, (int, float, Decimal)) else 0.0
