@@ -26,9 +26,17 @@ PIP := $(BIN)/python -m pip --disable-pip-version-check install --constraint con
 packages = { [ "$$(id -u)" = 0 ] && command -v apt-get >/dev/null && apt-get update -q \
 	&& DEBIAN_FRONTEND=noninteractive apt-get install -y -q --no-install-recommends $(1); }
 
-.PHONY: setup setup-optional demo demo-batch check test test-durability
+.PHONY: setup set-up setup-optional demo demo-batch check test test-durability
 
-setup: $(INSTALLED)
+# One at a time: the second of two that start at once waits, then finds everything there.
+setup:
+	@if command -v flock >/dev/null; then
+		exec 9>.setup.lock
+		flock -n 9 || { echo "another make setup runs here: waiting for it"; flock 9; }
+	fi
+	$(MAKE) --no-print-directory set-up
+
+set-up: $(INSTALLED)
 	@$(BIN)/python -m registration.render.llvm --install
 
 setup-optional: setup

@@ -1,6 +1,7 @@
 """Names and locations that may come from anywhere: ids of jobs, paths and URLs below a worker's roots, URLs without
 passwords."""
 
+import difflib
 import os
 import re
 from collections.abc import Iterable, Sequence
@@ -61,6 +62,11 @@ def check_location(location: Any, roots: Sequence[str], where: str) -> None:
 def resolve_roots(roots: Iterable[str | Path]) -> tuple[str, ...]:
     """Return roots in the form that `check_location` compares with: local ones absolute, without symbolic links."""
     return tuple(_resolve(str(root)) for root in roots)
+
+
+def nearest(name: str, known: Iterable[str], count: int = 3) -> list[str]:
+    """Return the known names that are most like one that is not known: for messages."""
+    return difflib.get_close_matches(name, known, n=count, cutoff=0.5)
 
 
 def redact(text: str) -> str:

@@ -7,7 +7,7 @@ import signal
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import Future, as_completed
 from contextlib import contextmanager
-from multiprocessing import get_context
+from multiprocessing.context import SpawnContext, SpawnProcess
 from typing import Any
 
 from pebble import ProcessExpired, ProcessPool
@@ -30,6 +30,23 @@ def terminate_with_parent(parent: int, number: signal.Signals = signal.SIGKILL) 
         os._exit(1)
 
 
+class _Child(SpawnProcess):
+    """A process that never receives Ctrl-C, which a terminal sends to children too: the parent decides."""
+
+    def start(self) -> None:
+        before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})  # children inherit it, from their first line
+        try:
+            super().start()
+        finally:
+            signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+class _Context(SpawnContext):
+    """Starts new interpreters: a fork would share the threads of torch and Dr.Jit."""
+
+    Process = _Child
+
+
 def start_pool(jobs: int = 1, modules: tuple[str, ...] = ()) -> ProcessPool:
     """Return a pool of processes that terminate with this one and import `modules` when they start."""
     return ProcessPool(
@@ -37,7 +54,7 @@ def start_pool(jobs: int = 1, modules: tuple[str, ...] = ()) -> ProcessPool:
         max_tasks=0,
         initializer=_initialize_child,
         initargs=(os.getpid(), modules),
-        context=get_context("spawn"),  # a fork would share the threads of torch and Dr.Jit
+        context=_Context(),
     )
 
 

@@ -64,3 +64,15 @@ def test_workers_end_with_a_killed_or_interrupted_parent(tmp_path, number):
             return
         time.sleep(0.1)
     raise AssertionError("the child still runs")
+
+
+def _interrupt_itself() -> str:
+    os.kill(os.getpid(), signal.SIGINT)
+    return "went on"
+
+
+def test_ctrl_c_is_the_parents_to_handle() -> None:
+    """A terminal sends it to all processes of a command: children would print tracebacks."""
+    with terminated_with_us(1) as pool:
+        assert pool.schedule(_interrupt_itself).result(timeout=60) == "went on"
+    assert signal.SIGINT not in signal.pthread_sigmask(signal.SIG_BLOCK, ())

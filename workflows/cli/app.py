@@ -1,12 +1,13 @@
 """The command line, `gnmreg`: every command reads its arguments, calls the library once and prints the outcome.
 
 The library is imported inside the commands, so that help and usage errors never wait for torch or mitsuba.
-Exit codes: 0 success; 1 a registration, or some of a subject's, failed; 2 arguments or input that cannot be used, or
-a subject without any usable registration; 130 interrupted.
+Exit codes: 0 success; 1 a registration, or some of a subject's or a batch's, failed; 2 arguments or input that cannot
+be used, or a subject without any usable registration; 130 interrupted; 141 nobody reads the output any more.
 """
 
-import difflib
 import inspect
+import os
+import select
 import shutil
 import sys
 import textwrap
@@ -17,7 +18,9 @@ import tyro
 
 from registration.errors import InputError
 from workflows.cli import capture, coregister, farm, model, register, stabilize, store
+from workflows.cli.arguments import PRINT_COMPLETION, SHELLS, completion, merge_repeated_options
 from workflows.cli.options import Command
+from workflows.ids import nearest
 
 DESCRIPTION = "Register multi-view captures of human heads as meshes of one topology, and build head models from them."
 HELP = ("-h", "--help")
@@ -62,24 +65,44 @@ COMMANDS: Mapping[str, Command] = {name: command for group in GROUPS.values() fo
 
 def main(args: Sequence[str] | None = None) -> int:
     """Run one command; `args` replaces the process's own. Returns the exit code."""
-    words = list(sys.argv[1:] if args is None else args)
-    name = _command_name(words)
-    if name is None:
-        _explain(words)
     try:
-        _reject_repeated_options(words)
-        return tyro.cli(
-            COMMANDS[name],
-            prog=f"gnmreg {name}",
-            args=words[len(name.split()) :],
-            config=(tyro.conf.FlagCreatePairsOff, tyro.conf.OmitArgPrefixes),
-        )
+        code = _run(list(sys.argv[1:] if args is None else args))
+        sys.stdout.flush()
+        return code
     except InputError as error:
         print(error, file=sys.stderr)
         return 2
     except KeyboardInterrupt:
         print("interrupted", file=sys.stderr)
         return 130
+    except BrokenPipeError:
+        if not _nobody_reads():
+            raise
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # else the interpreter complains when it ends
+        return 141
+
+
+def _run(words: list[str]) -> int:
+    name = _command_name(words)
+    if name is None:
+        _explain(words)
+    return tyro.cli(
+        COMMANDS[name],
+        prog=f"gnmreg {name}",
+        args=merge_repeated_options(words[len(name.split()) :], COMMANDS[name]),
+        config=(tyro.conf.FlagCreatePairsOff, tyro.conf.OmitArgPrefixes),
+    )
+
+
+def _nobody_reads() -> bool:
+    """Whether the reader of our output has gone, as `head` does."""
+    try:
+        descriptor = sys.stdout.fileno()
+    except (OSError, ValueError):
+        return False
+    poll = select.poll()
+    poll.register(descriptor, select.POLLOUT)
+    return any(event & select.POLLERR for _, event in poll.poll(0))
 
 
 def overview(prefix: str = "") -> str:
@@ -95,7 +118,11 @@ def overview(prefix: str = "") -> str:
         if group:
             lines += ["", title]
             lines += [line for name, command in group.items() for line in _row(name, command, width, columns)]
-    return "\n".join((*lines, "", f"gnmreg {prefix}COMMAND --help explains a command and its options."))
+    lines += ["", f"gnmreg {prefix}COMMAND --help explains a command and its options."]
+    if not prefix:
+        shells = "|".join(SHELLS)
+        lines += [f"gnmreg --version prints the release, gnmreg {PRINT_COMPLETION} {shells} a completion script."]
+    return "\n".join(lines)
 
 
 def _row(name: str, command: Command, width: int, columns: int) -> Iterator[str]:
@@ -114,30 +141,39 @@ def _command_name(words: Sequence[str]) -> str | None:
 
 
 def _explain(words: Sequence[str]) -> NoReturn:
-    """Print the overview on request, or say what is wrong with arguments that begin with no command, and exit."""
+    """Answer arguments that begin with no command: help, version, completion, or what is wrong with them; and exit."""
     prefix = f"{words[0]} " if words and any(name.startswith(f"{words[0]} ") for name in COMMANDS) else ""
     typed = words[1:] if prefix else words
     if typed and typed[0] in HELP:
         print(overview(prefix))
-        sys.exit(0)
-    if typed:
-        name = f"{prefix}{typed[0]}"
-        close = difflib.get_close_matches(name, COMMANDS, n=3)
-        hint = f"; similar: {', '.join(close)}" if close else ""
-        print(f"gnmreg: there is no command {name!r}{hint}\n", file=sys.stderr)
-    print(overview(prefix), file=sys.stderr)
-    sys.exit(2)
+    elif typed and typed[0] == "--version":
+        print(_version())
+    elif typed and typed[0].partition("=")[0] == PRINT_COMPLETION:
+        shell = typed[0].partition("=")[2] or " ".join(typed[1:])
+        print(completion(shell, COMMANDS))
+    elif typed and not typed[0].startswith("-"):
+        print(_unknown(prefix + typed[0], typed), file=sys.stderr)
+        sys.exit(2)
+    else:
+        if typed:
+            print(f"gnmreg: there is no option {typed[0]!r} without a command\n", file=sys.stderr)
+        print(overview(prefix), file=sys.stderr)
+        sys.exit(2)
+    sys.stdout.flush()
+    sys.exit(0)
 
 
-def _reject_repeated_options(words: Sequence[str]) -> None:
-    """Raise InputError for an option that is given twice: the parser would use the last and ignore the other."""
-    options = [word.partition("=")[0].replace("_", "-") for word in words if word.startswith("--")]
-    for option in options:
-        if options.count(option) > 1:
-            raise InputError(
-                "An option is given more than once",
-                where=option,
-                expected="each option once",
-                got=f"{options.count(option)} times",
-                fix=f"give it once; where it takes several values, all after one {option}",
-            )
+def _unknown(name: str, typed: Sequence[str]) -> str:
+    """What is said about a command that does not exist: the nearest ones first."""
+    words = [" ".join(typed[:2]), name, typed[0]]
+    close = list(dict.fromkeys(found for word in words for found in nearest(word.replace("-", " "), COMMANDS)))
+    close += [known for known in COMMANDS if typed[0] in known.split() and known not in close]
+    hint = f"; similar: {', '.join(close)}" if close else ""
+    listed = [line for group in GROUPS.values() for line in textwrap.wrap(", ".join(group), 100)]
+    return "\n".join((f"gnmreg: there is no command {name!r}{hint}", "", *listed, "", "gnmreg --help explains them."))
+
+
+def _version() -> str:
+    from importlib.metadata import version
+
+    return f"gnmreg {version('gnm-registration')}"

@@ -5,6 +5,7 @@ imported here, so that help stays fast.
 """
 
 import os
+import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from pathlib import Path
@@ -91,14 +92,17 @@ class FarmOptions:
     """Which farm: the folder of its logs, and its queue.
 
     Attributes:
-        folder: Folder of the farm: job logs and, unless --db names a database, the queue.
-        db: Database of the queue: sqlite:///FILE or postgresql://... Pass a URL with a password as GNMREG_DB: other
-            users of the machine can read command lines.
+        folder: Folder of the farm: job logs and, unless --db names a database, the queue. A folder that holds a queue
+            beats the environment variable GNMREG_DB.
+        db: Database of the queue: sqlite:///FILE or postgresql://... Pass a URL with a password as the environment
+            variable GNMREG_DB: other users of the machine can read command lines. --db GNMREG_DB takes that one, also
+            if the folder holds a queue.
     """
 
     folder: Annotated[Path | None, arg(metavar="DIR", help_behavior_hint="(default: the current folder)")] = None
     db: Annotated[
-        str | None, arg(metavar="URL", help_behavior_hint="(default: $GNMREG_DB, or a SQLite file in the folder)")
+        str | None,
+        arg(metavar="URL", help_behavior_hint="(default: the queue in --folder, $GNMREG_DB, or queue.sqlite here)"),
     ] = None
 
     @property
@@ -113,7 +117,7 @@ class FarmOptions:
         Raises:
             InputError: a URL that cannot be used.
         """
-        return queue_url(self.directory, self.db)
+        return queue_url(self.directory, self.db, own=self.folder is not None and has_queue(self.folder))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -157,19 +161,44 @@ class RunOptions(FarmOptions):
         return path.with_name(f"{path.name}.farm")
 
     def url_for(self, folder: Path) -> str:
-        """Return the URL of the queue's database, for a farm in `folder`."""
-        return queue_url(folder, self.db)
+        """Return the URL of the queue's database, for a farm in `folder`. With --local it has a queue of its own."""
+        return queue_url(folder, self.db, own=self.local or (self.folder is not None and has_queue(self.folder)))
 
 
-def queue_url(folder: Path, db: str | None) -> str:
-    """Return the database URL: `db`, the environment's, or a SQLite file in the folder.
+def has_queue(folder: Path) -> bool:
+    """Return whether there is a SQLite queue in a farm's folder."""
+    from workflows.engine.database import FILE
+
+    return (folder / FILE).is_file()
+
+
+def queue_url(folder: Path, db: str | None, *, own: bool) -> str:
+    """Return the URL of the queue's database.
+
+    Args:
+        folder: of the farm.
+        db: a URL, or "GNMREG_DB" for the one in that environment variable; None: choose.
+        own: choose the SQLite file in the folder, also if the environment variable is set.
 
     Raises:
-        InputError: a URL that cannot be used.
+        InputError: a URL that cannot be used, or the environment variable is not set.
     """
     from workflows.engine.database import ENVIRONMENT, checked_url, default_url
 
-    return checked_url(db or os.environ.get(ENVIRONMENT) or default_url(folder))
+    environment = os.environ.get(ENVIRONMENT)
+    if db == ENVIRONMENT and not environment:
+        raise InputError(
+            "The environment names no queue",
+            where=f"--db {ENVIRONMENT}",
+            expected=f"a URL in the environment variable {ENVIRONMENT}",
+            got="none",
+            fix=f"set {ENVIRONMENT}, or leave out --db",
+        )
+    if db is None and own:
+        if environment:
+            print(f"the queue is in {folder}; {ENVIRONMENT} is not used (--db {ENVIRONMENT} takes it)", file=sys.stderr)
+        return checked_url(default_url(folder))
+    return checked_url((environment if db in (None, ENVIRONMENT) else db) or default_url(folder))
 
 
 def weights(pairs: Sequence[str]) -> Mapping[str, float]:

@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 from dbos import DBOS, DBOSConfig
+from dbos._error import DBOSAwaitedWorkflowCancelledError, DBOSWorkflowCancelledError
 
 from registration.errors import InputError
 from workflows.engine.child import RETRIED, StepOutcome, StepProcess
@@ -33,6 +34,8 @@ QUEUES = {GPU: 1, REBUILD: 1, SUBJECTS: 64, DRIVER: 1}  # jobs of a queue that o
 ATTEMPTS, BACK_OFF_S, BACK_OFF_FACTOR = 3, 10.0, 3.0
 RECOVERIES = 5  # a job that killed more workers than this is dead: it is not run again
 Flow = Callable[..., Awaitable[Any]]
+# Errors that say nothing more than the job's row and log do.
+_REPORTED = (JobFailed, DBOSWorkflowCancelledError, DBOSAwaitedWorkflowCancelledError)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -157,10 +160,14 @@ def _register_workflows(process: EngineProcess, url: str, child: StepProcess | N
 
 
 class _Redacting(logging.Filter):
-    """Removes passwords from URLs in all log records, and the tracebacks of failed jobs."""
+    """Removes passwords from URLs in all log records, and the tracebacks of failed and cancelled jobs."""
 
     def filter(self, record: logging.LogRecord) -> bool:
         if record.exc_info and isinstance(record.exc_info[1], JobFailed):  # reported in the job's row and log
+            return False
+        if record.exc_info and isinstance(
+            record.exc_info[1], (DBOSWorkflowCancelledError, DBOSAwaitedWorkflowCancelledError)
+        ):
             return False
         record.msg, record.args = redact(record.getMessage()), None
         if record.exc_info:

@@ -78,7 +78,7 @@ class _Processes:
 
     def __init__(self, farm: LocalFarm) -> None:
         devices = [["--gpu", str(number)] for number in farm.gpus] or [[] for _ in range(farm.workers)]
-        shared = ["--folder", str(farm.folder)]
+        shared = ["--folder", str(farm.folder), "--db", ENVIRONMENT]  # the URL may hold a password
         roots = ["--root", *farm.roots] if farm.roots else []
         queues = ["--queue", "gpu", "rebuild"]
         workers = [["worker", *shared, *roots, *queues, *device] for device in devices]
