@@ -4,8 +4,10 @@ A capture may come from anybody: counts are compared with the file's size before
 """
 
 import mmap
+import os
 import struct
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +25,7 @@ from registration.capture.colmap_model import (
     rig_files,
 )
 from registration.errors import InputError
+from registration.storage.reading import open_file
 
 _MODEL_NAMES = tuple(PARAMETER_COUNTS)
 _CAMERA_SENSOR = 0  # of frames' data in binary files; "CAMERA" in text files
@@ -80,14 +83,9 @@ class _Binary:
 
     @classmethod
     def opened(cls, file: Path) -> "_Binary":
-        try:
-            with file.open("rb") as stream:
-                empty = file.stat().st_size == 0
-                data = b"" if empty else mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ)
-        except FileNotFoundError:
-            raise malformed(file, "the file, as COLMAP writes it", "no such file") from None
-        except (OSError, ValueError) as error:
-            raise malformed(file, "a binary file as COLMAP writes it", error) from None
+        with open_file(file, partial(malformed, file)) as stream:
+            empty = os.fstat(stream.fileno()).st_size == 0
+            data = b"" if empty else mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ)
         return cls(file, data)
 
     def __enter__(self) -> "_Binary":

@@ -1,10 +1,9 @@
 """Read the text files of a COLMAP model; every malformed line is an `InputError` that names it."""
 
-import codecs
 import math
-import re
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -21,6 +20,7 @@ from registration.capture.colmap_model import (
     rig_files,
 )
 from registration.errors import InputError
+from registration.storage.reading import raw_lines
 
 
 def read_text_model(folder: Path) -> ColmapModel:
@@ -115,15 +115,7 @@ def _is_number(word: str) -> bool:
 
 def _lines(file: Path, blank: bool = False) -> Iterator[_Line]:
     """Yield the lines of a text file but for comments, and for blank ones unless asked for."""
-    try:
-        content = file.read_bytes().removeprefix(codecs.BOM_UTF8)
-    except FileNotFoundError:
-        raise malformed(file, "the file, in UTF-8", "no such file") from None
-    except OSError as error:
-        raise malformed(file, "a text file in UTF-8", error) from None
-    for number, raw in enumerate(
-        re.split(rb"\r\n|\n|\r", content), 1
-    ):  # no other character ends a line: names have them
+    for number, raw in enumerate(raw_lines(file, partial(malformed, file)), 1):
         if raw.lstrip().startswith(b"#") or not (blank or raw.strip()):
             continue
         try:

@@ -3,16 +3,15 @@
 import mmap
 import os
 import struct
-import warnings
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
-
-from PIL import Image, UnidentifiedImageError
 
 from registration.capture.tiff import is_tiff, read_tiff_header, refuse_tiff
 from registration.errors import InputError
+from registration.storage.image_files import MAX_PIXELS, image_size
+from registration.storage.reading import Refuse, open_file
 
-MAX_PIXELS = 2**28  # 16384 x 16384: beyond any camera, and a hostile header must not make us allocate more
 _PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 _PNG_END = b"\x00\x00\x00\x00IEND\xaeB`\x82"
 
@@ -36,7 +35,7 @@ def read_header(path: Path, role: str) -> Header:
     Raises:
         InputError: the file is missing, is not an image, or declares more than `MAX_PIXELS`.
     """
-    if not path.is_file():
+    if not os.path.lexists(path):
         raise InputError(
             f"The {role} is missing",
             where=path,
@@ -44,35 +43,23 @@ def read_header(path: Path, role: str) -> Header:
             got="no such file",
             fix="add the file, or remove its view from the COLMAP model",
         )
-    try:
-        with path.open("rb") as file:
-            start = file.read(26)
-        if is_tiff(start):  # its own size, not that of the picture as displayed
-            width_px, height_px = _tiff_size(path, role)
-        else:
-            with warnings.catch_warnings():
-                warnings.simplefilter("ignore", Image.DecompressionBombWarning)  # MAX_PIXELS below is our limit
-                with Image.open(path) as image:
-                    width_px, height_px = image.size
-    except Image.DecompressionBombError as error:
-        raise _too_large(path, role, str(error)) from None
-    except (UnidentifiedImageError, OSError, ValueError, SyntaxError) as error:
-        raise InputError(
-            f"The {role} is not a readable image",
-            where=path,
-            expected="a PNG, JPEG or TIFF file",
-            got=f"a file that starts with {start[:8]!r}" if isinstance(error, UnidentifiedImageError) else error,
-            fix="convert it to PNG, JPEG or TIFF; if it is one, write it again: its header is damaged",
-        ) from None
-    if width_px * height_px > MAX_PIXELS:
-        raise _too_large(path, role, f"{width_px} x {height_px}")
+    fix = "convert it to PNG, JPEG or TIFF; if it is one, write it again: its header is damaged"
+    refuse = partial(InputError, f"The {role} is not a readable image", where=path, fix=fix)
+    with open_file(path, refuse) as file:
+        start = file.read(26)
+    width_px, height_px = _tiff_size(path, role, refuse) if is_tiff(start) else image_size(path, refuse)
     bits = start[24] if start.startswith(_PNG_SIGNATURE) and len(start) == 26 else None
     return Header(width_px=width_px, height_px=height_px, png_bits=bits)
 
 
-def _tiff_size(path: Path, role: str) -> tuple[int, int]:
+def _tiff_size(path: Path, role: str, refuse: Refuse) -> tuple[int, int]:
     with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
-        header = read_tiff_header(data)
+        try:
+            header = read_tiff_header(data)
+        except ValueError as error:
+            raise refuse(expected="a PNG, JPEG or TIFF file", got=error) from None
+    if header.width_px * header.height_px > MAX_PIXELS:
+        raise refuse(expected=f"at most {MAX_PIXELS} pixels", got=f"{header.width_px} x {header.height_px}")
     if header.defect is not None:
         raise refuse_tiff(path, role, header.defect)
     return header.width_px, header.height_px
@@ -135,13 +122,3 @@ def _png_chunks_reach_end(path: Path, size: int) -> bool:
             if kind == b"IEND":
                 return position <= size
     return False
-
-
-def _too_large(path: Path, role: str, got: str) -> InputError:
-    return InputError(
-        f"The {role} declares too many pixels",
-        where=path,
-        expected=f"at most {MAX_PIXELS} pixels",
-        got=got,
-        fix="write the file again, or tile the image",
-    )

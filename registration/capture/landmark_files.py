@@ -1,13 +1,12 @@
 """Read the landmarks of one view."""
 
-import json
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float
 
-from registration.capture.text import read_text
 from registration.errors import InputError
+from registration.storage.reading import read_json
 
 _FORMAT = 'write {"<scheme>": [[x_px, y_px, confidence], ...]}'
 _NOT_SEEN = [0.0, 0.0, 0.0]
@@ -23,13 +22,10 @@ def read_landmarks(path: Path) -> dict[str, Float[np.ndarray, "L 3"]]:
         InputError: the file is malformed.
     """
 
-    def refuse(expected: str, got: object, fix: str = _FORMAT) -> InputError:
+    def refuse(expected: object, got: object, fix: str = _FORMAT) -> InputError:
         return InputError("The landmark file is malformed", where=path, expected=expected, got=got, fix=fix)
 
-    try:
-        content = json.loads(read_text(path))
-    except (ValueError, RecursionError, OSError) as error:
-        raise refuse("JSON in UTF-8", error) from None
+    content = read_json(path, refuse, finite=False)  # the place of a number that is not finite is named below
     if not isinstance(content, dict):
         raise refuse("an object of schemes", type(content).__name__)
     landmarks = {}

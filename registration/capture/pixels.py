@@ -6,7 +6,7 @@ needs a few hundred MB. Every result is the mean over the pixels of a block that
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 
 import cv2
@@ -18,6 +18,8 @@ from registration.capture.headers import require_complete, require_size
 from registration.capture.tiff import decode_tiff, is_tiff
 from registration.errors import InputError
 from registration.frames import opencv_intrinsics, srgb_to_linear
+from registration.storage.image_files import FORMATS, decode
+from registration.storage.reading import Refuse
 from registration.types import Camera, Capture, View, ViewPixels
 
 STRIP_PIXELS = 2**21  # converted to float at a time: 25 MB of float32 RGB
@@ -126,11 +128,12 @@ def read_labels(path: Path, camera: Camera, classes: tuple[str, ...]) -> UInt8[n
     require_size(path, "label map", camera.width_px, camera.height_px)
     require_complete(path, "label map")
     try:
-        with Image.open(path) as image:  # unlike OpenCV it does not convert palette indices to colours
+        with Image.open(path, formats=FORMATS) as image:  # unlike OpenCV it does not convert palette indices to colours
             mode = image.mode
             labels = np.array(image)
-    except (OSError, ValueError, SyntaxError) as error:
-        raise _input_error(path, "label map", str(error)) from None
+    except Exception as error:  # a damaged file makes Pillow raise nearly anything
+        got = f"{type(error).__name__}: {error}"
+        raise _undecodable(path, "label map")(expected="a whole, undamaged image", got=got) from None
     if mode not in ("L", "P") or labels.dtype != np.uint8:
         raise InputError(
             "The label map is not a map of indices",
@@ -154,22 +157,17 @@ def read_labels(path: Path, camera: Camera, classes: tuple[str, ...]) -> UInt8[n
 def _imread(path: Path, role: str, camera: Camera, flags: int) -> np.ndarray:
     require_size(path, role, camera.width_px, camera.height_px)
     require_complete(path, role)
+    refuse = _undecodable(path, role)
     with path.open("rb") as file:
         tiff = is_tiff(file.read(4))
-    pixels = decode_tiff(path, grey=flags == _GRAY) if tiff else cv2.imread(str(path), flags)
-    if pixels is None or pixels.shape[:2] != (camera.height_px, camera.width_px):
-        raise _input_error(path, role, "a decoding error")
+    pixels = decode_tiff(path, refuse, grey=flags == _GRAY) if tiff else decode(path, flags, refuse)
+    if pixels.shape[:2] != (camera.height_px, camera.width_px):
+        raise refuse(expected="the size in its header", got=f"shape {pixels.shape}")
     return pixels
 
 
-def _input_error(path: Path, role: str, got: str) -> InputError:
-    return InputError(
-        f"The {role} cannot be decoded",
-        where=path,
-        expected="a whole, undamaged image",
-        got=got,
-        fix="copy or write the file again",
-    )
+def _undecodable(path: Path, role: str) -> Refuse:
+    return partial(InputError, f"The {role} cannot be decoded", where=path, fix="copy or write the file again")
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +11,7 @@ from jaxtyping import Float, Int
 from registration.errors import InputError
 from registration.storage.npz import NpzSchema
 from registration.storage.ply import read_ply
+from registration.storage.reading import open_file
 
 SCAN = "scan.ply"
 MAX_COORDINATE_M = 1e9  # beyond it, distances between vertices lose their meaning even in float64
@@ -43,6 +45,7 @@ def read_scan(path: Path) -> Scan:
     Raises:
         InputError: the file cannot be read, has fewer than three vertices, non-finite vertices or wrong indices.
     """
+    open_file(path, partial(_input_error, path)).close()  # it is a regular file
     try:
         mesh = read_ply(path)
     except (OSError, ValueError, MemoryError) as error:
@@ -104,7 +107,7 @@ def read_truth(path: Path) -> Float[np.ndarray, "N 3"]:
     return _TRUTH.read(path)["vertices"]
 
 
-def _input_error(path: Path, expected: str, got: str) -> InputError:
+def _input_error(path: Path, expected: object, got: object) -> InputError:
     return InputError(
         "The scan cannot be used", where=path, expected=expected, got=got, fix="export it again as PLY, in metres"
     )

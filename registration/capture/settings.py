@@ -1,15 +1,16 @@
 """Read `capture.toml`: subject, expression, units, tags and the names of the label classes."""
 
 import difflib
-import tomllib
+import os
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 from registration.capture.class_names import canonical
-from registration.capture.text import read_text
 from registration.errors import InputError
+from registration.storage.reading import parse_toml, read_bytes
 
 _RESERVED = ("subject", "expression", "units", "segmentation")
 
@@ -32,16 +33,14 @@ def read_settings(path: Path) -> CaptureSettings:
     """
 
     def refuse(
-        what: str, expected: str, got: object, fix: str = "see the capture folder in docs/formats.md"
+        what: str, expected: object, got: object, fix: str = "see the capture folder in docs/formats.md"
     ) -> InputError:
         return InputError(what, where=path, expected=expected, got=got, fix=fix)
 
-    try:
-        settings = tomllib.loads(read_text(path))
-    except FileNotFoundError:
-        raise refuse("capture.toml is missing", "subject, expression and units", "no such file") from None
-    except (ValueError, RecursionError, OSError) as error:  # ValueError: TOML's and Unicode's errors too
-        raise refuse("capture.toml cannot be read", "TOML in UTF-8", error) from None
+    if not os.path.lexists(path):
+        raise refuse("capture.toml is missing", "subject, expression and units", "no such file")
+    unreadable = partial(refuse, "capture.toml cannot be read")
+    settings = parse_toml(read_bytes(path, unreadable), unreadable)
     for key in ("subject", "expression"):
         if not isinstance(settings.get(key), str):
             got = settings.get(key, _misspelt(key, settings))

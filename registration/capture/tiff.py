@@ -14,6 +14,8 @@ import cv2
 import numpy as np
 
 from registration.errors import InputError
+from registration.storage.image_files import decode_content
+from registration.storage.reading import Refuse
 
 _WIDTH, _HEIGHT, _BITS, _PHOTOMETRIC, _ORIENTATION = 256, 257, 258, 262, 274
 _SAMPLES, _PLANAR, _EXTRA_SAMPLES, _SAMPLE_FORMAT = 277, 284, 338, 339
@@ -111,26 +113,26 @@ def refuse_tiff(path: Path, role: str, got: object) -> InputError:
     )
 
 
-def decode_tiff(path: Path, *, grey: bool = False) -> np.ndarray | None:
+def decode_tiff(path: Path, refuse: Refuse, *, grey: bool = False) -> np.ndarray:
     """Decode the first image of a TIFF file, pixels as stored: not turned, colours not multiplied by alpha.
 
     Args:
         path: the file, whose header was checked.
+        refuse: makes the error.
         grey: return one channel.
 
     Returns:
-        (H, W, 3) RGB or (H, W) grey, uint8 or uint16; None if it cannot be decoded.
+        (H, W, 3) RGB or (H, W) grey, uint8 or uint16.
+
+    Raises:
+        InputError: it cannot be decoded, not even in part.
     """
     data = bytearray(path.read_bytes())
     for offset, form, value in read_tiff_header(data).display_tags:
         struct.pack_into(form, data, offset, value)
-    level = cv2.utils.logging.setLogLevel(0)  # or it warns of every alpha channel, on stderr
-    try:
-        pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
-    finally:
-        cv2.utils.logging.setLogLevel(level)
-    if pixels is None or pixels.ndim not in (2, 3):
-        return None
+    pixels = decode_content(data, cv2.IMREAD_UNCHANGED, refuse)
+    if pixels.ndim not in (2, 3):
+        raise refuse(expected="one image", got=f"an array of shape {pixels.shape}")
     if grey:
         return pixels if pixels.ndim == 2 else cv2.cvtColor(np.ascontiguousarray(pixels[..., :3]), cv2.COLOR_BGR2GRAY)
     return np.repeat(pixels[..., None], 3, 2) if pixels.ndim == 2 else np.ascontiguousarray(pixels[..., 2::-1])

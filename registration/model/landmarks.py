@@ -1,6 +1,7 @@
 """Landmark schemes of a model: named lists of points on its surface, each the weighted mean of three vertices."""
 
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import overload
 
@@ -10,6 +11,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from registration.errors import InputError
+from registration.storage.reading import read_list
 
 _PREFIX = "head_sparse_"
 _FIX = "write one landmark a row as `i0 w0 i1 w1 i2 w2`: vertex indices from 0, weights that sum to 1"
@@ -47,10 +49,11 @@ def read_scheme(path: Path, vertex_count: int, name: str | None = None) -> Landm
         InputError: the file has other rows, a vertex index is out of range, or weights do not sum to one.
     """
     path = Path(path)
+    lines = read_list(path, partial(InputError, "The landmark scheme cannot be read", where=path, fix=_FIX))
     try:
-        rows = [[float(word) for word in line.split()] for line in path.read_text("ascii").splitlines() if line.strip()]
-    except (OSError, ValueError) as error:
-        raise _input_error("cannot be read", path, "rows of six numbers", f"{type(error).__name__}: {error}") from error
+        rows = [[float(word) for word in line.split()] for line in lines]
+    except ValueError as error:
+        raise _input_error("cannot be read", path, "rows of six numbers", error) from None
     for number, row in enumerate(rows):
         if len(row) != 6 or not np.isfinite(row).all():
             raise _input_error("has a wrong row", path, "six finite numbers", f"{row} in row {number}")

@@ -10,11 +10,13 @@ import secrets
 import shutil
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 from registration.errors import InputError
 from registration.storage.jsonable import to_jsonable
+from registration.storage.reading import read_json
 
 _AT_FDCWD, _RENAME_EXCHANGE = -100, 2  # linux/fcntl.h, linux/fs.h
 
@@ -124,8 +126,8 @@ def refuse_foreign(
 def read_json_of_kind(file: Path, kind: str) -> dict[str, Any] | None:
     """Return the JSON object in a file if its `kind` is this one, of any schema version, else None."""
     try:
-        value = json.loads(Path(file).read_text("utf-8"))
-    except (OSError, ValueError, RecursionError):
+        value = read_json(Path(file), partial(InputError.unreadable, "record", where=file, fix="write it again"))
+    except InputError:
         return None
     return value if isinstance(value, dict) and value.get("kind") == kind else None
 

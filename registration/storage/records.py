@@ -17,6 +17,7 @@ within it. Non-finite floats are written as `null`: declare `float | None` where
 import json
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, fields, is_dataclass
+from functools import partial
 from pathlib import Path
 from types import UnionType
 from typing import Any, ClassVar, Literal, TypeVar, Union, get_args, get_origin
@@ -38,6 +39,7 @@ from cattrs.cols import (
 from cattrs.gen import make_dict_structure_fn, override
 
 from registration.errors import InputError
+from registration.storage import reading
 from registration.storage.files import atomic_write_text, has_kind, json_text
 from registration.storage.jsonable import to_jsonable
 
@@ -101,7 +103,7 @@ class Record:
     @classmethod
     def from_text(cls: type[R], content: str | bytes, *, where: object) -> R:
         """Read a record from the content of its file. `where` names the file in messages. Raises as `read`."""
-        return cls.from_json(_parse(content, where, cls.TITLE, cls.FIX), where=where)
+        return cls.from_json(reading.parse_json(content, partial(cls.invalid, where)), where=where)
 
     @classmethod
     def from_json(cls: type[R], value: Any, *, where: object) -> R:
@@ -143,14 +145,9 @@ def read_json(file: Path, *, title: str = "record", fix: str = Record.FIX) -> An
     """Read the value in a JSON file.
 
     Raises:
-        InputError: the file cannot be read, or is no JSON.
+        InputError: as `reading.read_json`.
     """
-    try:
-        content = Path(file).read_bytes()
-    except OSError as error:
-        got = error.strerror or error
-        raise InputError.unreadable(title, where=file, expected="a readable file", got=got, fix=fix) from error
-    return _parse(content, file, title, fix)
+    return reading.read_json(Path(file), partial(InputError.unreadable, title, where=file, fix=fix))
 
 
 def structure(value: Any, type_: Any, *, where: object, title: str = "record", fix: str = Record.FIX) -> Any:
@@ -170,6 +167,8 @@ def structure(value: Any, type_: Any, *, where: object, title: str = "record", f
         return _CONVERTER.structure(value, type_)
     except Exception as error:  # cattrs raises groups of errors, in which ours are leaves
         path, leaf = _first_leaf(error)
+        if isinstance(leaf, InputError):  # a dataclass refuses its values itself
+            raise leaf from None
         mismatch = _as_mismatch(leaf)
         if mismatch is None:
             raise
@@ -208,18 +207,6 @@ def _as_mismatch(error: BaseException) -> _MismatchError | None:
     if isinstance(error, KeyError):
         return _MismatchError("this field", "no such field")
     return None
-
-
-def _parse(content: str | bytes, where: object, title: str, fix: str) -> Any:
-    try:
-        return json.loads(content, parse_constant=_refuse_constant)
-    except (ValueError, RecursionError) as error:
-        got = f"no JSON: {error}"
-        raise InputError.unreadable(title, where=where, expected="a JSON object", got=got, fix=fix) from error
-
-
-def _refuse_constant(name: str) -> None:
-    raise ValueError(f"{name} is no JSON number")
 
 
 def _shown(value: Any) -> str:

@@ -7,6 +7,7 @@ import math
 import os
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +17,7 @@ from registration.errors import InputError
 from registration.frames import linear_to_srgb, srgb_to_linear
 from registration.storage.files import atomic_directory, atomic_write_text, has_kind, write_json
 from registration.storage.hashing import content_id, input_hash, to_jsonable, versions
+from registration.storage.image_files import decode, image_size
 from registration.storage.mesh import write_obj, write_ply
 from registration.storage.npz import Kind, NpzSchema
 from registration.storage.records import Record, read_json, structure
@@ -54,7 +56,12 @@ _FIELDS: dict[str, tuple[Kind, str]] = {
     name: ("integer" if name in _INTEGERS else "float", axes) for name, axes in AXES.items()
 }
 SCHEMA = NpzSchema(
-    title=_TITLE, fix=_FIX, fields=_FIELDS, families={LANDMARKS: ("float", "L 3")}, indices={"triangles": "V"}
+    title=_TITLE,
+    fix=_FIX,
+    fields=_FIELDS,
+    families={LANDMARKS: ("float", "L 3")},
+    indices={"triangles": "V"},
+    max_bytes=2**30,  # ten million vertices
 )
 
 
@@ -258,10 +265,11 @@ def _write_png(file: Path, texture: np.ndarray) -> None:
 def _read_png(file: Path) -> np.ndarray:
     import cv2
 
-    texture = cv2.imread(str(file), cv2.IMREAD_UNCHANGED) if file.is_file() else None
-    if texture is None or texture.dtype != np.uint16 or texture.ndim != 3 or texture.shape[2] != 3:
-        got = "nothing readable" if texture is None else f"{texture.dtype} of shape {texture.shape}"
-        raise InputError.unreadable(_TITLE, where=file, expected="a 16 bit RGB PNG", got=got, fix=_FIX)
+    refuse = partial(InputError.unreadable, _TITLE, where=file, fix=_FIX)
+    image_size(file, refuse)
+    texture = decode(file, cv2.IMREAD_UNCHANGED, refuse)
+    if texture.dtype != np.uint16 or texture.ndim != 3 or texture.shape[2] != 3:
+        raise refuse(expected="a 16 bit RGB PNG", got=f"{texture.dtype} of shape {texture.shape}")
     return np.ascontiguousarray(texture[..., ::-1])
 
 

@@ -2,10 +2,12 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path, PurePosixPath
 
 from registration.errors import InputError
 from registration.options import RegisterOptions
+from registration.storage.reading import read_list
 from registration.storage.records import to_json
 from workflows.engine.jobs import DRIVER, FlowJob, Job
 from workflows.ids import check_id, redact
@@ -83,11 +85,8 @@ def _expand(word: str) -> list[str]:
     if not word.startswith("@"):
         return [word]
     file = Path(word[1:])
-    try:
-        return [line.strip() for line in file.read_text("utf-8").splitlines() if line.strip()]
-    except (OSError, UnicodeDecodeError) as error:
-        expected = "one path or URL on each line"
-        raise _input_error("The list of captures cannot be read", where=file, expected=expected, got=error) from None
+    fix = "write one path or URL on each line"
+    return read_list(file, partial(InputError, "The list of captures cannot be read", where=file, fix=fix))
 
 
 def _keys(locations: Sequence[str]) -> Mapping[str, str]:

@@ -3,6 +3,7 @@ subjects."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +11,7 @@ import numpy as np
 
 from registration.capture.native import natural_key
 from registration.errors import InputError
+from registration.storage.reading import read_list
 from registration.storage.records import Record
 from workflows.records.subject import NEUTRAL, SubjectCaptures, read_captures
 
@@ -129,11 +131,8 @@ def split(dataset: Dataset, held_out: float | Path | None = None, seed: int = 0)
 
 
 def _listed(file: Path, names: Sequence[str]) -> tuple[str, ...]:
-    try:
-        listed = [line.strip() for line in file.read_text("utf-8").splitlines() if line.strip()]
-    except (OSError, ValueError) as error:
-        expected = "a fraction such as 0.2, or a file with one folder name per line"
-        raise _input_error("The held-out subjects cannot be read", file, expected, error) from error
+    fix = "give a fraction such as 0.2, or a file with one folder name per line"
+    listed = read_list(file, partial(InputError, "The held-out subjects cannot be read", where=file, fix=fix))
     if unknown := [name for name in listed if name not in names]:
         raise _input_error("There is no such subject to hold out", file, ", ".join(names[:8]), unknown[0])
     return tuple(name for name in names if name in listed)

@@ -1,15 +1,18 @@
 """The log of decisions about components of the stabilization, `decisions.jsonl`: JSON lines, append-only."""
 
 import json
+import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
+from functools import partial
 from getpass import getuser
 from pathlib import Path
 
 from registration.errors import InputError
 from registration.stabilize.decisions import Action, Decision
 from registration.storage.files import atomic_write_text
+from registration.storage.reading import read_text
 from registration.storage.records import Record
 
 
@@ -38,10 +41,7 @@ def read_decisions(file: Path, dataset: str) -> list[Decision]:
     Raises:
         InputError: the file cannot be read, a line is malformed, or decisions are about another dataset.
     """
-    try:
-        lines = Path(file).read_text("utf-8").splitlines()
-    except (OSError, ValueError) as error:
-        raise DecisionEntry.invalid(file, expected="a readable file of JSON lines", got=error) from error
+    lines = read_text(Path(file), partial(DecisionEntry.invalid, file)).splitlines()
     entries = [
         DecisionEntry.from_text(line, where=f"{file}, line {number}")
         for number, line in enumerate(lines, 1)
@@ -69,7 +69,7 @@ def append_decisions(file: Path, dataset: str, decisions: Sequence[Decision]) ->
         InputError: the log cannot be read, or is about another dataset.
     """
     file = Path(file)
-    previous = file.read_text("utf-8") if file.is_file() else ""
+    previous = read_text(file, partial(DecisionEntry.invalid, file)) if os.path.lexists(file) else ""
     if previous:
         read_decisions(file, dataset)
     time, user = datetime.now(UTC).isoformat(timespec="seconds"), _user()

@@ -4,8 +4,6 @@ from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
-
 from registration.capture.native import natural_key
 from registration.errors import InputError
 from registration.model import gnm_npz
@@ -13,7 +11,7 @@ from registration.model.fetch import cached_path
 from registration.model.gnm_npz import GNMData
 from registration.stabilize.subject_meshes import SkullSkin, SubjectMeshes, subject_meshes
 from registration.storage.cache import cache_folder
-from registration.storage.registration_folder import load_registration, read_manifest
+from registration.storage.registration_folder import SCHEMA, load_registration, read_manifest
 from workflows.records.subject import MANIFEST, SubjectRecord, is_subject_folder, read_subject
 
 STABILIZED = "stabilized"  # the folder of the stabilized set within a run
@@ -155,11 +153,8 @@ def _subject(folder: Path, skip_failed: bool) -> StabilizationSubject:
 def _check_arrays(folder: Path, topology: str, data: GNMData) -> None:
     """Check the arrays other than textures: in milliseconds, before anything is computed."""
     file = folder / "registration.npz"
-    try:
-        with np.load(file, allow_pickle=False) as archive:
-            triangles, vertices, confidence = (archive[name] for name in ("triangles", "vertices", "confidence"))
-    except Exception as error:  # whatever a broken file makes zipfile, zlib and numpy raise
-        raise _input_error("A registration cannot be read", file, "an undamaged NPZ file", error) from error
+    arrays = SCHEMA.read(file, only=("triangles", "vertices", "confidence"))
+    triangles, vertices = arrays["triangles"], arrays["vertices"]
     if gnm_npz.topology_hash(triangles) != topology:
         raise InputError(
             "A registration has another topology than the model",
@@ -167,10 +162,6 @@ def _check_arrays(folder: Path, topology: str, data: GNMData) -> None:
             expected=f"the model's {len(data.template_vertex_positions)} vertices and {len(data.triangles)} triangles",
             got=f"{len(vertices)} vertices and {len(triangles)} triangles, or another order",
             fix="register all subjects with one model, and give that one with --model",
-        )
-    if not (np.isfinite(vertices).all() and np.isfinite(confidence).all()):
-        raise _input_error(
-            "A registration is not finite", file, "finite vertices and confidence", "NaN or infinite numbers"
         )
 
 

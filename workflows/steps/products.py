@@ -4,11 +4,12 @@ A product of the same inputs is not computed again. The result is written last, 
 can be repeated at any time; flows rely on that.
 """
 
-import json
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, Generic, TypeVar
 
+from registration.storage.reading import read_json
 from workflows.records.step_results import StepResult
 
 FILE = "step.json"
@@ -44,10 +45,7 @@ class Product(Generic[R]):
 
     def _read(self, file: Path) -> dict[str, Any]:
         """The JSON object. Other fields than the hash are not checked: another version may have written it."""
-        try:
-            value = json.loads(file.read_bytes())
-        except (OSError, ValueError, RecursionError) as error:
-            raise self.result.invalid(file, expected="a JSON object", got=error) from error
+        value = read_json(file, partial(self.result.invalid, file))
         if not isinstance(value, dict) or not isinstance(value.get("input_hash"), str):
             raise self.result.invalid(file, expected='an object with "input_hash"', got="no such field")
         return value
