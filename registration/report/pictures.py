@@ -80,12 +80,12 @@ def scale_colours(value: Float[np.ndarray, "*S"]) -> Float[np.ndarray, "*S 3"]:
     return np.stack([np.interp(value, stops, np.array(COLOUR_SCALE, float)[:, k]) for k in range(3)], -1)
 
 
-def data_uri(image: RgbImage, quality: int = 86) -> str:
-    """Encode an image as the data URI of a JPEG.
+def jpeg(image: RgbImage, quality: int = 86) -> bytes:
+    """Encode an image as a JPEG file.
 
     Args:
         image: 8 bit sRGB.
-        quality: of the JPEG, up to 100.
+        quality: up to 100.
 
     Raises:
         ValueError: OpenCV cannot encode the array.
@@ -93,7 +93,12 @@ def data_uri(image: RgbImage, quality: int = 86) -> str:
     ok, encoded = cv2.imencode(".jpg", image[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, quality])
     if not ok:
         raise ValueError(f"cannot encode an image of shape {image.shape}")
-    return "data:image/jpeg;base64," + base64.b64encode(encoded.tobytes()).decode("ascii")
+    return encoded.tobytes()
+
+
+def data_uri(image: RgbImage, quality: int = 86) -> str:
+    """Encode an image as the data URI of a JPEG; arguments and errors as for `jpeg`."""
+    return "data:image/jpeg;base64," + base64.b64encode(jpeg(image, quality)).decode("ascii")
 
 
 def overlap(target: Float[np.ndarray, "H W"], rendered: Float[np.ndarray, "H W"]) -> float:

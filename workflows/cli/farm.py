@@ -16,6 +16,7 @@ from workflows.cli.options import NOT_SET, FarmOptions, JobId, JobOptions, Port,
 if TYPE_CHECKING:
     from workflows.engine.client import QueueClient
     from workflows.engine.reader import JobRow, QueueMetrics
+    from workflows.farm.batch_page import BatchPage
 
 CAPTURES_PER_DAY = 10_000  # the throughput that status compares with
 REFRESH_S = 2.0
@@ -113,6 +114,7 @@ def batch(
     from registration.progress import console_progress
     from workflows.engine.process import migrate
     from workflows.farm.batch import batch_jobs, submit_batch
+    from workflows.farm.batch_page import BatchPage
     from workflows.farm.local import LocalFarm, local_gpus, run_until_done
 
     jobs = batch_jobs(captures, model=model, out=out, run=run, options=fit.register_options())
@@ -122,15 +124,26 @@ def batch(
         migrate(url)
     count = submit_batch(url, jobs)
     print(f"{jobs.run}: {count} captures are in the queue", flush=True)
+    page = BatchPage(url, jobs.run, out)
     if not farm.local:
+        _say_page(page)
         return 0
     roots = (*jobs.roots, str(folder.resolve()))
     gpus = local_gpus() if fit.variant == "cuda" else ()
     machine = LocalFarm(url=url, folder=folder, roots=roots, workers=farm.workers, gpus=gpus)
-    with console_progress() as progress:
-        result = run_until_done(machine, jobs.run, progress)
+    try:
+        with console_progress() as progress:
+            result = run_until_done(machine, jobs.run, progress, page.update)
+    finally:
+        _say_page(page, live=False)
     print("\n".join((*_status_lines(_figures(url, jobs.run)), *filter(None, [result.reason]))))
     return 0 if result.counts.get("done", 0) == sum(result.counts.values()) else 1
+
+
+def _say_page(page: "BatchPage", *, live: bool = True) -> None:
+    """Write a batch's page, and print where it is or why there is none."""
+    page.write(live=live)
+    print(page.problem or page.location, file=sys.stderr if page.problem else sys.stdout, flush=True)
 
 
 def status(

@@ -91,6 +91,11 @@ class QueueReader:
                 rows |= {row[0]: _row(row) for row in ask(query, {"ids": list(ids[start : start + 1000])})}
         return rows
 
+    def jobs(self, run: str) -> list[JobRow]:
+        """Return the jobs of a run, or of a part of it, without its flows."""
+        among = BELOW.replace("workflow_uuid", "w.workflow_uuid")
+        return [_row(row) for row in self._rows(self._select(f"w.name = 'job' AND {among}"), below(check_id(run)))]
+
     def metrics(self, run: str | None = None) -> QueueMetrics:
         """Return everything that `gnmreg status` shows, of a run or of the whole queue."""
         among = f"{BELOW} AND " if run else ""

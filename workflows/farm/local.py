@@ -5,7 +5,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -41,10 +41,21 @@ class LocalRunResult:
     reason: str = ""  # of the driver's failure
 
 
-def run_until_done(farm: LocalFarm, run: str, progress: Progress) -> LocalRunResult:
+def run_until_done(
+    farm: LocalFarm,
+    run: str,
+    progress: Progress,
+    on_counts: Callable[[Mapping[str, int]], None] = lambda counts: None,
+) -> LocalRunResult:
     """Start the farm, wait until a run's driver has ended, stop the farm.
 
     The processes end with this function, also on Ctrl-C and kill -9; the next call continues the run.
+
+    Args:
+        farm: the processes.
+        run: name of the run.
+        progress: where to report to.
+        on_counts: called every second with the numbers of jobs by state.
 
     Raises:
         InputError: no workers, or a process could not start.
@@ -61,6 +72,7 @@ def run_until_done(farm: LocalFarm, run: str, progress: Progress) -> LocalRunRes
             row = reader.rows([run]).get(run)
             counts = reader.counts(run, kind="job")
             progress.update(ended(counts), max(sum(counts.values()), 1), _summary(counts))
+            on_counts(counts)
             if row is not None and row.state in (DONE, FAILED, CANCELLED):
                 reason = f"{row.failure['status']}: {row.failure['reason']}" if row.failure else ""
                 return LocalRunResult(counts=counts, reason=reason)

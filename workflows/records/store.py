@@ -2,6 +2,7 @@
 
     <store>/<key>/artifact.json          the record: input hash and the digest of every file
     <store>/<key>/attempt-<uuid>/...     the files of the attempt that the record names
+    <store>/<name>.html, <name>.csv      pages and tables about them
 
 An attempt writes only below its own folder and is published by writing the record, which is atomic: two workers that
 compute the same artifact do not interfere, and one that dies leaves files that `verify` lists as orphaned.
@@ -29,6 +30,7 @@ from workflows.ids import check_id, redact
 
 MANIFEST = "artifact.json"
 ATTEMPT = "attempt-"
+PAGES = (".html", ".csv")  # endings of the files beside the artifacts
 _BLOCK = 2**20
 
 
@@ -169,7 +171,7 @@ class Store:
             artifacts=len(manifests),
             missing=tuple(missing),
             altered=tuple(altered),
-            orphaned=tuple(sorted(names - known)),
+            orphaned=tuple(sorted(name for name in names - known if not _is_page(name))),
             unreadable=unreadable,
         )
 
@@ -186,6 +188,19 @@ class Store:
         if self.local is not None:
             _remove_empty(self.local)
         return deleted
+
+    def write_page(self, name: str, text: str) -> None:
+        """Write a page or table about the artifacts beside them, in one write.
+
+        Raises:
+            InputError: the name is not that of a page.
+            OSError: the store cannot be written to.
+        """
+        if not _is_page(name):
+            raise InputError("The page cannot be written", where=name, expected="NAME.html or NAME.csv", got=name)
+        if self.local is not None:
+            self.local.mkdir(parents=True, exist_ok=True)
+        self._write(self._path(name), text)
 
     def delete(self, below: str) -> int:
         """Delete all artifacts at and below a key, records first, and return their number."""
@@ -270,6 +285,10 @@ def _digest(stream: Any) -> str:
         while block := stream.read(_BLOCK):
             digest.update(block)
     return digest.hexdigest()
+
+
+def _is_page(name: str) -> bool:
+    return "/" not in name and name.endswith(PAGES)
 
 
 def _in_attempt(name: str) -> bool:

@@ -1,5 +1,6 @@
 """The steps that register one capture. A worker's child calls them with JSON arguments."""
 
+import traceback
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -8,16 +9,21 @@ from registration.capture.native import read_capture
 from registration.inputs import input_hash, read_schemes
 from registration.model import gnm_npz
 from registration.pipeline import register
-from registration.progress import Progress
+from registration.progress import NullProgress, Progress
+from registration.report.pictures import jpeg
 from registration.storage import hashing
 from registration.storage.registration_folder import read_manifest
+from registration.types import Registration
 from workflows.engine.jobs import PermanentStepError
+from workflows.pages.thumbnail import thumbnail
+from workflows.records.headline import brief
 from workflows.records.remote import fetch_capture, fetch_model
 from workflows.records.store import Store
 from workflows.steps.job_options import from_job
 from workflows.steps.subject import start_subject
 
 REGISTRATION = "registration"  # the folder within an attempt
+REPORT, THUMBNAIL = f"{REGISTRATION}/report.html", "thumbnail.jpg"  # within an attempt
 
 
 def register_stored(
@@ -55,13 +61,32 @@ def register_stored(
 
         def make(attempt: Path) -> dict[str, Any]:
             result = register(folder, file, attempt / REGISTRATION, chosen, progress=progress)
-            scan = result.figures.get("scan_to_mesh", {}).get("face")
-            return hashing.to_jsonable({"status": result.status, "reason": result.reason, "scan_to_mesh_face": scan})
+            about = {
+                "status": result.status,
+                "reason": result.reason,
+                "figures": brief(result.figures),
+                "seconds": sum(result.seconds.values()),
+                "thumbnail": _write_thumbnail(result, attempt / THUMBNAIL, progress or NullProgress()),
+            }
+            return hashing.to_jsonable(about)
 
         artifact = Store(store).produce(key, input_hash=digest, make=make)
     if artifact.about.get("status") == "failed":
         raise PermanentStepError(f"registration failed: {artifact.about.get('reason')}")
     return {**artifact.brief(), "attempt": artifact.attempt}
+
+
+def _write_thumbnail(result: Registration, file: Path, progress: Progress) -> bool:
+    """Write a picture of the head, and return whether there is one: a failure must not cost the registration."""
+    try:
+        image = thumbnail(result)
+        if image is None:
+            return False
+        file.write_bytes(jpeg(image))
+    except Exception:
+        progress.message(traceback.format_exc())
+        return False
+    return True
 
 
 def register_capture(

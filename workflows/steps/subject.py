@@ -18,10 +18,13 @@ from registration.model import gnm_npz
 from registration.options import RegisterOptions
 from registration.pipeline import register
 from registration.progress import NullProgress, PrefixedProgress, Progress
+from registration.report.pictures import RgbImage, data_uri
 from registration.storage import hashing
 from registration.storage.registration_folder import read_manifest, update_figures
 from registration.types import Capture, Registration
-from workflows.pages.subject import render_subject_page, thumbnail
+from workflows.pages.subject import render_subject_page
+from workflows.pages.thumbnail import thumbnail
+from workflows.records.headline import brief
 from workflows.records.step_results import CaptureResult, CollectResult
 from workflows.records.subject import (
     CaptureRow,
@@ -34,8 +37,6 @@ from workflows.records.subject import (
 )
 from workflows.steps.job_options import from_job
 from workflows.steps.products import Product
-
-HEADLINE = ("scan_to_mesh", "drift")  # metrics of the face that are copied from the manifest
 
 
 def register_subject(
@@ -177,9 +178,9 @@ class _SubjectWriter:
     def row(self, capture: Capture) -> CaptureRow:
         return next(row for row in self.subject.rows if row.name == capture.root.name)
 
-    def put(self, row: CaptureRow, thumbnail: str | None = None) -> None:
+    def put(self, row: CaptureRow, thumbnail: RgbImage | None = None) -> None:
         if thumbnail is not None:
-            self._thumbnails[row.name] = thumbnail
+            self._thumbnails[row.name] = data_uri(thumbnail)
         rows = tuple(row if old.name == row.name else old for old in self.subject.rows)
         self.subject = replace(self.subject, rows=rows)
         self._save()
@@ -247,7 +248,7 @@ def _register_row(
         row,
         status=result.status,
         reason=reason,
-        figures={name: {"face": face} for name in HEADLINE if (face := result.figures.get(name, {}).get("face"))},
+        figures=brief(result.figures),
         seconds=sum(result.seconds.values()),
         folder=folder.name,
     )

@@ -1,5 +1,6 @@
 """Commands of an operator on a queue without workers; `--local` with real registrations is in the slow tests."""
 
+import csv
 import os
 import re
 import signal
@@ -125,11 +126,20 @@ def test_a_local_farm_is_interrupted_and_resumes(tmp_path: Path) -> None:
     first.send_signal(signal.SIGINT)
     assert first.wait(timeout=60) == 130
     assert len(pids) >= 3 and not any(map(alive, pids))
+    table = tmp_path / "out" / "captures.csv"
+    assert "running" not in table.read_text()
     second = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=600)
     assert second.returncode == 1 and "jobs: 3 (2 done, 1 failed)" in second.stdout, second.stdout + second.stderr
     assert 'capture.toml lacks "subject"' in second.stdout
     report = Store(tmp_path / "out").verify()
     assert report.is_sound and report.artifacts == 2 and not _processes_of(str(tmp_path))
+    with table.open() as file:
+        bad, *registered = csv.DictReader(file)
+    assert (bad["capture"], bad["status"]) == ("captures/bad", "bad input")
+    assert {row["status"] for row in registered} <= {"converged", "stopped"}
+    for row in registered:
+        assert (tmp_path / "out" / row["report"]).is_file() and float(row["scan_to_mesh_face_mean_mm"]) < 5
+        assert (tmp_path / "out" / row["report"]).parents[1].joinpath("thumbnail.jpg").is_file()
 
 
 def _done(url: str) -> bool:

@@ -22,9 +22,10 @@ def work(store: str, key: str, seconds: float = 0.0, trace: str | None = None) -
         time.sleep(seconds)
         (folder / "result.txt").write_text(key)
         _trace(trace, f"end {key} {os.getpid()}")
-        return {"seconds": seconds}
+        return {"status": "converged", "seconds": seconds}
 
-    return Store(store).produce(key, input_hash=key, make=make).brief()
+    artifact = Store(store).produce(key, input_hash=key, make=make)
+    return {**artifact.brief(), "attempt": artifact.attempt}
 
 
 def talk(text: str, progress: Progress) -> str:
