@@ -58,7 +58,7 @@ def main() -> None:
         page = ReviewPage(ReviewState(stored(head), head, Path(folder) / "log.jsonl", "picture"), port=0)
         browser = playwright.chromium.launch(executable_path=CHROMIUM or shutil.which("chromium"), args=list(FLAGS))
         tab = browser.new_page(viewport=SIZE)
-        tab.goto(f"http://127.0.0.1:{page.port}")
+        tab.goto(page.url)
         tab.get_by_text("Software WebGL rendering detected").locator("xpath=ancestor::*[@role='alert'][1]").get_by_role(
             "button"
         ).click()

@@ -1,4 +1,4 @@
-"""Pages that viser serves on the loopback interface, over one port; they request nothing from other hosts."""
+"""Pages that viser serves on the loopback interface, over one port, to those who know their token."""
 
 import socket
 import time
@@ -6,6 +6,7 @@ import time
 import viser
 
 from registration.errors import InputError
+from workflows.web.gate import PARAMETER, Gate, guarded_servers
 
 _HOST = "127.0.0.1"
 
@@ -36,7 +37,9 @@ class PageServer:
                     got=error,
                     fix="choose another one with --port",
                 ) from error
-        self._server = viser.ViserServer(host=_HOST, port=port, label=title, verbose=False)
+        self._gate = Gate()
+        with guarded_servers(self._gate):
+            self._server = viser.ViserServer(host=_HOST, port=port, label=title, verbose=False)
         self.port = self._server.get_port()
         gui, scene = self._server.gui, self._server.scene
         gui.configure_theme(brand_color=(31, 122, 116), show_logo=False, show_share_button=False, control_width="large")
@@ -47,8 +50,8 @@ class PageServer:
 
     @property
     def url(self) -> str:
-        """The page's URL."""
-        return f"http://{_HOST}:{self.port}"
+        """The page's URL, with the token that it asks for."""
+        return f"http://{_HOST}:{self.port}/?{PARAMETER}={self._gate.token}"
 
     def wait(self) -> None:
         """Block until Ctrl-C, then close."""

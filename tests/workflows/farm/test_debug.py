@@ -75,7 +75,7 @@ def test_a_registration_can_be_watched(calls: list[dict[str, Any]], tmp_path: Pa
     capture = small.make(tmp_path / "capture")
     done = debug(row(capture=str(capture), model=str(synthetic.MODEL)), tmp_path / "out", NullProgress(), port=0)
     assert done.page is not None
-    with urllib.request.urlopen(f"http://127.0.0.1:{done.page.port}", timeout=10) as answer:
+    with urllib.request.urlopen(done.page.url, timeout=10) as answer:
         assert answer.status == 200
     done.page.close()
 

@@ -93,7 +93,7 @@ def test_an_operator_watches_a_fit(page: FitPage, tmp_path: Path) -> None:
         tab = browser.new_page(viewport={"width": 1360, "height": 900})
         requests = []
         tab.on("request", lambda request: requests.append(request.url))
-        tab.goto(f"http://127.0.0.1:{page.port}")
+        tab.goto(page.url)
         expect = sync_api.expect
         expect(tab.get_by_text("ball, neutral")).to_be_visible(timeout=60_000)
         tab.set_default_timeout(15_000)

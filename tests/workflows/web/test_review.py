@@ -48,7 +48,7 @@ def test_a_reviewer_steps_subtracts_undoes_and_saves(page, run, model, model_fil
         requests, sockets = [], []
         tab.on("request", lambda request: requests.append(request.url))
         tab.on("websocket", lambda socket: sockets.append(socket.url))
-        tab.goto(f"http://127.0.0.1:{page.port}")
+        tab.goto(page.url)
         see = sync_api.expect
         see(tab.get_by_text("6 expressions of 2 subjects")).to_be_visible(timeout=60_000)
         tab.set_default_timeout(15_000)
