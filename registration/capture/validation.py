@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from registration.capture import headers, leftovers, pixels, triangulation
+from registration.capture import headers, leftovers, pixels, rig_checks, triangulation
 from registration.capture.scan import read_scan, read_truth
 from registration.errors import InputError
 from registration.types import Capture, View
@@ -37,13 +37,13 @@ def validate_capture(capture: Capture) -> None:
         _check_camera(capture, view)
         _check_headers(capture, view)
     leftovers.match_files(capture)
-    _check_landmarks(capture)
+    agree, sized = _check_landmarks(capture)
     if capture.scan is not None:
         read_scan(capture.scan)
     if capture.ground_truth is not None:
         read_truth(capture.ground_truth)
-    for view in capture.views:
-        _check_pixels(capture, view)
+    boxes = {view.name: _check_pixels(capture, view) for view in capture.views}
+    rig_checks.check_mask_rays(capture, boxes, poses=not agree, size=not sized)
 
 
 def _check_camera(capture: Capture, view: View) -> None:
@@ -95,7 +95,8 @@ def _files(view: View) -> list[tuple[Path, str]]:
     return [(path, role) for path, role in files if path is not None]
 
 
-def _check_landmarks(capture: Capture) -> None:
+def _check_landmarks(capture: Capture) -> tuple[bool, bool]:
+    """Whether landmarks confirm the poses, and whether they confirm the unit."""
     counts = {len(view.landmarks["68"]) for view in capture.views if "68" in view.landmarks}
     if counts - {68}:
         raise InputError(
@@ -105,6 +106,7 @@ def _check_landmarks(capture: Capture) -> None:
             got=", ".join(map(str, sorted(counts))),
             fix="give another scheme another name",
         )
+    agree = rig_checks.check_landmark_rays(capture)
     points = triangulation.triangulate(capture, "68")[0]
     distance = eye_distance(points)
     if distance is not None and not EYE_DISTANCE_M[0] <= distance <= EYE_DISTANCE_M[1]:
@@ -117,6 +119,10 @@ def _check_landmarks(capture: Capture) -> None:
             got=f"{distance:.4g} m",
             fix=hint,
         )
+    if distance is None:
+        for name in {name for view in capture.views for name in view.landmarks}:
+            rig_checks.check_landmark_size(capture, name, triangulation.triangulate(capture, name)[0])
+    return agree, distance is not None
 
 
 def eye_distance(points: Float[np.ndarray, "L 3"]) -> float | None:
@@ -128,10 +134,12 @@ def eye_distance(points: Float[np.ndarray, "L 3"]) -> float | None:
     return distance if np.isfinite(distance) else None
 
 
-def _check_pixels(capture: Capture, view: View) -> None:
-    camera = view.camera
+def _check_pixels(capture: Capture, view: View) -> rig_checks.MaskBox | None:
+    """Decode what a view has. Returns the box of its mask, or else of its labels."""
+    camera, box = view.camera, None
     if view.mask is not None:
-        brightest = int(pixels.read_mask(view.mask, camera).max())
+        mask = pixels.read_mask(view.mask, camera)
+        brightest, box = int(mask.max()), rig_checks.mask_box(mask > 127)
         if brightest < 128:
             raise InputError(
                 "The mask is empty",
@@ -141,8 +149,11 @@ def _check_pixels(capture: Capture, view: View) -> None:
                 fix="write 255 for the subject" if brightest else "draw the mask, or remove this view or its mask",
             )
     if view.segmentation is not None:
-        pixels.read_labels(view.segmentation, camera, capture.classes)
+        labels = pixels.read_labels(view.segmentation, camera, capture.classes)
+        if box is None and "background" in capture.classes:
+            box = rig_checks.mask_box(labels != capture.classes.index("background"))
     if camera.width_px * camera.height_px <= MAX_DECODED_PIXELS:
         pixels.read_image(view.image, camera)
         if view.normals is not None:
             pixels.read_normals(view.normals, camera)
+    return box
