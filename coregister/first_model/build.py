@@ -22,7 +22,7 @@ from registration.geometry.quads import corner_triangles, triangles_of
 from registration.model import gnm_npz, landmarks
 from registration.model.gnm_npz import GNMData
 from registration.model.landmarks import LandmarkScheme
-from registration.storage.cache import cache_folder
+from registration.storage.cache import cache_folder, make_cache_folder
 from registration.storage.files import atomic_file
 
 SEED = 20260401
@@ -96,7 +96,7 @@ def _build_into(path: Path) -> None:
     """Build the model into its cache folder, which appears complete or not at all."""
     source = makehuman.read(makehuman.fetch())
     data, schemes = build_first_model(source)
-    path.parent.parent.mkdir(parents=True, exist_ok=True)
+    make_cache_folder(path.parent.parent)
     with tempfile.TemporaryDirectory(dir=path.parent.parent, prefix=".first-") as folder:
         new = Path(folder) / path.parent.name
         gnm_npz.write(data, new / path.name)

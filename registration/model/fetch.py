@@ -7,7 +7,7 @@ from pathlib import Path
 
 from registration.errors import InputError
 from registration.model import gnm_npz
-from registration.storage.cache import cache_folder
+from registration.storage.cache import cache_folder, make_cache_folder
 from registration.storage.files import atomic_file
 
 BASE_URL = "https://huggingface.co/google/gnm-v3/resolve/main"
@@ -32,7 +32,7 @@ def fetch(base_url: str = BASE_URL) -> Path:
     path, url = cached_path(), f"{base_url}/{FILE}"
     if path.is_file():
         return path
-    path.parent.mkdir(parents=True, exist_ok=True)
+    make_cache_folder(path.parent)
     with atomic_file(path) as temporary:
         _download(url, temporary, path)
         gnm_npz.read(temporary)

@@ -1,8 +1,12 @@
 """The cache folder: downloaded and built models, and the libLLVM that was tested on this machine."""
 
+import errno
+import os
 from pathlib import Path
 
 import platformdirs
+
+from registration.errors import InputError
 
 
 def cache_folder() -> Path:
@@ -17,3 +21,23 @@ def cache_folder() -> Path:
     if not folder.is_absolute():
         raise RuntimeError("the user has no home folder")
     return folder
+
+
+def make_cache_folder(folder: Path) -> None:
+    """Make a folder in the cache, and its parents.
+
+    Raises:
+        InputError: this user cannot write there.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        if not os.access(folder, os.W_OK):
+            raise PermissionError(errno.EACCES, os.strerror(errno.EACCES))
+    except OSError as error:
+        raise InputError(
+            "The cache folder cannot be written",
+            where=folder,
+            expected="a folder that this user can make and write",
+            got=error.strerror or error,
+            fix="correct its permissions, or set XDG_CACHE_HOME to a folder that can be written",
+        ) from error

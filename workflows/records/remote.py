@@ -12,7 +12,7 @@ from typing import Any
 import fsspec
 
 from registration.errors import InputError
-from registration.storage.cache import cache_folder
+from registration.storage.cache import cache_folder, make_cache_folder
 from workflows.ids import redact
 
 MAX_BYTES = 64 * 2**30  # of one capture: more than any has; limits the download of a hostile listing
@@ -81,7 +81,7 @@ def fetch_model(location: str) -> Path:
     cache = cache_folder() / "fetched"
     cached = cache / hashlib.sha256(json.dumps([location, versions], sort_keys=True).encode()).hexdigest()[:32]
     if not cached.is_dir():
-        cache.mkdir(parents=True, exist_ok=True)
+        make_cache_folder(cache)
         temporary = Path(tempfile.mkdtemp(prefix=".fetch-", dir=cache))
         try:
             for remote in infos:
