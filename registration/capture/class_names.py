@@ -9,13 +9,13 @@ BACKGROUND = "background"
 NECK = "neck_other"
 KNOWN = (BACKGROUND, *CLASSES, NECK)
 
-# What covers a head: excluded from every comparison on purpose.
-_COVERS = re.compile(r"hair|beard|cloth|shirt|hat|helmet|cap|glass|eye_?g|ear_?r(ing)?$|neck_?l(ace)?$|mask|band|hand")
+# What covers a head or is not known: excluded from every comparison on purpose.
+_COVERS = re.compile(
+    r"hair|beard|cloth|shirt|hat$|helmet|cap$|glass|eye_?g$|ear_?r(ing)?s?$|neck_?l(ace)?$|mask|band|hand|ignore|unlabel|void"
+)
 _OTHER_NAMES = {
     "bg": BACKGROUND,
     "back": BACKGROUND,
-    "none": BACKGROUND,
-    "unlabeled": BACKGROUND,
     "face": "skin",
     "facial_skin": "skin",
     "head": "skin",

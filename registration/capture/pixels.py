@@ -15,6 +15,7 @@ from jaxtyping import Float, UInt8
 from PIL import Image
 
 from registration.capture.headers import require_complete, require_size
+from registration.capture.masks import subject_coverage
 from registration.capture.tiff import decode_tiff, is_tiff
 from registration.errors import InputError
 from registration.frames import opencv_intrinsics, srgb_to_linear
@@ -24,7 +25,7 @@ from registration.types import Camera, Capture, View, ViewPixels
 
 STRIP_PIXELS = 2**21  # converted to float at a time: 25 MB of float32 RGB
 _COLOUR = cv2.IMREAD_COLOR_RGB | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
-_GRAY = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION
+_AS_STORED = cv2.IMREAD_UNCHANGED | cv2.IMREAD_IGNORE_ORIENTATION
 
 
 def read_view(view: View, capture: Capture, *, downsample: int = 1) -> ViewPixels:
@@ -105,8 +106,8 @@ def read_image(path: Path, camera: Camera) -> np.ndarray:
 
 
 def read_mask(path: Path, camera: Camera) -> UInt8[np.ndarray, "H W"]:
-    """Read a mask, 255 = subject, distorted."""
-    return _imread(path, "mask", camera, _GRAY)
+    """Read a mask, 255 = subject, distorted (`masks.subject_coverage`). Raises InputError if it is none."""
+    return subject_coverage(path, _imread(path, "mask", camera, _AS_STORED))
 
 
 def read_normals(path: Path, camera: Camera) -> np.ndarray:
@@ -125,22 +126,24 @@ def read_normals(path: Path, camera: Camera) -> np.ndarray:
 
 def read_labels(path: Path, camera: Camera, classes: tuple[str, ...]) -> UInt8[np.ndarray, "H W"]:
     """Read a label map, distorted: indices into `classes`. Raises InputError for an index without a name."""
-    require_size(path, "label map", camera.width_px, camera.height_px)
+    header = require_size(path, "label map", camera.width_px, camera.height_px)
     require_complete(path, "label map")
     try:
         with Image.open(path, formats=FORMATS) as image:  # unlike OpenCV it does not convert palette indices to colours
-            mode = image.mode
+            mode, form = image.mode, image.format
             labels = np.array(image)
     except Exception as error:  # a damaged file makes Pillow raise nearly anything
         got = f"{type(error).__name__}: {error}"
         raise _undecodable(path, "label map")(expected="a whole, undamaged image", got=got) from None
-    if mode not in ("L", "P") or labels.dtype != np.uint8:
+    if mode == "L" and header.png_bits in (2, 4):  # Pillow scales them to 8 bits
+        labels = labels // (255 // (2**header.png_bits - 1))
+    if form == "JPEG" or mode not in ("L", "P") or labels.dtype != np.uint8:
         raise InputError(
             "The label map is not a map of indices",
             where=path,
-            expected="8 bit, one channel",
-            got=f"mode {mode}, {labels.dtype}",
-            fix="store the class index of each pixel in one 8 bit channel",
+            expected="8 bit, one channel, without loss",
+            got="a JPEG, whose compression mixes indices" if form == "JPEG" else f"mode {mode}, {labels.dtype}",
+            fix="store the class index of each pixel in one 8 bit channel of a PNG",
         )
     highest = int(labels.max())
     if highest >= len(classes):
@@ -148,8 +151,8 @@ def read_labels(path: Path, camera: Camera, classes: tuple[str, ...]) -> UInt8[n
             "A label index has no name",
             where=path,
             expected=f"indices below {len(classes)}: {', '.join(classes)}",
-            got=f"index {highest}",
-            fix="name every index in [segmentation] classes of capture.toml",
+            got=f"index {highest} at {int((labels == highest).sum())} pixels",
+            fix="name every index in [segmentation] classes of capture.toml; pixels to ignore (often 255) need one too",
         )
     return labels
 
@@ -160,7 +163,7 @@ def _imread(path: Path, role: str, camera: Camera, flags: int) -> np.ndarray:
     refuse = _undecodable(path, role)
     with path.open("rb") as file:
         tiff = is_tiff(file.read(4))
-    pixels = decode_tiff(path, refuse, grey=flags == _GRAY) if tiff else decode(path, flags, refuse)
+    pixels = decode_tiff(path, refuse) if tiff else decode(path, flags, refuse)
     if pixels.shape[:2] != (camera.height_px, camera.width_px):
         raise refuse(expected="the size in its header", got=f"shape {pixels.shape}")
     return pixels

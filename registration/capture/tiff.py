@@ -113,16 +113,15 @@ def refuse_tiff(path: Path, role: str, got: object) -> InputError:
     )
 
 
-def decode_tiff(path: Path, refuse: Refuse, *, grey: bool = False) -> np.ndarray:
+def decode_tiff(path: Path, refuse: Refuse) -> np.ndarray:
     """Decode the first image of a TIFF file, pixels as stored: not turned, colours not multiplied by alpha.
 
     Args:
         path: the file, whose header was checked.
         refuse: makes the error.
-        grey: return one channel.
 
     Returns:
-        (H, W, 3) RGB or (H, W) grey, uint8 or uint16.
+        (H, W, 3) RGB, uint8 or uint16.
 
     Raises:
         InputError: it cannot be decoded, not even in part.
@@ -133,6 +132,4 @@ def decode_tiff(path: Path, refuse: Refuse, *, grey: bool = False) -> np.ndarray
     pixels = decode_content(data, cv2.IMREAD_UNCHANGED, refuse)
     if pixels.ndim not in (2, 3):
         raise refuse(expected="one image", got=f"an array of shape {pixels.shape}")
-    if grey:
-        return pixels if pixels.ndim == 2 else cv2.cvtColor(np.ascontiguousarray(pixels[..., :3]), cv2.COLOR_BGR2GRAY)
     return np.repeat(pixels[..., None], 3, 2) if pixels.ndim == 2 else np.ascontiguousarray(pixels[..., 2::-1])

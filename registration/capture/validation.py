@@ -139,14 +139,14 @@ def _check_pixels(capture: Capture, view: View) -> rig_checks.MaskBox | None:
     camera, box = view.camera, None
     if view.mask is not None:
         mask = pixels.read_mask(view.mask, camera)
-        brightest, box = int(mask.max()), rig_checks.mask_box(mask > 127)
-        if brightest < 128:
+        box = rig_checks.mask_box(mask > 127)
+        if not mask.any():
             raise InputError(
                 "The mask is empty",
                 where=view.mask,
                 expected="255 where the subject is",
-                got=f"no pixel above {brightest}",
-                fix="write 255 for the subject" if brightest else "draw the mask, or remove this view or its mask",
+                got="no pixel above 0",
+                fix="draw the mask, or remove this view or its mask",
             )
     if view.segmentation is not None:
         labels = pixels.read_labels(view.segmentation, camera, capture.classes)

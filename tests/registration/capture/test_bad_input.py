@@ -206,7 +206,7 @@ def empty_mask(root: Path) -> None:
     cv2.imwrite(str(root / "masks" / "cam3.png"), np.zeros((160, 120), np.uint8))
 
 
-@bad("The mask is empty", where="masks/cam3.png", got="no pixel above 1", fix="255")
+@bad("The mask is too dark", where="masks/cam3.png", got="no pixel above 1", fix="255")
 def mask_of_ones(root: Path) -> None:
     cv2.imwrite(str(root / "masks" / "cam3.png"), np.ones((160, 120), np.uint8))
 
