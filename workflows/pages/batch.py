@@ -1,13 +1,15 @@
 """The HTML page of a batch: its captures, ranked by what needs a look; the images and reports are files beside it."""
 
 from collections.abc import Sequence
+from urllib.parse import quote
 
 from workflows.pages.base import render
+from workflows.pages.registrations import RegistrationLine, figure_texts, seconds_text
 from workflows.records.batch import DONE, FAILED, BatchRow, BatchTable
-from workflows.records.headline import Headline, headline_value
+from workflows.records.headline import Headline, verdict_level
 
-MISSING = "–"
 PAGE_ROWS = 100  # that are displayed at first: a browser takes seconds to lay out ten thousand
+_WIDTH_PX = 54  # of a thumbnail
 
 
 def render_batch_page(table: BatchTable, *, csv_file: str) -> str:
@@ -18,16 +20,33 @@ def render_batch_page(table: BatchTable, *, csv_file: str) -> str:
         csv_file: the same table as CSV, beside the page.
     """
     headlines = table.headlines
+    lines = [_line(row, headlines) for row in table.rows]
     return render(
         "batch.html",
         table=table,
         csv_file=csv_file,
         tiles=_tiles(table.rows),
         headlines=headlines,
-        counts=table.counts(),
-        rows=[{"row": row, "values": _values(row, headlines), "seconds": _seconds(row)} for row in table.rows],
+        statuses=table.counts(),
+        lines=lines,
+        to_look_at=sum(bool(line.failed or line.look) for line in lines),
         page_rows=PAGE_ROWS,
-        missing=MISSING,
+    )
+
+
+def _line(row: BatchRow, headlines: Sequence[Headline]) -> RegistrationLine:
+    return RegistrationLine(
+        name=row.name,
+        status=row.status,
+        failed=row.state == FAILED,
+        level=verdict_level(row.figures),
+        look=row.look,
+        reason=row.reason,
+        report=row.report,
+        thumbnail=quote(row.thumbnail) if row.thumbnail else None,
+        width=_WIDTH_PX,
+        values=figure_texts(row.figures, headlines),
+        seconds=seconds_text(row.seconds),
     )
 
 
@@ -42,12 +61,3 @@ def _tiles(rows: Sequence[BatchRow]) -> list[tuple[str, str, str]]:
         (len(rows) - len(done) - failed, "not done"),
     )
     return [(f"{count:,}", "", label) for count, label in counts]
-
-
-def _values(row: BatchRow, headlines: Sequence[Headline]) -> list[str]:
-    values = [(headline_value(row.figures, headline), headline.digits) for headline in headlines]
-    return [MISSING if value is None else f"{value:.{digits}f}" for value, digits in values]
-
-
-def _seconds(row: BatchRow) -> str:
-    return MISSING if row.seconds is None else f"{row.seconds:.0f}"

@@ -7,7 +7,16 @@ from dataclasses import dataclass, field, replace
 from statistics import median
 from typing import Any
 
-from workflows.records.headline import HEADLINES, Headline, headline_value
+from workflows.records.headline import (
+    HEADLINES,
+    VERDICTS,
+    WRONG,
+    Headline,
+    headline_value,
+    present,
+    verdict_level,
+    verdict_reasons,
+)
 
 DONE, FAILED, INTERRUPTED, CANCELLED = "done", "failed", "interrupted", "cancelled"  # states of jobs
 RUNNING, WAITING = "running", "waiting"
@@ -15,7 +24,7 @@ _UNFINISHED = (INTERRUPTED, CANCELLED, RUNNING, WAITING)  # in the order of the 
 _MIN_COMPARED = 8  # captures that have a figure before it is compared with the others'
 _MAX_DEVIATIONS, _MAX_RATIO = 6.0, 1.5  # of a figure from the batch's median that needs no look; both are exceeded
 _FORMULA = ("=", "+", "-", "@", "\t", "\r")  # a spreadsheet would execute such a cell
-_COLUMNS = ("capture", "state", "status", "needs_a_look", "reason")
+_COLUMNS = ("capture", "state", "status", "verdict", "needs_a_look", "reason")
 _MORE_COLUMNS = ("registration_s", "report", "source", "job")
 
 
@@ -48,7 +57,7 @@ class BatchTable:
     @property
     def headlines(self) -> list[Headline]:
         """The figures that any row has."""
-        return [h for h in HEADLINES if any(headline_value(row.figures, h) is not None for row in self.rows)]
+        return present(row.figures for row in self.rows)
 
     def counts(self) -> dict[str, int]:
         """Return status -> number of rows, in the order of the rows."""
@@ -64,7 +73,8 @@ class BatchTable:
         writer.writerow((*_COLUMNS, *(headline.column for headline in headlines), *_MORE_COLUMNS))
         for row in self.rows:
             values = [headline_value(row.figures, headline) for headline in headlines]
-            words = [_cell(word) for word in (row.name, row.state, row.status, row.look, row.reason)]
+            verdict = VERDICTS.get(verdict_level(row.figures), "")
+            words = [_cell(word) for word in (row.name, row.state, row.status, verdict, row.look, row.reason)]
             numbers = ["" if value is None else f"{value:.6g}" for value in (*values, row.seconds)]
             writer.writerow((*words, *numbers, *map(_cell, (row.report or "", row.source, row.job))))
         return text.getvalue()
@@ -73,8 +83,9 @@ class BatchTable:
 def ranked(rows: Sequence[BatchRow]) -> tuple[BatchRow, ...]:
     """Return the rows in the order in which they need a look, with the reasons in `look`.
 
-    First failed captures, by kind; then registrations that were stopped, or with a figure far above the batch's
-    median; then the other registrations, the largest figure first; then captures that are not done.
+    First failed captures, by kind; then registrations that are wrong or to be looked at by their verdict, were
+    stopped, or have a figure far above the batch's median; then the other registrations, the largest figure first;
+    then captures that are not done.
     """
     medians = {headline: limit for headline in HEADLINES if (limit := _limit(rows, headline)) is not None}
     looked = [replace(row, look="; ".join(_reasons(row, medians))) if row.state == DONE else row for row in rows]
@@ -100,7 +111,9 @@ def _limit(rows: Sequence[BatchRow], headline: Headline) -> _Limit | None:
 
 
 def _reasons(row: BatchRow, limits: Mapping[Headline, _Limit]) -> list[str]:
-    reasons = ["it was stopped before it converged"] if row.status == "stopped" else []
+    reasons = verdict_reasons(row.figures)
+    if row.status == "stopped" and not reasons:
+        reasons = ["it was stopped before it converged"]
     for headline, limit in limits.items():
         value = headline_value(row.figures, headline)
         if value is not None and value > limit.largest:
@@ -117,7 +130,8 @@ def _rank(row: BatchRow, limits: Mapping[Headline, _Limit]) -> tuple[Any, ...]:
     values = [(headline_value(row.figures, headline), headline) for headline in HEADLINES]
     ratios = [value / max(limits[h].largest, 1e-9) for value, h in values if value is not None and h in limits]
     first = next((value for value, _ in values if value is not None), 0.0)
-    return (1 if row.look else 2, -max(ratios, default=0.0), -first, row.name)
+    level = 1.0 if verdict_level(row.figures) == WRONG else 1.5 if row.look else 2.0
+    return (level, -max(ratios, default=0.0), -first, row.name)
 
 
 def _cell(text: str) -> str:

@@ -1,7 +1,7 @@
 """The figures of a registration that tables of many registrations show."""
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -17,18 +17,25 @@ class Headline:
     digits: int = 3
 
 
-_SCAN = ("scan_to_mesh", "face")
+_SCAN, _IMAGES = ("scan_to_mesh", "face"), ("residuals", "overall")
 HEADLINES = (
     Headline(path=(*_SCAN, "mean_mm"), column="scan_to_mesh_face_mean_mm", title="scan to mesh, mean", unit="mm"),
     Headline(path=(*_SCAN, "median_mm"), column="scan_to_mesh_face_median_mm", title="scan to mesh, median", unit="mm"),
     Headline(path=(*_SCAN, "p95_mm"), column="scan_to_mesh_face_p95_mm", title="scan to mesh, 95 %", unit="mm"),
     Headline(path=("drift", "face", "mean_mm"), column="drift_face_mean_mm", title="drift, mean", unit="mm"),
+    Headline(path=(*_IMAGES, "silhouette_px"), column="silhouette_px", title="silhouette", unit="px", digits=1),
+    Headline(path=(*_IMAGES, "normals_deg"), column="normals_deg", title="normals", unit="°", digits=1),
+    Headline(path=(*_IMAGES, "colour_levels"), column="colour_levels", title="colour", unit="levels", digits=1),
+    Headline(path=(*_IMAGES, "labels_percent"), column="labels_percent", title="labels", unit="%", digits=1),
+    Headline(path=(*_IMAGES, "landmarks_px"), column="landmarks_px", title="landmarks", unit="px", digits=1),
 )
+GOOD, LOOK, WRONG = "good", "look", "wrong"  # levels of a verdict
+VERDICTS = {GOOD: "good", LOOK: "look at it", WRONG: "wrong"}
 
 
 def brief(figures: Mapping[str, Any]) -> dict[str, Any]:
-    """Return those figures of a manifest that `HEADLINES` names, with the rows that they are in."""
-    kept: dict[str, Any] = {}
+    """Return the verdict and those figures of a manifest that `HEADLINES` names, with the rows that they are in."""
+    kept: dict[str, Any] = {"verdict": figures["verdict"]} if verdict_level(figures) else {}
     for headline in HEADLINES:
         if headline_value(figures, headline) is not None:
             *above, last = headline.path[:-1] or headline.path
@@ -46,3 +53,24 @@ def headline_value(figures: Mapping[str, Any], headline: Headline) -> float | No
         value = value.get(name) if isinstance(value, Mapping) else None
     number = isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
     return float(value) if number else None
+
+
+def verdict_level(figures: Mapping[str, Any]) -> str:
+    """Return "good", "look" or "wrong"; empty for a registration without a verdict."""
+    verdict = figures.get("verdict")
+    level = verdict.get("level") if isinstance(verdict, Mapping) else None
+    return level if level in VERDICTS else ""
+
+
+def verdict_reasons(figures: Mapping[str, Any]) -> list[str]:
+    """Return why a registration should be looked at; empty if its verdict is good, or there is none."""
+    if verdict_level(figures) not in (LOOK, WRONG):
+        return []
+    reasons = figures["verdict"].get("reasons")
+    return [str(reason) for reason in reasons] if isinstance(reasons, list | tuple) else []
+
+
+def present(rows: Iterable[Mapping[str, Any]]) -> list[Headline]:
+    """Return the columns that have a value in any of the rows, each the figures of a registration."""
+    figures = list(rows)
+    return [h for h in HEADLINES if any(headline_value(row, h) is not None for row in figures)]

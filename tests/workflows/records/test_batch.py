@@ -2,6 +2,7 @@
 
 import csv
 import io
+from dataclasses import replace
 from typing import Any
 
 from workflows.records.batch import BatchRow, BatchTable, ranked
@@ -44,6 +45,32 @@ def test_what_needs_a_look_comes_first() -> None:
     }
 
 
+def test_verdicts_are_reasons_to_look() -> None:
+    def judged(name: str, level: str) -> BatchRow:
+        return replace(a_row(name), figures={"verdict": {"level": level, "reasons": [f"it is {level}"]}})
+
+    rows = ranked([judged("fine", "good"), judged("doubtful", "look"), judged("off", "wrong"), judged("odd", "?")])
+    assert [(row.name, row.look) for row in rows] == [
+        ("off", "it is wrong"),
+        ("doubtful", "it is look"),
+        ("fine", ""),
+        ("odd", ""),
+    ]
+    read = read_csv(BatchTable(run="june", written="", rows=rows).to_csv())
+    assert [row["verdict"] for row in read] == ["wrong", "look at it", "good", ""]
+
+
+def test_residuals_in_the_images_are_columns() -> None:
+    """Of captures without a scan."""
+    overall = {"silhouette_px": 0.7, "normals_deg": 2.5, "landmarks_px": 1.25}
+    rows = ranked([replace(a_row("a"), figures={"residuals": {"overall": overall, "views": {}}})])
+    (read,) = read_csv(BatchTable(run="june", written="", rows=rows).to_csv())
+    assert {name: float(read[name]) for name in overall} == overall and "scan_to_mesh_face_mean_mm" not in read
+    assert brief({"residuals": {"overall": overall, "views": {"cam00": overall}}}) == {
+        "residuals": {"overall": overall}
+    }
+
+
 def test_figures_of_few_captures_are_not_compared() -> None:
     assert not any(row.look for row in ranked([a_row("a", mean_mm=0.2), a_row("b", mean_mm=9.0)]))
 
@@ -61,7 +88,7 @@ def test_the_csv_file_names_units_and_holds_no_formulas() -> None:
     )
     read = read_csv(BatchTable(run="june", written="", rows=rows).to_csv())
     assert list(read[0]) == [
-        *("capture", "state", "status", "needs_a_look", "reason"),
+        *("capture", "state", "status", "verdict", "needs_a_look", "reason"),
         *("scan_to_mesh_face_mean_mm", "registration_s", "report", "source", "job"),
     ]
     assert [row["capture"] for row in read] == ["bob/rest", "ann/rest"]

@@ -1,4 +1,4 @@
-const table = document.querySelector("table.rows"), body = table.tBodies[0];
+const table = document.querySelector("table.registrations"), body = table.tBodies[0];
 const search = document.querySelector("input[type=search]"), choice = document.querySelector("select");
 const said = document.querySelector("[role=status]"), more = document.querySelector("button.more");
 const all = [...body.rows].map((row) => ({ row, cells: [...row.cells].map((cell) => cell.textContent) }));
@@ -10,7 +10,7 @@ let order = all.map((_, k) => k), shown = rowsAtOnce;
 function show() {
   const words = search.value.toLowerCase().split(/\s+/).filter(Boolean), status = choice.value;
   const found = order.filter((k) => words.every((word) => text[k].includes(word))
-    && (!status || (status === "look" ? all[k].row.classList.contains("look") : all[k].cells[2] === status.slice(3))));
+    && (!status || (status === "look" ? all[k].row.classList.contains("look") : all[k].cells[2].endsWith(status.slice(3)))));
   body.replaceChildren(...found.slice(0, shown).map((k) => all[k].row));
   const displayed = Math.min(shown, found.length);
   said.textContent = `${displayed} of ${found.length}` + (found.length < all.length ? ` that match, ${all.length} in all` : "");
