@@ -32,6 +32,12 @@ def check_id(identity: str) -> str:
     return identity
 
 
+def id_part(name: str, length: int = 100) -> str:
+    """Return a folder's name as a part of an id: other characters than those of ids become "_"."""
+    part = re.sub(r"[^A-Za-z0-9._-]", "_", name)[:length]
+    return part if part[:1].isalnum() else f"x{part}"
+
+
 def check_location(location: Any, roots: Sequence[str], where: str) -> None:
     """Refuse a path or URL that is not below one of the roots, also by `..` or through a symbolic link.
 

@@ -104,16 +104,18 @@ def batch(
     """Register many independent captures through the queue.
 
     Args:
-        captures: Capture folders or their URLs; @FILE stands for a file with one of them on each line.
+        captures: Capture folders or their URLs; @FILE stands for a file with one of them on each line. Those that
+            cannot be used are listed, and the others are registered.
         model: The head model, a GNM NPZ file or its URL.
         out: The store to publish results in, a folder or an s3:// URL.
-        run: Name of the run. Submitting to the same run again adds new captures.
+        run: Name of the run. Submitting to the same run again adds new captures, and registers those again whose
+            settings or contents changed.
         fit: How the captures are registered.
         farm: Where the jobs are executed.
     """
     from registration.progress import console_progress
     from workflows.engine.process import migrate
-    from workflows.farm.batch import batch_jobs, submit_batch
+    from workflows.farm.batch import batch_jobs, made_and_kept, submit_batch
     from workflows.farm.batch_page import BatchPage
     from workflows.farm.local import LocalFarm, local_gpus, run_until_done
 
@@ -122,12 +124,17 @@ def batch(
     url = farm.url_for(folder)
     if farm.local:
         migrate(url)
-    count = submit_batch(url, jobs)
-    print(f"{jobs.run}: {count} captures are in the queue", flush=True)
+    submission = submit_batch(url, jobs)
+    print(f"{jobs.run}: {submission.total} captures are in the queue: {submission.new} new,", end=" ")
+    print(f"{submission.again} again, {submission.waiting} waiting or running already", flush=True)
+    for line in jobs.remarks[:MAX_IDS]:
+        print(line, file=sys.stderr)
+    if len(jobs.remarks) > MAX_IDS:
+        print(f"and {len(jobs.remarks) - MAX_IDS} more", file=sys.stderr)
     page = BatchPage(url, jobs.run, out)
     if not farm.local:
         _say_page(page)
-        return 0
+        return 1 if jobs.remarks else 0
     roots = (*jobs.roots, str(folder.resolve()))
     gpus = local_gpus() if fit.variant == "cuda" else ()
     machine = LocalFarm(url=url, folder=folder, roots=roots, workers=farm.workers, gpus=gpus)
@@ -137,7 +144,9 @@ def batch(
     finally:
         _say_page(page, live=False)
     print("\n".join((*_status_lines(_figures(url, jobs.run)), *filter(None, [result.reason]))))
-    return 0 if result.counts.get("done", 0) == sum(result.counts.values()) else 1
+    made, kept = made_and_kept(url, jobs)
+    print(f"{made} registered, {kept} kept: their inputs did not change")
+    return 0 if not jobs.remarks and result.counts.get("done", 0) == sum(result.counts.values()) else 1
 
 
 def _say_page(page: "BatchPage", *, live: bool = True) -> None:

@@ -2,7 +2,9 @@
 
 import json
 import re
+import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from itertools import islice
 from typing import Any
 
@@ -10,6 +12,7 @@ import sqlalchemy as sa
 from dbos import DBOSClient, EnqueueOptions
 
 from registration.errors import InputError
+from workflows.engine.alive import ended_processes
 from workflows.engine.database import BELOW, below, checked_url, engine, require_queue, table
 from workflows.engine.jobs import MAX_BYTES, FlowJob, Job
 from workflows.engine.serialization import APPLICATION, VERSION, JsonSerializer, UnreadableRow
@@ -17,8 +20,23 @@ from workflows.ids import check_id
 
 CHUNK = 1000  # jobs submitted in one transaction
 ACTIVE = ("ENQUEUED", "PENDING", "DELAYED")
+WAITING = ("ENQUEUED", "DELAYED")
 FAILED = ("ERROR", "MAX_RECOVERY_ATTEMPTS_EXCEEDED")
+SETTLE_S = 4.0  # within which a worker has noticed that its job was cancelled
 _ITERATION = re.compile(r"^[^/]+/(it[0-9]+)(?:/|$)")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Submission:
+    """Numbers of the jobs of a submission."""
+
+    new: int = 0
+    again: int = 0  # had ended, or waited with other arguments
+    waiting: int = 0  # waited or ran with these arguments
+
+    @property
+    def total(self) -> int:
+        return self.new + self.again + self.waiting
 
 
 class QueueClient:
@@ -57,6 +75,31 @@ class QueueClient:
             count += len(chunk)
         return count
 
+    def resubmit(self, jobs: Iterable[Job | FlowJob]) -> Submission:
+        """Put jobs into their queues like `submit`, also those that have ended, and all with these arguments.
+
+        A step returns at once if its product has the same inputs, so that only what changed is computed again.
+
+        Raises:
+            InputError: as `submit`, or a job runs with other arguments; the jobs before its thousand are submitted.
+        """
+        total = Submission()
+        for chunk in _chunks(jobs):
+            for job in chunk:
+                _check(job)
+            self._wait_for_cancelled([job.id for job in chunk])
+            with self._engine.begin() as connection:
+                specs = self._specs(connection, [job.id for job in chunk])
+                left = self._make_room(connection, chunk, specs)
+                put = [job for job in chunk if job.id not in left]
+                for job in put:
+                    self._client.enqueue_in_transaction(connection, _options(job), job.spec(), queue=job.queue)
+            again = sum(job.id in specs for job in put)
+            total = Submission(
+                new=total.new + len(put) - again, again=total.again + again, waiting=total.waiting + len(left)
+            )
+        return total
+
     def cancel(self, run: str) -> int:
         """Cancel a run, or a part of it, including running jobs, and return the number of jobs and flows.
 
@@ -72,6 +115,7 @@ class QueueClient:
     def requeue(self, ids: Sequence[str]) -> list[str]:
         """Restart flows that have ended, under their ids. Returns the ids of those."""
         ended = [i for i in ids for row in [self._rows(i).get(i)] if row is not None and row["status"] not in ACTIVE]
+        self._wait_for_cancelled(ended)
         queues = self._queues(ended)
         ended = [identity for identity in ended if identity in queues]
         for identity in ended:
@@ -108,6 +152,7 @@ class QueueClient:
                 and _nearest(i, rows) in above
             }
         ordered = sorted(chosen, key=lambda i: (-i.count("/"), i))  # jobs before the flows that wait for them
+        self._wait_for_cancelled(ordered)
         queues = self._queues(ordered)
         ordered = [identity for identity in ordered if identity in queues]
         for identity in ordered:
@@ -132,6 +177,68 @@ class QueueClient:
         for chunk in _chunks(ids):
             self._client.delete_workflows(chunk)
         return len(ids)
+
+    def _make_room(
+        self, connection: sa.Connection, jobs: Sequence[Job | FlowJob], specs: Mapping[str, Any]
+    ) -> set[str]:
+        """Delete the rows of jobs that ended, or wait with other arguments; return the ids of those that stay."""
+        known = [job.id for job in jobs if job.id in specs]
+        changed = {job.id for job in jobs if job.id in specs and specs[job.id] != _stored(job)}
+        status = table(self.url, "workflow_status")
+
+        def execute(query: str, ids: Iterable[str], **values: Any) -> Any:
+            text = sa.text(query).bindparams(sa.bindparam("ids", expanding=True))
+            return connection.execute(text, {"ids": list(ids), **values})
+
+        execute(f"DELETE FROM {status} WHERE workflow_uuid IN :ids AND status NOT IN {ACTIVE}", known)
+        execute(f"DELETE FROM {status} WHERE workflow_uuid IN :ids AND status IN {WAITING}", changed)
+        query = f"SELECT workflow_uuid, executor_id FROM {status} WHERE workflow_uuid IN :ids"
+        running = {identity: str(executor) for identity, executor in execute(query, changed)}
+        dead = ended_processes(self.url, running.values())
+        for name in dead:
+            execute(
+                f"DELETE FROM {status} WHERE workflow_uuid IN :ids AND executor_id = :name",
+                [identity for identity, executor in running.items() if executor == name],
+                name=name,
+            )
+        if busy := sorted(identity for identity, executor in running.items() if executor not in dead):
+            raise InputError(
+                "Jobs run with other settings",
+                where=busy[0],
+                expected="jobs that wait or have ended, or the settings that they run with",
+                got=f"{len(busy)} running",
+                fix=f"wait, or `gnmreg cancel {busy[0].partition('/')[0]}` first, or name another run with --run",
+            )
+        left = {row[0] for row in execute(query, known)}
+        deleted = [identity for identity in known if identity not in left]
+        for name in ("workflow_input", "workflow_output", "operation_outputs"):  # no foreign keys lead to the rows
+            execute(f"DELETE FROM {table(self.url, name)} WHERE workflow_uuid IN :ids", deleted)
+        return left
+
+    def _specs(self, connection: sa.Connection, ids: Sequence[str]) -> dict[str, Any]:
+        """Id -> version and arguments of those of the ids that are in the queue."""
+        query = sa.text(
+            "SELECT w.workflow_uuid, w.application_version, coalesce(i.inputs, w.inputs) "
+            f"FROM {table(self.url, 'workflow_status')} w "
+            f"LEFT JOIN {table(self.url, 'workflow_input')} i ON i.workflow_uuid = w.workflow_uuid "
+            "WHERE w.workflow_uuid IN :ids"
+        ).bindparams(sa.bindparam("ids", expanding=True))
+        rows = connection.execute(query, {"ids": list(ids)})
+        return {identity: (version, _spec(inputs)) for identity, version, inputs in rows}
+
+    def _wait_for_cancelled(self, ids: Sequence[str]) -> None:
+        """Wait until the workers of jobs that were cancelled a moment ago have noticed.
+
+        A worker looks for the state "cancelled" once a second. If it found the job waiting again, it would keep on,
+        with the arguments that were cancelled.
+        """
+        query = sa.text(
+            f"SELECT max(completed_at) FROM {table(self.url, 'workflow_status')} "
+            "WHERE status = 'CANCELLED' AND workflow_uuid IN :ids"
+        ).bindparams(sa.bindparam("ids", expanding=True))
+        with self._engine.connect() as connection:
+            last = max((connection.execute(query, {"ids": chunk}).scalar() or 0 for chunk in _chunks(ids)), default=0)
+        time.sleep(min(SETTLE_S, max(0.0, float(last) / 1000 + SETTLE_S - time.time())))
 
     def _ids(self, run: str, statuses: Sequence[str]) -> list[str]:
         """Ids of a run in the given states (none given: in any), the shortest first."""
@@ -181,6 +288,19 @@ def _queue(inputs: Any) -> str | None:
     except (UnreadableRow, TypeError, KeyError):
         return None
     return queue if isinstance(queue, str) else None
+
+
+def _spec(inputs: Any) -> Any:
+    """A job's specification in a row; None in a row that this package did not write."""
+    try:
+        return JsonSerializer().deserialize(inputs)["args"][0]
+    except (UnreadableRow, TypeError, KeyError, IndexError):
+        return None
+
+
+def _stored(job: Job | FlowJob) -> tuple[str, Any]:
+    """What `_specs` returns for a job that was just submitted."""
+    return VERSION, json.loads(json.dumps(job.spec()))
 
 
 def _ancestors(identity: str) -> list[str]:

@@ -7,10 +7,8 @@ process counts as dead only when its lock was free for some time and the server 
 
 import fcntl
 import logging
-import os
 import threading
 import time
-import zlib
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import IO, Protocol
@@ -18,11 +16,10 @@ from typing import IO, Protocol
 import sqlalchemy as sa
 
 from registration.errors import InputError
-from workflows.engine.database import engine, is_sqlite, reading, sqlite_file, table
+from workflows.engine.alive import HELD, LOCK_CLASS, is_free, lock_key, locks_folder
+from workflows.engine.database import engine, is_sqlite, reading, table
 
 log = logging.getLogger("gnmreg")
-
-_CLASS = 0x676E6D  # "gnm": the first of the two numbers of our advisory locks
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -57,8 +54,7 @@ class FileLocks:
     """flock on files next to the SQLite database."""
 
     def __init__(self, url: str) -> None:
-        database = sqlite_file(url)
-        self._folder = database.with_name(f"{database.name}.locks")
+        self._folder = locks_folder(url)
         self._held: IO[str] | None = None
 
     def take(self, name: str) -> bool:
@@ -79,23 +75,10 @@ class FileLocks:
         pass
 
     def free(self, names: Iterable[str]) -> set[str]:
-        return {name for name in names if self._is_free(name)}
+        return {name for name in names if is_free(self._folder, name)}
 
     def uptime_s(self) -> float:
         return float("inf")
-
-    def _is_free(self, name: str) -> bool:
-        try:
-            descriptor = os.open(self._folder / os.path.basename(name), os.O_RDONLY)
-        except FileNotFoundError:
-            return True
-        try:
-            fcntl.flock(descriptor, fcntl.LOCK_SH | fcntl.LOCK_NB)
-            return True
-        except OSError:
-            return False
-        finally:
-            os.close(descriptor)
 
 
 class PostgresLocks:
@@ -121,13 +104,8 @@ class PostgresLocks:
             raise ConnectionError(f"another process took the lock of {self._name}")
 
     def free(self, names: Iterable[str]) -> set[str]:
-        keys = {name: _key(name) for name in names}
-        query = sa.text(
-            "SELECT l.objid::bigint FROM pg_locks l JOIN pg_database d ON d.oid = l.database "
-            "WHERE l.locktype = 'advisory' AND l.classid = :class AND l.granted AND d.datname = current_database()"
-        )
-        held = {row[0] for row in self._open().execute(query, {"class": _CLASS})}
-        return {name for name, key in keys.items() if key % 2**32 not in held}
+        held = {row[0] for row in self._open().execute(sa.text(HELD), {"class": LOCK_CLASS})}
+        return {name for name in names if lock_key(name) % 2**32 not in held}
 
     def uptime_s(self) -> float:
         query = sa.text("SELECT extract(epoch FROM now() - pg_postmaster_start_time())")
@@ -135,7 +113,7 @@ class PostgresLocks:
 
     def _taken(self) -> bool:
         query = sa.text("SELECT pg_try_advisory_lock(:class, :key)")
-        return bool(self._open().execute(query, {"class": _CLASS, "key": _key(self._name)}).scalar_one())
+        return bool(self._open().execute(query, {"class": LOCK_CLASS, "key": lock_key(self._name)}).scalar_one())
 
     def _open(self) -> sa.Connection:
         if self._connection is None:
@@ -219,9 +197,3 @@ class Liveness:
         )
         with reading(self._url) as ask:
             return [row[0] for row in ask(query, {"version": version})]
-
-
-def _key(name: str) -> int:
-    """The second number of a name's advisory lock, a signed 32 bit integer."""
-    digest = zlib.crc32(name.encode())
-    return digest - 2**32 if digest >= 2**31 else digest

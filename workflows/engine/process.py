@@ -163,11 +163,7 @@ class _Redacting(logging.Filter):
     """Removes passwords from URLs in all log records, and the tracebacks of failed and cancelled jobs."""
 
     def filter(self, record: logging.LogRecord) -> bool:
-        if record.exc_info and isinstance(record.exc_info[1], JobFailed):  # reported in the job's row and log
-            return False
-        if record.exc_info and isinstance(
-            record.exc_info[1], (DBOSWorkflowCancelledError, DBOSAwaitedWorkflowCancelledError)
-        ):
+        if record.exc_info and isinstance(record.exc_info[1], _REPORTED):
             return False
         record.msg, record.args = redact(record.getMessage()), None
         if record.exc_info:

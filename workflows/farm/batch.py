@@ -1,19 +1,23 @@
 """A batch: many independent captures, registered as the jobs of one run."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path, PurePosixPath
+from typing import TYPE_CHECKING
 
 from registration.errors import InputError
 from registration.options import RegisterOptions
 from registration.storage.reading import read_list
 from registration.storage.records import to_json
 from workflows.engine.jobs import DRIVER, FlowJob, Job
-from workflows.ids import check_id, redact
+from workflows.ids import check_id, id_part, redact
 from workflows.records.remote import is_remote, local_path
 from workflows.steps import table
 from workflows.steps.job_options import to_job
+
+if TYPE_CHECKING:
+    from workflows.engine.client import Submission
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -23,6 +27,14 @@ class Batch:
     run: str
     jobs: tuple[Job, ...]
     roots: tuple[str, ...]  # folders and URLs that contain all paths of the jobs
+    missing: tuple[str, ...] = ()  # captures that are not on this machine; their jobs will be bad input
+    left_out: Mapping[str, str] = field(default_factory=dict)  # capture -> why it has no job
+
+    @property
+    def remarks(self) -> list[str]:
+        """One line for each entry that cannot be used."""
+        absent = [f"bad input: {location}: no folder with capture.toml" for location in self.missing]
+        return absent + [f"bad input, left out: {location}: {reason}" for location, reason in self.left_out.items()]
 
 
 def batch_jobs(
@@ -33,7 +45,7 @@ def batch_jobs(
     run: str | None = None,
     options: RegisterOptions = RegisterOptions(),  # noqa: B008  frozen
 ) -> Batch:
-    """Return one job for each capture.
+    """Return one job for each capture. Entries that cannot be used do not stop the others.
 
     Args:
         captures: folders, URLs, or @FILE with one of them per line.
@@ -43,17 +55,21 @@ def batch_jobs(
         options: of all registrations.
 
     Raises:
-        InputError: there is no capture, one cannot be found, the model is missing, two captures have one name, or the
-            options cannot be used by a worker.
+        InputError: there is no capture that can be used, a list or the model is missing, or the options cannot be used
+            by a worker.
     """
     shared = {"model": _absolute(model), "store": _absolute(out), "options": to_json(to_job(options))}
-    locations = [location for word in captures for location in _expand(word)]
+    locations = list(dict.fromkeys(_absolute(location) for word in captures for location in _expand(word)))
     if not locations:
         raise _input_error("There is nothing to register", where="CAPTURE", expected="captures", got="none")
     if not is_remote(model) and not local_path(model).is_file():
         raise _input_error("The model is missing", where=model, expected="a GNM NPZ file", got="no such file")
     name = run or PurePosixPath(out.rstrip("/")).name
-    by_key = _keys([_absolute(location) for location in locations])
+    by_key, left_out = _keys(locations)
+    missing = tuple(location for location in by_key.values() if not _may_exist(location))
+    if len(missing) == len(by_key):
+        expected = "a folder with capture.toml"
+        raise _input_error("No capture can be found", where=missing[0], expected=expected, got="none")
     jobs = tuple(
         Job(
             id=check_id(f"{name}/{key}"),
@@ -63,22 +79,55 @@ def batch_jobs(
         for key, location in by_key.items()
     )
     inputs = {location.rpartition("/")[0] for location in (*by_key.values(), _absolute(model))}
-    return Batch(run=check_id(name), jobs=jobs, roots=(*sorted(inputs), _absolute(out)))
+    return Batch(
+        run=check_id(name),
+        jobs=jobs,
+        roots=(*sorted(inputs), _absolute(out)),
+        missing=missing,
+        left_out=left_out,
+    )
 
 
-def submit_batch(url: str, batch: Batch) -> int:
-    """Put the jobs and their driver into the queue at `url`; existing ones are kept. Returns the number of jobs."""
+def submit_batch(url: str, batch: Batch) -> "Submission":
+    """Put the jobs and their driver into the queue at `url`.
+
+    Jobs that have ended are put there again, with the settings of this batch: a job whose inputs did not change returns
+    its published result.
+
+    Raises:
+        InputError: there is no queue, the run is no batch, or a job runs with other settings.
+    """
     from workflows.engine.client import QueueClient
+    from workflows.engine.reader import QueueReader
 
     queue = QueueClient(url)
+    driver = FlowJob(id=batch.run, flow="batch", queue=DRIVER)
     try:
-        count = queue.submit(batch.jobs)
-        driver = FlowJob(id=batch.run, flow="batch", queue=DRIVER)
+        row = QueueReader(url, known=True).rows([batch.run]).get(batch.run)
+        if row is not None and row.spec != driver.spec():
+            raise InputError(
+                "The run is no batch",
+                where=batch.run,
+                expected="a new name, or that of a batch",
+                got="a coregistration" if row.spec.get("flow") == "coregister" else "another run",
+                fix="name the run with --run",
+            )
+        submission = queue.resubmit(batch.jobs)
         queue.submit([driver])
         queue.requeue([batch.run])  # a driver that had ended waits for the new jobs
     finally:
         queue.close()
-    return count
+    return submission
+
+
+def made_and_kept(url: str, batch: Batch) -> tuple[int, int]:
+    """Return how many captures of a batch were registered, and how many results of the same inputs were kept."""
+    from workflows.engine.reader import DONE, QueueReader
+
+    rows = QueueReader(url, known=True).rows([job.id for job in batch.jobs]).values()
+    results = [(row.result or {}).get("result") for row in rows if row.state == DONE]
+    made = sum(isinstance(result, dict) and result.get("made") is not False for result in results)
+    return made, len(results) - made
 
 
 def _expand(word: str) -> list[str]:
@@ -89,20 +138,24 @@ def _expand(word: str) -> list[str]:
     return read_list(file, partial(InputError, "The list of captures cannot be read", where=file, fix=fix))
 
 
-def _keys(locations: Sequence[str]) -> Mapping[str, str]:
-    """Key -> location. The key is the last two folders: it does not depend on the other captures of the batch."""
-    for location in locations:
-        if not is_remote(location) and not (local_path(location) / "capture.toml").is_file():
-            expected = "a folder with capture.toml"
-            raise _input_error("A capture cannot be found", where=location, expected=expected, got="none")
+def _keys(locations: Sequence[str]) -> tuple[dict[str, str], dict[str, str]]:
+    """Key -> location, and location -> why it has none.
+
+    The key is the last two folders: it does not depend on the other captures of the batch.
+    """
     by_key: dict[str, str] = {}
+    left_out: dict[str, str] = {}
     for location in locations:
-        key = "/".join(PurePosixPath(location).parts[-2:])
+        key = "/".join(id_part(part) for part in PurePosixPath(location).parts[-2:])
         if key in by_key:
-            expected = "captures that differ in the names of their last two folders"
-            raise _input_error("Two captures have the same key", where=location, expected=expected, got=by_key[key])
-        by_key[key] = location
-    return by_key
+            left_out[redact(location)] = f"the names of its last two folders are those of {redact(by_key[key])}"
+        else:
+            by_key[key] = location
+    return by_key, left_out
+
+
+def _may_exist(location: str) -> bool:
+    return is_remote(location) or (local_path(location) / "capture.toml").is_file()
 
 
 def _absolute(location: str) -> str:

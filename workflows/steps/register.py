@@ -46,7 +46,7 @@ def register_stored(
         progress: where to report to.
 
     Returns:
-        The artifact's key, content id, status and attempt.
+        The artifact's key, content id, status and attempt, and whether this call made it.
 
     Raises:
         InputError: as `register`, or an input cannot be fetched.
@@ -56,10 +56,13 @@ def register_stored(
     file = fetch_model(model)
     data = gnm_npz.read(file)
     schemes = read_schemes(file, data, chosen.landmark_files)
+    made = False
     with fetch_capture(capture) as folder:
         digest = input_hash(read_capture(folder), data, schemes, None, chosen)
 
         def make(attempt: Path) -> dict[str, Any]:
+            nonlocal made
+            made = True
             result = register(folder, file, attempt / REGISTRATION, chosen, progress=progress)
             about = {
                 "status": result.status,
@@ -73,7 +76,7 @@ def register_stored(
         artifact = Store(store).produce(key, input_hash=digest, make=make)
     if artifact.about.get("status") == "failed":
         raise PermanentStepError(f"registration failed: {artifact.about.get('reason')}")
-    return {**artifact.brief(), "attempt": artifact.attempt}
+    return {**artifact.brief(), "attempt": artifact.attempt, "made": made}
 
 
 def _write_thumbnail(result: Registration, file: Path, progress: Progress) -> bool:

@@ -4,19 +4,26 @@ import csv
 import os
 import re
 import signal
+import sqlite3
 import subprocess
 import sys
 import time
+from contextlib import closing
 from pathlib import Path
+from typing import Any
 
 import pytest
 
+from registration.errors import InputError
+from registration.options import RegisterOptions
 from tests.registration.capture import small
 from tests.registration.register import synthetic
 from tests.workflows.farm.harness import ROOT, alive, interruptible
 from workflows.cli.app import main
-from workflows.engine.client import QueueClient
+from workflows.engine.client import QueueClient, Submission
 from workflows.engine.database import default_url
+from workflows.engine.jobs import FlowJob
+from workflows.engine.liveness import FileLocks
 from workflows.engine.reader import QueueReader
 from workflows.farm.batch import batch_jobs, submit_batch
 from workflows.records.store import Store
@@ -59,13 +66,11 @@ def test_unusable_batches_are_refused(captures: Path, capsys: pytest.CaptureFixt
     assert batch(captures) == 2
     assert "There is no queue" in capsys.readouterr().err
     main(["migrate", "--folder", str(captures)])
-    for more, words in (
-        (str(captures / "nobody"), "cannot be found"),
-        (str(captures / "ann" / "rest"), "have the same key"),
-        (f"@{captures}/none", "cannot be read"),
-    ):
-        assert batch(captures, more) == 2
-        assert words in capsys.readouterr().err
+    assert batch(captures, f"@{captures}/none") == 2
+    assert "cannot be read" in capsys.readouterr().err
+    model = ["--model", str(synthetic.MODEL), "--out", str(captures.parent / "out"), "--folder", str(captures)]
+    assert main(["batch", str(captures / "nobody"), *model]) == 2
+    assert "No capture can be found" in capsys.readouterr().err
     assert main(["logs", "out/none", "--folder", str(captures)]) == 2
     assert main(["cancel", "../x", "--folder", str(captures)]) == 2
     with pytest.raises(SystemExit) as stop:
@@ -104,6 +109,22 @@ def test_jobs_are_named_by_the_last_two_folders(captures: Path) -> None:
     jobs = batch_jobs(locations, model=str(synthetic.MODEL), out="s3://bucket/results/june")
     assert [job.id for job in jobs.jobs] == ["june/ann/rest", "june/bob/rest", "june/cyd/rest"]
     assert "s3://bucket/results/june" in jobs.roots and f"{captures}/ann" in jobs.roots
+
+
+def test_bad_entries_are_listed_and_the_others_are_submitted(
+    captures: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    main(["migrate", "--folder", str(captures)])
+    same = small.make(captures / "again" / "ann" / "rest")
+    odd = small.make(captures / "Björn K" / "rest")
+    assert batch(captures, str(captures / "nobody"), str(captures / "ann" / "rest" / ".." / "rest"), str(same)) == 1
+    printed = capsys.readouterr()
+    assert "3 captures are in the queue: 3 new" in printed.out
+    assert f"bad input: {captures}/nobody: no folder with capture.toml" in printed.err
+    assert f"bad input, left out: {same}" in printed.err and f"those of {captures}/ann/rest" in printed.err
+    assert batch(captures, str(odd)) == 0
+    assert QueueReader(default_url(captures)).counts("out", kind="job") == {"waiting": 4}
+    assert main(["logs", "out/Bj_rn_K/rest", "--folder", str(captures)]) == 0
 
 
 @pytest.mark.slow
@@ -161,14 +182,68 @@ def _processes_of(word: str) -> list[int]:
     return [pid for pid in pids if alive(pid)]
 
 
+def submit(captures: Path, *names: str, **settings: Any) -> Submission:
+    options = RegisterOptions(**settings)
+    folders = [f"{captures}/{name}/rest" for name in names]
+    model, out = str(synthetic.MODEL), str(captures.parent / "out")
+    return submit_batch(default_url(captures), batch_jobs(folders, run="r", model=model, out=out, options=options))
+
+
+def recipe(captures: Path, job: str) -> str:
+    return QueueReader(default_url(captures)).rows([job])[job].spec["arguments"]["options"]["recipe"]
+
+
 def test_captures_are_added_to_a_batch_that_ended(captures: Path) -> None:
     main(["migrate", "--folder", str(captures)])
-    url = default_url(captures)
-    settings = {"model": str(synthetic.MODEL), "out": str(captures.parent / "out")}
-    assert submit_batch(url, batch_jobs([f"{captures}/ann/rest"], run="r", **settings)) == 1
-    queue, reader = QueueClient(url), QueueReader(url)
+    assert submit(captures, "ann") == Submission(new=1)
+    queue, reader = QueueClient(default_url(captures)), QueueReader(default_url(captures))
     queue.cancel("r")
-    folders = [f"{captures}/{name}/rest" for name in ("ann", "bob")]
-    assert submit_batch(url, batch_jobs(folders, run="r", **settings)) == 2
+    assert submit(captures, "ann", "bob") == Submission(new=1, again=1)
     assert reader.rows(["r"])["r"].state == "waiting"
-    assert reader.counts("r") == {"cancelled": 1, "waiting": 1}
+    assert reader.counts("r") == {"waiting": 2}
+
+
+def test_a_batch_with_other_settings_replaces_waiting_and_ended_jobs(captures: Path) -> None:
+    main(["migrate", "--folder", str(captures)])
+    submit(captures, "ann", "bob", recipe="draft")
+    assert submit(captures, "ann", "bob", recipe="draft") == Submission(waiting=2)
+    assert submit(captures, "ann", recipe="preview") == Submission(again=1)
+    assert (recipe(captures, "r/ann/rest"), recipe(captures, "r/bob/rest")) == ("preview", "draft")
+    set_rows(captures, status="SUCCESS")
+    assert submit(captures, "ann", "bob", recipe="preview") == Submission(again=2)  # their inputs may have changed
+    assert recipe(captures, "r/bob/rest") == "preview"
+    assert QueueReader(default_url(captures)).counts("r", kind="job") == {"waiting": 2}
+    set_rows(captures, status="ERROR")
+    assert submit(captures, "ann", recipe="studio") == Submission(again=1)
+    QueueClient(default_url(captures)).retry("r")
+    assert recipe(captures, "r/ann/rest") == "studio"
+
+
+def test_jobs_that_run_with_other_settings_are_not_replaced(captures: Path) -> None:
+    main(["migrate", "--folder", str(captures)])
+    submit(captures, "ann", "bob", recipe="draft")
+    set_rows(captures, status="PENDING", executor_id="living")
+    locks = FileLocks(default_url(captures))
+    assert locks.take("living")
+    assert submit(captures, "ann", recipe="draft") == Submission(waiting=1)
+    with pytest.raises(InputError, match="run with other settings"):
+        submit(captures, "ann", "bob", recipe="preview")
+    assert recipe(captures, "r/ann/rest") == "draft"
+    set_rows(captures, status="PENDING", executor_id="dead")
+    assert submit(captures, "ann", "bob", recipe="preview") == Submission(again=2)
+    assert recipe(captures, "r/ann/rest") == "preview"
+
+
+def test_the_name_of_a_coregistration_cannot_be_a_batchs(captures: Path) -> None:
+    main(["migrate", "--folder", str(captures)])
+    flow = FlowJob(id="r", flow="coregister", arguments={"plan": "/p"}, queue="driver")
+    QueueClient(default_url(captures)).submit([flow])
+    with pytest.raises(InputError, match="no batch"):
+        submit(captures, "ann")
+
+
+def set_rows(captures: Path, **columns: str) -> None:
+    """Pretend what workers do to the rows of the jobs."""
+    with closing(sqlite3.connect(captures / "queue.sqlite")) as database, database:
+        text = ", ".join(f"{name} = :{name}" for name in columns)
+        database.execute(f"UPDATE workflow_status SET {text} WHERE name = 'job'", columns)

@@ -15,6 +15,7 @@ import sqlalchemy as sa
 
 from bench.support.postgres_server import Server, programs, server
 from tests.workflows.farm.harness import QUICK, Farm, alive, children_of, open_farm
+from workflows.engine.alive import lock_key
 from workflows.engine.database import checked_url, engine
 from workflows.engine.jobs import FlowJob, Job
 from workflows.records.store import Store
@@ -120,7 +121,7 @@ def test_a_frozen_worker_whose_connection_broke_is_fenced(farm: Farm) -> None:
     with engine(checked_url(farm.url)).connect() as connection:
         connection.execute(
             sa.text("SELECT pg_terminate_backend(pid) FROM pg_locks WHERE locktype = 'advisory' AND objid = :key"),
-            {"key": _key(frozen)},
+            {"key": lock_key(frozen) % 2**32},
         )
     wait_for_begin(farm, "run/a", 2)
     farm.signal(frozen, signal.SIGCONT)
@@ -130,12 +131,6 @@ def test_a_frozen_worker_whose_connection_broke_is_fenced(farm: Farm) -> None:
     farm.wait_for_end(*(f"run/b{n}" for n in range(6)))
     report = Store(farm.folder / "store").verify()
     assert report.is_sound and report.artifacts == 7
-
-
-def _key(name: str) -> int:
-    from workflows.engine.liveness import _key
-
-    return _key(name) % 2**32
 
 
 def test_a_poison_job_becomes_a_dead_letter(farm: Farm) -> None:
