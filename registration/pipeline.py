@@ -11,6 +11,8 @@ import torch
 
 from registration.evaluate.audit import audit_penetration
 from registration.evaluate.evaluation import RegistrationEvaluation, evaluate_registration
+from registration.evaluate.verdict import judge
+from registration.evaluate.viewpoint import intersection_figures
 from registration.fit.context import FitContext
 from registration.fit.initialization import (
     MIN_LANDMARKS,
@@ -30,6 +32,7 @@ from registration.model.regions import exterior
 from registration.options import RegisterOptions
 from registration.progress import NullProgress, Progress
 from registration.render import backend
+from registration.report.comparison import Comparison, compare_views
 from registration.report.inputs import ReportInputs, distance_heat_map, report_views
 from registration.report.page import render_report
 from registration.report.stage_snapshots import write_stage
@@ -42,7 +45,6 @@ from registration.types import Parameters, Registration, Status
 CONVERGED_MM = 0.05  # 95th percentile of vertex motion over the last tenth of the last stage
 MAX_LANDMARK_PX = 3.0  # median residual at 512 px of head height
 _NAMED_VIEW_RATIO = 2  # times MAX_LANDMARK_PX: views with a larger error are named
-_REPORT_VIEWS = 8
 _STAGE_VIEWS = 3
 
 
@@ -86,7 +88,9 @@ def register(
     device = backend.activate(options.variant, deterministic=options.deterministic)
     torch.manual_seed(options.seed)
     fitted = _fit(inputs, options.seed, device, pictures, progress)
-    registration, page = _evaluate(inputs, fitted.problem, _collect(inputs, fitted), progress)
+    progress.message("comparing with the views")
+    comparison = compare_views(fitted.problem)
+    registration, page = _evaluate(inputs, comparison, _collect(inputs, fitted, comparison), progress)
     save_registration(registration, out, page)
     return registration
 
@@ -206,7 +210,7 @@ def _parameters(registration: Registration) -> Parameters:
     return Parameters(**{name: torch.as_tensor(np.asarray(getattr(registration, name))) for name in names})
 
 
-def _collect(inputs: RegistrationInputs, fitted: _Fitted) -> Registration:
+def _collect(inputs: RegistrationInputs, fitted: _Fitted, comparison: Comparison) -> Registration:
     """The result as arrays, with its status."""
     problem, trace = fitted.problem, fitted.trace
     parameters, offsets = problem.variables.parameters()
@@ -230,7 +234,7 @@ def _collect(inputs: RegistrationInputs, fitted: _Fitted) -> Registration:
         offsets=array(offsets),
         vertices=vertices,
         triangles=inputs.data.triangles,
-        confidence=problem.confidence() if np.isfinite(vertices).all() else np.zeros(len(vertices), np.float32),
+        confidence=comparison.confidence,
         texture=array(problem.appearance.texture),
         corner_uvs=problem.context.corner_uvs,
         landmarks={name: scheme.points(vertices) for name, scheme in inputs.schemes.items()},
@@ -242,6 +246,7 @@ def _collect(inputs: RegistrationInputs, fitted: _Fitted) -> Registration:
             "camera_gains": problem.appearance.gains.cpu().numpy().round(4).tolist(),
             "views_not_trusted": dict(problem.view_weights.notes),
             "notes": list(fitted.initial.notes),
+            "residuals": comparison.residuals,
         },
         config=inputs.config,
         inputs=inputs.digests,
@@ -277,7 +282,7 @@ def _status(
 
 
 def _evaluate(
-    inputs: RegistrationInputs, problem: FitProblem, registration: Registration, progress: Progress
+    inputs: RegistrationInputs, comparison: Comparison, registration: Registration, progress: Progress
 ) -> tuple[Registration, str]:
     """The registration with its metrics, including those against a scan, and the report's page."""
     evaluation: RegistrationEvaluation | None = None
@@ -285,21 +290,25 @@ def _evaluate(
     if finite:
         progress.message("auditing intersections between parts")
         audit = audit_penetration(registration.vertices, inputs.data, scale=float(registration.scale))
-        registration = replace(registration, figures={**registration.figures, "intersections": audit.metrics})
+        shown = {view.name for view in comparison.views}
+        cameras = {view.name: view.camera for view in inputs.capture.views if view.name in shown}
+        intersections = intersection_figures(audit, registration.vertices, cameras)
+        registration = replace(registration, figures={**registration.figures, "intersections": intersections})
     if inputs.capture.scan is not None and finite:
         progress.message("measuring against the scan")
         evaluation = evaluate_registration(registration, inputs.capture)
         registration = replace(registration, figures={**registration.figures, **evaluation.metrics})
+    verdict = judge(registration.status, registration.figures).figure
+    registration = replace(registration, figures={**registration.figures, "verdict": verdict})
     progress.message("writing the report")
-    cameras = [view.camera for view in inputs.capture.views]
-    batch, rendered = problem.render_views(select_spread_views(cameras, _REPORT_VIEWS))
     page = render_report(
         ReportInputs(
             registration=registration,
             subject=inputs.capture.subject,
             expression=inputs.capture.expression,
-            views=report_views(batch, rendered),
-            class_names=batch.class_names,
+            views=comparison.views,
+            thumbnails=comparison.thumbnails,
+            class_names=comparison.class_names,
             heat_map=None if evaluation is None else distance_heat_map(registration, evaluation.vertex_distance_mm),
             versions=hashing.versions(),
         )

@@ -1,11 +1,14 @@
-"""Metrics of a registration as tables on the terminal."""
+"""Figures of a registration as tables on the terminal."""
 
 from collections.abc import Mapping
 from typing import Any
 
 from rich.console import Console
+from rich.markup import escape
 from rich.table import Table
 
+from registration.evaluate.residuals import residual_rows
+from registration.evaluate.verdict import LEVEL_TITLES
 from registration.types import METRIC_TITLES
 
 
@@ -28,3 +31,25 @@ def print_metrics(metrics: Mapping[str, Any], title: str, console: Console | Non
             cells = ("-" if value is None else f"{value:.3f}" for value in values)
             table.add_row(metric_title, region, f"{row['points']:,}", *cells)
     (console or Console()).print(table)
+
+
+def print_assessment(figures: Mapping[str, Any], console: Console | None = None) -> None:
+    """Print what the images say about a registration, a residual per row, and the verdict with its reasons.
+
+    Args:
+        figures: of a registration's manifest; what is missing is not printed.
+        console: default: the terminal.
+    """
+    console = console or Console()
+    rows = residual_rows(figures.get("residuals", {}))
+    if rows:
+        table = Table(title="residuals in the images", caption="pixels at a head height of 512 px")
+        for heading in ("", "overall", "worst view", ""):
+            table.add_column(heading, justify="left" if heading == "" else "right")
+        for kind, overall, worst, view in rows:
+            unknown = "-" if overall is None else kind.text(overall)
+            table.add_row(kind.title, unknown, kind.text(worst), escape(view))
+        console.print(table)
+    if verdict := figures.get("verdict"):
+        reasons = "; ".join(verdict["reasons"])
+        console.print(f"verdict: {LEVEL_TITLES[verdict['level']]}: {escape(reasons)}", highlight=False, soft_wrap=True)

@@ -10,7 +10,6 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from registration.fit.appearance import Appearance
-from registration.fit.confidence import vertex_confidence
 from registration.fit.context import FitContext
 from registration.fit.initialization import PoseCandidate, rate_candidate
 from registration.fit.optimizer import AdamBlock, AdamUniformBlock, History, ParameterBlock, minimize
@@ -27,7 +26,6 @@ from registration.types import Rendered, Targets
 _MOTION_FRACTION = 0.1  # of the last stage's steps, over which the motion of the vertices is measured
 _MAX_STEP_MM = 2.0  # of a region with a rate scale of its own, unless the stage itself steps further
 _AGREEING_VIEWS = 3  # that locate a landmark; of two, a wrong one moves the point along the other's ray
-_CONFIDENCE_BATCH = 4  # views rendered together at the finest level
 
 
 OnStep = Callable[[Stage, int], None]
@@ -215,13 +213,19 @@ class FitProblem:
         targets, vertices = self._coarsest_targets(), self.vertices()
         with torch.no_grad():
             rendered = self.context.renderer(vertices, None, targets.pixels)
-        residuals = [
-            self._disagreement_px(name, residual_px)
-            for name, residual_px in self._landmark_residuals_by_view(vertices).items()
-        ]
-        unknown = torch.full((self.context.view_count,), torch.nan)
-        landmark_px = torch.cat(residuals, 1).nanmedian(1).values if residuals else unknown
-        return view_errors(rendered, targets, landmark_px)
+        residuals = self._landmark_residuals_by_view(vertices)
+        disagreement = {name: self._disagreement_px(name, residual_px) for name, residual_px in residuals.items()}
+        return view_errors(rendered, targets, self._median_by_view(disagreement))
+
+    def landmark_px_by_view(self) -> Float[Tensor, "N"]:
+        """Return the median distance of each view's landmarks from the mesh's, px at 512 px of head height."""
+        return self._median_by_view(self._landmark_residuals_by_view(self.vertices()))
+
+    def _median_by_view(self, residuals_px: Mapping[str, Float[Tensor, "N L"]]) -> Float[Tensor, "N"]:
+        """Over all schemes; NaN without landmarks."""
+        if not residuals_px:
+            return torch.full((self.context.view_count,), torch.nan)
+        return torch.cat(list(residuals_px.values()), 1).nanmedian(1).values
 
     def _coarsest_targets(self) -> Targets:
         return self.context.pyramid[-1].select(range(self.context.view_count), self.context.device)
@@ -279,13 +283,6 @@ class FitProblem:
             distance = distance[np.isfinite(distance)]
             residuals[name] = float(np.median(distance)) * px_per_m if len(distance) else float("nan")
         return residuals
-
-    def confidence(self) -> Float[np.ndarray, "V"]:
-        """Return the confidence of every vertex, in [0, 1): see `vertex_confidence`."""
-        views = [view for view, weight in enumerate(self.view_weights.geometry) if weight > 0.5]
-        batches = [views[first : first + _CONFIDENCE_BATCH] for first in range(0, len(views), _CONFIDENCE_BATCH)]
-        rendered = (self.render_views(batch) for batch in batches)
-        return vertex_confidence(self.vertices().cpu().numpy(), self.context.data.triangles, rendered)
 
     def render_views(self, views: Sequence[int]) -> tuple[Targets, Rendered]:
         """Return targets of some views at the finest level, and the mesh rendered there, exposed as their cameras."""

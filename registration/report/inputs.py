@@ -1,8 +1,9 @@
 """The contents of a report, in NumPy arrays: the page needs neither the renderer nor a GPU."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
+import cv2
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
@@ -11,6 +12,7 @@ from torch import Tensor
 from registration.frames import axis_angle_to_matrix
 from registration.types import Registration, Rendered, Targets
 
+THUMBNAIL_HEIGHT = 150  # px
 _BACKGROUND = 0.92  # linear; shown where the targets list no pixel
 
 
@@ -47,7 +49,8 @@ class ReportInputs:
     registration: Registration
     subject: str
     expression: str
-    views: tuple[ReportView, ...] = ()
+    views: tuple[ReportView, ...] = ()  # those that are shown in full
+    thumbnails: tuple[ReportView, ...] = ()  # all views, small
     class_names: tuple[str, ...] = ()
     heat_map: HeatMap | None = None
     versions: Mapping[str, str] = field(default_factory=dict)
@@ -68,6 +71,28 @@ def distance_heat_map(registration: Registration, distance_mm: Float[np.ndarray,
         triangles=registration.triangles,
         distance_mm=distance_mm,
         T_head_world=T_head_world,
+    )
+
+
+def thumbnail(view: ReportView) -> ReportView:
+    """Return a view's colours and outline at `THUMBNAIL_HEIGHT`, without normals and classes."""
+    height, width = view.rendered_mask.shape
+    size = (max(1, round(width * min(1.0, THUMBNAIL_HEIGHT / height))), min(height, THUMBNAIL_HEIGHT))
+
+    def reduced(image: np.ndarray) -> np.ndarray:
+        return cv2.resize(image.astype(np.float32), size, interpolation=cv2.INTER_AREA)
+
+    return replace(
+        view,
+        target_rgb=reduced(view.target_rgb),
+        rendered_rgb=reduced(view.rendered_rgb),
+        compared=reduced(view.compared) > 0.5,
+        rendered_mask=reduced(view.rendered_mask),
+        rendered_normals=reduced(view.rendered_normals),
+        target_mask=None,
+        target_normals=None,
+        target_classes=None,
+        rendered_classes=np.full(size[::-1], -1),
     )
 
 

@@ -6,16 +6,20 @@ from typing import Any
 
 from markupsafe import Markup
 
+from registration.evaluate.residuals import RESIDUALS, residual_rows
+from registration.evaluate.verdict import LEVEL_TITLES, judge
 from registration.report.charts import loss_curves
 from registration.report.heat_map import render_heat_map, scale_limit_mm
-from registration.report.inputs import ReportInputs, ReportView
-from registration.report.pictures import CLASS_COLOURS, data_uri, view_images
+from registration.report.inputs import ReportInputs
+from registration.report.pictures import CLASS_COLOURS, ViewImages, data_uri, view_images
+from registration.report.remarks import format_mm, headline, remarks
 from registration.report.templates import environment
 from registration.storage.hashing import to_jsonable
 from registration.types import METRIC_TITLES, Registration
 
 STATISTICS = {"mean_mm": "mean", "median_mm": "median", "std_mm": "std", "p95_mm": "p95"}
 _OPEN_VIEWS = 4  # whose normals and classes are unfolded at first
+_THUMBNAIL_QUALITY = 75  # of their JPEGs
 
 
 def render_report(inputs: ReportInputs) -> str:
@@ -27,19 +31,25 @@ def render_report(inputs: ReportInputs) -> str:
     registration, heat = inputs.registration, inputs.heat_map
     limit_mm = scale_limit_mm(heat.distance_mm) if heat else 0.0
     longest_s = max(registration.seconds.values(), default=0.0) or 1.0
+    by_view = registration.figures.get("residuals", {}).get("views", {})
     template = environment().get_template("report.html")
     return template.render(
         subject=inputs.subject,
         expression=inputs.expression,
         status=registration.status,
         headline=headline(registration),
+        verdict=_verdict(registration),
         remarks=remarks(registration),
         tiles=_tiles(registration),
         limit_mm=limit_mm,
         heat_images=[(side, data_uri(image)) for side, image in render_heat_map(heat, limit_mm)] if heat else [],
         distance_heads=("points", *STATISTICS.values()),
         distance_rows=_distance_rows(registration.figures),
-        views=[_view(view) for view in inputs.views],
+        residual_rows=_residual_rows(registration.figures.get("residuals", {})),
+        views=[_view(view_images(view), by_view.get(view.name, {})) for view in inputs.views],
+        thumbnails=[
+            _view(view_images(view), by_view.get(view.name, {}), _THUMBNAIL_QUALITY) for view in inputs.thumbnails
+        ],
         open_views=_OPEN_VIEWS,
         legend=[(name, CLASS_COLOURS[k % len(CLASS_COLOURS)]) for k, name in enumerate(inputs.class_names)],
         curves=Markup(loss_curves(registration.history)),
@@ -50,34 +60,10 @@ def render_report(inputs: ReportInputs) -> str:
     )
 
 
-def headline(registration: Registration) -> str:
-    """Return the result in one or two sentences."""
-    opening = {
-        "converged": "The registration converged",
-        "stopped": "The registration was stopped before it converged",
-        "failed": "The registration failed",
-    }[registration.status]
-    sentence = f"{opening}: {registration.reason}." if registration.reason else f"{opening}."
-    face = registration.figures.get("scan_to_mesh", {}).get("face", {})
-    if face.get("mean_mm") is None:
-        return f"{sentence} There is no scan of the face to measure it against."
-    return (
-        f"{sentence} On the face the scan lies {_mm(face['mean_mm'])} mm from the mesh on average; "
-        f"half of its points are within {_mm(face['median_mm'])} mm and 95 % within {_mm(face['p95_mm'])} mm."
-    )
-
-
-def remarks(registration: Registration) -> list[str]:
-    """Return remarks besides the headline: views with low weights, excluded landmarks, intersecting parts."""
-    figures = registration.figures
-    lines = [f"View {view} has a low weight: {why}." for view, why in figures.get("views_not_trusted", {}).items()]
-    lines += [f"{note[:1].upper()}{note[1:]}." for note in figures.get("notes", [])]
-    for pair, row in figures.get("intersections", {}).get("pairs", {}).items():
-        count = sum(value for name, value in row.items() if name.startswith("vertices_beyond"))
-        if count:
-            deepest = _mm(row["max_excess_mm"])
-            lines.append(f"{pair.capitalize()}: {count} vertices deeper than in the template, by up to {deepest} mm.")
-    return lines
+def _verdict(registration: Registration) -> dict[str, Any]:
+    """The stored verdict, or that on a registration from before there was one."""
+    figure = registration.figures.get("verdict") or judge(registration.status, registration.figures).figure
+    return {"level": figure["level"], "title": LEVEL_TITLES[figure["level"]], "reasons": figure["reasons"]}
 
 
 def _tiles(registration: Registration) -> list[tuple[str, str, str]]:
@@ -94,7 +80,14 @@ def _tiles(registration: Registration) -> list[tuple[str, str, str]]:
     for key, region, statistic, label in shown:
         value = metrics.get(key, {}).get(region, {}).get(statistic)
         if value is not None:
-            tiles.append((_mm(value), "mm", label))
+            tiles.append((format_mm(value), "mm", label))
+    if not tiles:
+        overall = metrics.get("residuals", {}).get("overall", {})
+        tiles = [
+            (f"{overall[name]:.1f}", kind.unit, f"{kind.title}: {kind.meaning}")
+            for name, kind in RESIDUALS.items()
+            if name in overall
+        ]
     if seconds:
         tiles.append((_duration(sum(seconds.values())), "", f"in {len(seconds)} stages"))
     return tiles
@@ -109,7 +102,7 @@ def _distance_rows(metrics: Mapping[str, Any]) -> list[dict[str, Any]]:
                 for field, reason in (("dropped_normals", "normals"), ("dropped_boundary", "the mesh's boundary"))
                 if row.get(field)
             )
-            statistics = [_mm(row[statistic]) for statistic in STATISTICS]
+            statistics = [format_mm(row[statistic]) for statistic in STATISTICS]
             rows.append(
                 {
                     "title": title,
@@ -122,14 +115,22 @@ def _distance_rows(metrics: Mapping[str, Any]) -> list[dict[str, Any]]:
     return rows
 
 
-def _view(view: ReportView) -> dict[str, Any]:
-    images = view_images(view)
-    rows = {row: [(caption, data_uri(image)) for caption, image in captioned] for row, captioned in images.rows.items()}
-    return {"name": images.name, "numbers": images.numbers, "rows": rows}
+def _view(images: ViewImages, residuals: Mapping[str, float], quality: int = 86) -> dict[str, Any]:
+    """A view's pictures and its residuals as text."""
+    rows = {
+        row: [(caption, data_uri(image, quality)) for caption, image in captioned]
+        for row, captioned in images.rows.items()
+    }
+    numbers = {kind.title: kind.text(residuals[name]) for name, kind in RESIDUALS.items() if name in residuals}
+    return {"name": images.name, "numbers": numbers, "rows": rows}
 
 
-def _mm(value: float | None) -> str:
-    return "–" if value is None else f"{value:.3f}" if value < 1 else f"{value:.2f}"
+def _residual_rows(figure: Mapping[str, Any]) -> list[tuple[str, str, str, str, str]]:
+    """Kind, overall value, worst value, its view, and the meaning, as text."""
+    return [
+        (kind.title, "–" if overall is None else kind.text(overall), kind.text(worst), view, kind.meaning)
+        for kind, overall, worst, view in residual_rows(figure)
+    ]
 
 
 def _duration(seconds: float) -> str:

@@ -1,4 +1,4 @@
-"""Images of the report, 8 bit sRGB: comparisons of each view, with their metrics, and the colour scale."""
+"""Images of the report, 8 bit sRGB: comparisons of each view, and the colour scale."""
 
 import base64
 from dataclasses import dataclass
@@ -38,39 +38,26 @@ class ViewImages:
 
     name: str
     rows: dict[str, list[tuple[str, RgbImage]]]  # title -> captions and images
-    numbers: dict[str, str]  # metric -> text; measured at full resolution
 
 
 def view_images(view: ReportView) -> ViewImages:
     """Compare the colours, normals and classes of one view.
 
     Args:
-        view: its optional targets may be missing; their rows and numbers are then omitted.
+        view: its optional targets may be missing; their rows are then omitted.
 
     Returns:
-        A row of target, rendering and difference for each of colour, normals and classes; the mean colour difference
-        (sRGB), the median angle of the normals, the fraction of equal classes, and the overlap of the masks.
+        A row of target, rendering and difference for each of colour, normals and classes.
     """
     target, rendered = (linear_to_srgb(rgb.astype(np.float32)) for rgb in (view.target_rgb, view.rendered_rgb))
-    difference = np.where(view.compared & (view.rendered_mask > 0.5), np.abs(target - rendered).mean(-1), np.nan)
-    rows = {"Colour": _colour_row(view, target, rendered, difference)}
-    numbers = {}
-    if np.isfinite(difference).any():
-        numbers["colour"] = f"{np.nanmean(difference):.3f}"
+    rows = {"Colour": _colour_row(view, target, rendered)}
     if view.target_normals is not None:
-        angle = _normal_angle(view, view.target_normals)
-        rows["Normals"] = _normal_row(view, view.target_normals, angle)
-        if np.isfinite(angle).any():
-            numbers["normals"] = f"{np.nanmedian(angle):.1f}°"
+        rows["Normals"] = _normal_row(view, view.target_normals)
     if view.target_classes is not None:
         both = (view.target_classes >= 0) & (view.rendered_classes >= 0)
         wrong = both & (view.target_classes != view.rendered_classes)
         rows["Classes"] = _class_row(view, view.target_classes, target, wrong)
-        if both.any():
-            numbers["classes"] = f"{100 * (1 - wrong.sum() / both.sum()):.1f} %"
-    if view.target_mask is not None:
-        numbers["mask overlap"] = f"{100 * overlap(view.target_mask, view.rendered_mask):.1f} %"
-    return ViewImages(name=view.name, rows=rows, numbers=numbers)
+    return ViewImages(name=view.name, rows=rows)
 
 
 def scale_colours(value: Float[np.ndarray, "*S"]) -> Float[np.ndarray, "*S 3"]:
@@ -101,15 +88,8 @@ def data_uri(image: RgbImage, quality: int = 86) -> str:
     return "data:image/jpeg;base64," + base64.b64encode(jpeg(image, quality)).decode("ascii")
 
 
-def overlap(target: Float[np.ndarray, "H W"], rendered: Float[np.ndarray, "H W"]) -> float:
-    """Return the intersection over union of two soft masks; 1 if both are empty."""
-    union = np.maximum(target, rendered).sum()
-    return float(np.minimum(target, rendered).sum() / union) if union else 1.0
-
-
-def _colour_row(
-    view: ReportView, target: np.ndarray, rendered: np.ndarray, difference: np.ndarray
-) -> list[tuple[str, RgbImage]]:
+def _colour_row(view: ReportView, target: np.ndarray, rendered: np.ndarray) -> list[tuple[str, RgbImage]]:
+    difference = np.where(view.compared & (view.rendered_mask > 0.5), np.abs(target - rendered).mean(-1), np.nan)
     return [
         ("capture, outline of the rendering", _with_outline(_downscaled(_to_uint8(target)), view.rendered_mask)),
         ("rendering", _downscaled(_over_background(_to_uint8(rendered), view.rendered_mask))),
@@ -117,7 +97,8 @@ def _colour_row(
     ]
 
 
-def _normal_row(view: ReportView, target: np.ndarray, angle: np.ndarray) -> list[tuple[str, RgbImage]]:
+def _normal_row(view: ReportView, target: np.ndarray) -> list[tuple[str, RgbImage]]:
+    angle = _normal_angle(view, target)
     return [
         ("capture", _downscaled(_over_background(_to_uint8((target + 1) / 2), np.asarray(target.any(-1), np.float32)))),
         ("rendering", _downscaled(_over_background(_to_uint8((view.rendered_normals + 1) / 2), view.rendered_mask))),

@@ -30,11 +30,13 @@ def register(
         force: Register again although the folder holds the result of the same input.
         fit: How the capture is registered.
     """
+    from registration.evaluate.console_table import print_assessment
     from registration.pipeline import register
     from registration.progress import console_progress
 
     with console_progress() as progress:
         result = register(capture, model, out, fit, neutral=neutral, force=force, progress=progress)
+    print_assessment(result.figures)
     print(f"{result.status}: {result.reason}\n{out}")
     return 1 if result.status == "failed" else 0
 

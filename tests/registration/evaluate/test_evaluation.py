@@ -12,8 +12,9 @@ from rich.console import Console
 from registration.capture.native import read_capture
 from registration.capture.scan import read_scan, read_truth
 from registration.errors import InputError
-from registration.evaluate.console_table import print_metrics
+from registration.evaluate.console_table import print_assessment, print_metrics
 from registration.evaluate.evaluation import evaluate_folder, evaluate_registration
+from registration.evaluate.residuals import residual_figures
 from registration.storage.mesh import write_ply
 from registration.storage.registration_folder import load_registration, save_registration
 from registration.types import Camera, Capture, Registration, View
@@ -193,6 +194,18 @@ def test_the_table_prints_every_metric(tmp_path):
     for name in ("Scan to mesh", "Scan to mesh, by area", "Mesh to scan", "Vertex error", "1.000"):
         assert name in text
     assert "drift" not in text
+
+
+def test_residuals_and_the_verdict_are_printed():
+    views = {"cam00": {"silhouette_px": 0.5}, "cam[b]01": {"silhouette_px": 1.5}}
+    figures = {"residuals": residual_figures(views), "verdict": {"level": "look", "reasons": ["first", "second"]}}
+    console = Console(file=io.StringIO(), width=120)
+    print_assessment(figures, console)
+    text = console.file.getvalue().replace("\N{NO-BREAK SPACE}", " ")
+    assert "silhouette" in text and "1.0 px" in text and "1.5 px" in text and "cam[b]01" in text
+    assert "normals" not in text and "verdict: look at it: first; second" in text
+    print_assessment({}, silent := Console(file=io.StringIO()))
+    assert silent.file.getvalue() == ""
 
 
 def truth_registration(capture: Capture) -> Registration:

@@ -7,14 +7,20 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 
+from registration.evaluate.audit import audit_penetration
+from registration.evaluate.residuals import residual_figures
+from registration.model.gnm_npz import read
 from registration.report import heat_map as heat_maps
 from registration.report.charts import ChartLine, line_charts, loss_curves
 from registration.report.inputs import ReportInputs, distance_heat_map
-from registration.report.page import headline, render_report
+from registration.report.page import render_report
+from registration.report.remarks import headline, remarks
 from registration.storage.hashing import versions
 from registration.types import Registration
+from tests.conftest import FIXTURES
 from tests.registration.report.test_pictures import a_view
 
+TEMPLATE = read(FIXTURES / "tiny_gnm.npz")
 VOID = {"meta", "img", "br", "link", "input", "hr"}
 
 
@@ -169,17 +175,58 @@ def test_line_charts_have_a_panel_per_title_and_bands():
 
 def test_remarks_name_low_weights_exclusions_and_intersections():
     row = {"template_vertices": 3, "template_max_mm": 1.0, "vertices_beyond_0.3mm": 2, "max_excess_mm": 0.83}
+    row["view"] = "cam07"
     figures = {
         "notes": ["landmarks 2-6 of scheme 68 do not fit the model's: excluded"],
         "views_not_trusted": {"cam03": "silhouette 35 px off the other views"},
         "intersections": {"pairs": {"tongue in gums": row, "ears in skin": {**row, "vertices_beyond_0.3mm": 0}}},
     }
     page = render_report(some_inputs(registration=a_registration(figures=figures)))
-    assert "<li>View cam03 has a low weight: silhouette 35 px off the other views.</li>" in page
+    assert "<li>View cam03 disagrees with the others and counts little: silhouette 35 px off the other views." in page
     assert "<li>Landmarks 2-6 of scheme 68 do not fit" in page
-    assert "<li>Tongue in gums: 2 vertices deeper than in the template, by up to 0.830 mm.</li>" in page
-    assert "Ears in skin" not in page
+    sentence = "2 vertices of the tongue lie inside the gums, worst 0.8 mm deeper than in the model itself"
+    assert f"<li>{sentence}: look at the mouth in cam07.</li>" in page
+    assert "of an ear" not in page
     assert "<ul>" not in render_report(some_inputs())
+
+
+def test_one_vertex_is_singular():
+    row = {"vertices_beyond_0.3mm": 1, "max_excess_mm": 0.5}
+    [line] = remarks(a_registration(figures={"intersections": {"pairs": {"lips in teeth": row}}}))
+    assert line == "1 vertex of the lips lies inside the teeth, worst 0.5 mm deeper than in the model itself."
+
+
+def test_every_pair_of_the_audit_has_words():
+    pairs = [pair.name for pair in audit_penetration(TEMPLATE.template_vertex_positions, TEMPLATE).pairs]
+    row = {"vertices_beyond_0.3mm": 3, "max_excess_mm": 0.5}
+    lines = remarks(a_registration(figures={"intersections": {"pairs": dict.fromkeys(pairs, row)}}))
+    assert len(lines) == len(pairs) and not any("another part, worst" in line for line in lines)
+
+
+def test_the_page_says_how_many_views_of_how_many_it_shows():
+    views = tuple(a_view(name=f"cam{number:02}") for number in range(5))
+    page = render_report(some_inputs(views=views[:2], thumbnails=views))
+    check_page(page)
+    assert "Shown are 2 of 5 views" in page and "All 5 views" in page and "cam04" in page
+    everything = render_report(some_inputs(views=views, thumbnails=views))
+    assert "Shown are" not in everything and "All 5 views" not in everything
+
+
+def test_a_converged_face_that_is_a_millimetre_wrong_is_not_green():
+    row = {"points": 1234, "mean_mm": 1.15, "median_mm": 1.0, "std_mm": 0.2, "p95_mm": 2.5}
+    page = render_report(some_inputs(registration=a_registration(figures={"scan_to_mesh": {"face": row}})))
+    assert '<span class="badge wrong">wrong</span><span class="status">converged</span>' in page
+    assert 'class="badge good"' not in page and "1.15 mm from the mesh on average" in page
+
+
+def test_residuals_are_shown_overall_and_of_the_worst_view():
+    views = {"cam00": {"silhouette_px": 0.5, "normals_deg": 2.0}, "cam01": {"silhouette_px": 1.5}}
+    figures = {"residuals": residual_figures(views)}
+    page = render_report(some_inputs(registration=a_registration(figures=figures)))
+    check_page(page)
+    rows = re.findall(r"<tr><td>silhouette</td>(.*?)</tr>", page)
+    assert len(rows) == 1 and "1.0\N{NO-BREAK SPACE}px" in rows[0] and "<td>cam01</td>" in rows[0]
+    assert "silhouette: mean distance of the outlines" in page  # a tile, as there is no scan
 
 
 def test_hidden_panels_when_stages_do_not_fill_a_row():

@@ -1,7 +1,7 @@
 """Comparison images and their numbers, of views with known differences."""
 
 import base64
-from dataclasses import replace
+from dataclasses import fields, replace
 
 import cv2
 import numpy as np
@@ -13,13 +13,12 @@ from registration.frames import srgb_to_linear
 from registration.geometry.rasterizer import rasterize
 from registration.report import heat_map, pictures
 from registration.report.heat_map import render_heat_map, scale_limit_mm
-from registration.report.inputs import HeatMap, ReportView, report_views
+from registration.report.inputs import HeatMap, ReportView, report_views, thumbnail
 from registration.report.pictures import (
     BACKGROUND,
     COLOUR_SCALE,
     OUTLINE,
     data_uri,
-    overlap,
     scale_colours,
     view_images,
 )
@@ -63,16 +62,8 @@ def a_view(**changes) -> ReportView:
     return ReportView(**{**fields, **changes})
 
 
-def test_numbers_of_a_view():
-    assert view_images(a_view()).numbers == {
-        "colour": "0.100",
-        "normals": "10.0°",
-        "classes": "95.0 %",
-        "mask overlap": "100.0 %",
-    }
-    half = a_view().rendered_mask.copy()
-    half[:20] = 0
-    assert view_images(a_view(rendered_mask=half)).numbers["mask overlap"] == "50.0 %"
+def arrays(view: ReportView) -> list[tuple[str, np.ndarray]]:
+    return [(f.name, value) for f in fields(view) if isinstance(value := getattr(view, f.name), np.ndarray)]
 
 
 def test_images_show_the_differences():
@@ -99,9 +90,18 @@ def test_the_outline_of_the_rendering_is_drawn_on_the_capture():
 
 def test_missing_targets_of_a_view_are_omitted():
     images = view_images(a_view(target_normals=None, target_classes=None, target_mask=None))
-    assert list(images.rows) == ["Colour"] and list(images.numbers) == ["colour"]
-    no_pixels = view_images(a_view(compared=np.zeros((HEIGHT, WIDTH), bool), rendered_mask=np.zeros((HEIGHT, WIDTH))))
-    assert "colour" not in no_pixels.numbers and no_pixels.numbers["mask overlap"] == "0.0 %"
+    assert list(images.rows) == ["Colour"]
+
+
+def test_a_thumbnail_shows_the_colours_of_a_view_in_small():
+    tall = thumbnail(replace(a_view(), **{name: np.repeat(np.repeat(a, 10, 0), 10, 1) for name, a in arrays(a_view())}))
+    small = thumbnail(a_view())  # already small
+    assert tall.rendered_mask.shape == (150, 112) and small.rendered_mask.shape == (HEIGHT, WIDTH)
+    images = view_images(tall)
+    assert list(images.rows) == ["Colour"] and images.name == "cam"
+    colour = images.rows["Colour"][2][1]
+    np.testing.assert_allclose(colour[75, 56], scale_colours(np.array(0.1 / pictures.COLOUR_LIMIT)), atol=1)
+    assert tuple(colour[2, 2]) == BACKGROUND
 
 
 def test_large_views_are_downscaled():
@@ -112,13 +112,6 @@ def test_large_views_are_downscaled():
     arrays = {k: tall(v) for k, v in vars(view).items() if isinstance(v, np.ndarray)}
     image = view_images(replace(view, **arrays)).rows["Colour"][0][1]
     assert image.shape == (pictures.MAX_IMAGE_HEIGHT, 480, 3)
-
-
-def test_overlap():
-    a, b = np.zeros((2, 4)), np.zeros((2, 4))
-    assert overlap(a, b) == 1
-    a[:, :2], b[:, 1:3] = 1, 1
-    assert overlap(a, b) == pytest.approx(1 / 3)
 
 
 def test_scale_runs_from_first_to_last_colour():
@@ -216,7 +209,7 @@ def test_report_views_of_targets_and_a_rendering():
         np.testing.assert_array_equal(view.target_classes, np.where(mask[0] > 0, 2, -1))
         np.testing.assert_array_equal(view.rendered_classes, view.target_classes)
         assert view.target_normals is None and view.target_rgb[3, 3, 0] == 0.25 and view.target_rgb[0, 5, 0] > 0.9
-        assert view_images(view).numbers["mask overlap"] == "100.0 %"
+        np.testing.assert_array_equal(view.rendered_mask, view.target_mask)
     without_targets = replace(targets, mask_weight=listed * 0, class_weight=listed * 0)
     assert all(
         view.target_mask is None and view.target_classes is None for view in report_views(without_targets, rendered)

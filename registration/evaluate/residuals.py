@@ -1,0 +1,139 @@
+"""Residuals of a registration in its own images: what can be measured without a scan (docs/formats.md, "Figures")."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+from torch import Tensor
+
+from registration.fit.view_weights import view_errors
+from registration.frames import linear_to_srgb
+from registration.types import Rendered, Targets
+
+_LEVELS = 255  # of 8 bit sRGB
+
+
+@dataclass(frozen=True, kw_only=True)
+class ResidualKind:
+    """One kind of residual, as the report and the terminal show it."""
+
+    title: str
+    unit: str
+    meaning: str
+
+    def text(self, value: float) -> str:
+        """Return a value with its unit."""
+        space = "" if self.unit == "°" else "\N{NO-BREAK SPACE}"
+        return f"{value:.1f}{space}{self.unit}"
+
+
+RESIDUALS: Mapping[str, ResidualKind] = {
+    "silhouette_px": ResidualKind(
+        title="silhouette", unit="px", meaning="mean distance of the outlines; the head is 512 px high"
+    ),
+    "normals_deg": ResidualKind(title="normals", unit="°", meaning="median angle between the normals"),
+    "colour_levels": ResidualKind(
+        title="colour", unit="levels", meaning="mean difference of the colours, of 255 sRGB levels"
+    ),
+    "labels_percent": ResidualKind(title="labels", unit="%", meaning="pixels whose label is another one"),
+    "landmarks_px": ResidualKind(
+        title="landmarks", unit="px", meaning="median distance of the landmarks; the head is 512 px high"
+    ),
+}
+
+
+def view_residuals(
+    targets: Targets, rendered: Rendered, landmark_px: Float[Tensor, "N"]
+) -> dict[str, dict[str, float]]:
+    """Measure the residuals in each view of a batch.
+
+    Args:
+        targets: of the views.
+        rendered: the registration at the pixels of `targets`, with the colours of each camera's exposure.
+        landmark_px: median distance of each view's landmarks, px at 512 px of head height; NaN without landmarks.
+
+    Returns:
+        View -> key of `RESIDUALS` -> value; a kind that cannot be measured in a view is missing there.
+    """
+    outline_px = view_errors(rendered, targets, landmark_px).outline_px
+    count = len(targets.names)
+    means = {
+        "silhouette_px": outline_px.cpu().numpy(),
+        "normals_deg": _by_view(*_normal_angles(targets, rendered), targets, np.median),
+        "colour_levels": _by_view(*_colour_differences(targets, rendered), targets, np.mean),
+        "labels_percent": _by_view(*_wrong_labels(targets, rendered), targets, np.mean),
+        "landmarks_px": landmark_px.cpu().numpy(),
+    }
+    return {
+        targets.names[view]: {kind: float(values[view]) for kind, values in means.items() if np.isfinite(values[view])}
+        for view in range(count)
+    }
+
+
+def residual_figures(views: Mapping[str, Mapping[str, float]], not_trusted: Sequence[str] = ()) -> dict[str, Any]:
+    """Return the manifest's figure of the residuals: of each view, and overall.
+
+    Args:
+        views: as `view_residuals` returns them, of all views.
+        not_trusted: views that do not count overall.
+
+    Returns:
+        `views`, and `overall`: the median over the trusted views of each kind that any of them has.
+    """
+    trusted = [values for name, values in views.items() if name not in not_trusted]
+    known = {kind: [values[kind] for values in trusted if kind in values] for kind in RESIDUALS}
+    overall = {kind: float(np.median(values)) for kind, values in known.items() if values}
+    return {"overall": overall, "views": {name: dict(values) for name, values in views.items()}}
+
+
+def residual_rows(figure: Mapping[str, Any]) -> list[tuple[ResidualKind, float | None, float, str]]:
+    """Return the rows of a table of residuals: kind, overall value, worst value and its view.
+
+    Args:
+        figure: of a manifest, as `residual_figures` returns it; kinds that no view has are omitted.
+    """
+    rows, views = [], figure.get("views", {})
+    for name, kind in RESIDUALS.items():
+        known = {view: values[name] for view, values in views.items() if name in values}
+        if known:
+            worst = max(known, key=lambda view: known[view])
+            rows.append((kind, figure.get("overall", {}).get(name), known[worst], worst))
+    return rows
+
+
+def _by_view(values: np.ndarray, counts: np.ndarray, targets: Targets, statistic: Any) -> Float[np.ndarray, "N"]:
+    """The statistic of the pixels that count, view by view; NaN without any."""
+    view = targets.pixels.view.cpu().numpy()
+    members = (values[counts & (view == number)] for number in range(len(targets.names)))
+    return np.array([statistic(part) if len(part) else np.nan for part in members])
+
+
+def _array(values: Tensor) -> np.ndarray:
+    return values.detach().float().cpu().numpy()
+
+
+def _normal_angles(targets: Targets, rendered: Rendered) -> tuple[np.ndarray, np.ndarray]:
+    """Degrees at each pixel, and where both normals are known."""
+    target, shown = _array(targets.normals), _array(rendered.normals)
+    lengths = np.linalg.norm(target, axis=-1) * np.linalg.norm(shown, axis=-1)
+    counts = (_array(targets.normal_weight) > 0) & (lengths > 0)
+    cosine = (target * shown).sum(-1) / np.where(counts, lengths, 1)
+    return np.degrees(np.arccos(np.clip(cosine, -1, 1))), counts
+
+
+def _colour_differences(targets: Targets, rendered: Rendered) -> tuple[np.ndarray, np.ndarray]:
+    """Mean over the channels at each pixel, in sRGB levels, and where colours are compared."""
+    target, shown = linear_to_srgb(_array(targets.rgb)), linear_to_srgb(_array(rendered.rgb))
+    counts = (_array(targets.rgb_weight) > 0) & (_array(rendered.mask) > 0.5)
+    return _LEVELS * np.abs(target - shown).mean(-1), counts
+
+
+def _wrong_labels(targets: Targets, rendered: Rendered) -> tuple[np.ndarray, np.ndarray]:
+    """100 at each pixel of another label and 0 elsewhere, and where labels are compared."""
+    target, shown = _array(targets.classes), _array(rendered.classes)
+    if not target.shape[-1]:
+        return np.zeros(len(target)), np.zeros(len(target), bool)
+    counts = (_array(targets.class_weight) > 0) & (target.max(-1) > 0.5) & (_array(rendered.mask) > 0.5)
+    return 100.0 * (target.argmax(-1) != shown.argmax(-1)), counts

@@ -1,0 +1,82 @@
+"""A registration's result in sentences that a newcomer understands."""
+
+from collections.abc import Mapping
+from typing import Any, Protocol, runtime_checkable
+
+from registration.evaluate.audit import BEYOND_KEY
+from registration.types import Status
+
+# Pair of the penetration audit -> what lies where, and where to look.
+_PAIRS = {
+    "lids in left eye": ("of the eyelids", "inside the left eyeball", "the left eye"),
+    "lids in right eye": ("of the eyelids", "inside the right eyeball", "the right eye"),
+    "lips in teeth": ("of the lips", "inside the teeth", "the mouth"),
+    "lips in gums": ("of the lips", "inside the gums", "the mouth"),
+    "lips in tongue": ("of the lips", "inside the tongue", "the mouth"),
+    "tongue in teeth": ("of the tongue", "inside the teeth", "the mouth"),
+    "tongue in gums": ("of the tongue", "inside the gums", "the mouth"),
+    "tongue in skin": ("of the tongue", "inside the skin of the face", "the mouth"),
+    "upper lip in lower lip": ("of the upper lip", "inside the lower lip", "the mouth"),
+    "lower lip in upper lip": ("of the lower lip", "inside the upper lip", "the mouth"),
+    "ears in skin": ("of an ear, or of the skin behind it,", "inside the other", "the ears"),
+    "skin in itself": ("of the skin", "inside another part of the skin, as in a fold", "this place"),
+}
+
+
+@runtime_checkable
+class Assessed(Protocol):
+    """What a registration and the manifest of a registration folder share."""
+
+    @property
+    def status(self) -> Status: ...
+    @property
+    def reason(self) -> str: ...
+    @property
+    def figures(self) -> Mapping[str, Any]: ...
+
+
+def headline(registration: Assessed) -> str:
+    """Return the result in one or two sentences."""
+    opening = {
+        "converged": "The registration converged",
+        "stopped": "The registration was stopped before it converged",
+        "failed": "The registration failed",
+    }[registration.status]
+    sentence = f"{opening}: {registration.reason}." if registration.reason else f"{opening}."
+    face = registration.figures.get("scan_to_mesh", {}).get("face", {})
+    if face.get("mean_mm") is None:
+        return f"{sentence} There is no scan of the face to measure it against."
+    return (
+        f"{sentence} On the face the scan lies {format_mm(face['mean_mm'])} mm from the mesh on average; "
+        f"half of its points are within {format_mm(face['median_mm'])} mm and 95 % within "
+        f"{format_mm(face['p95_mm'])} mm."
+    )
+
+
+def remarks(registration: Assessed) -> list[str]:
+    """Return remarks besides the headline: views with low weights, excluded landmarks, parts inside one another."""
+    figures = registration.figures
+    lines = [str(warning) for warning in figures.get("warnings", [])]
+    lines += [
+        f"View {view} disagrees with the others and counts little: {why}. Look at its camera, image, mask and labels."
+        for view, why in figures.get("views_not_trusted", {}).items()
+    ]
+    lines += [f"{note[:1].upper()}{note[1:]}." for note in figures.get("notes", [])]
+    lines += [
+        _intersection(pair, row[BEYOND_KEY], row["max_excess_mm"], row.get("view"))
+        for pair, row in figures.get("intersections", {}).get("pairs", {}).items()
+        if row.get(BEYOND_KEY)
+    ]
+    return lines
+
+
+def _intersection(pair: str, count: int, worst_mm: float, view: str | None) -> str:
+    part, place, target = _PAIRS.get(pair, (f"({pair})", "inside another part", "this place"))
+    number = f"1 vertex {part} lies" if count == 1 else f"{count} vertices {part} lie"
+    where = f": look at {target} in {view}" if view else ""
+    return f"{number} {place}, worst {worst_mm:.1f} mm deeper than in the model itself{where}."
+
+
+def format_mm(value: float | None) -> str:
+    """Return a distance in millimetres with three significant digits or so."""
+    return "–" if value is None else f"{value:.3f}" if value < 1 else f"{value:.2f}"

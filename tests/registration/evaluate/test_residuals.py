@@ -1,0 +1,83 @@
+"""Residuals in the images, of views with known differences."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from registration.evaluate.residuals import RESIDUALS, residual_figures, view_residuals
+from registration.frames import srgb_to_linear
+from registration.types import Camera, Pixels, Rendered, Targets
+
+
+def square_subject() -> tuple[Targets, Rendered]:
+    """Two views of 64 x 64 px with a square subject of 32 px, which the mesh covers exactly.
+
+    In the second view the mesh is 10 levels brighter, its normals are rotated by 10 degrees, and a quarter of its
+    labels are wrong.
+    """
+    camera = Camera(width_px=64, height_px=64, intrinsics=np.diag([64.0, 64.0, 1.0]), T_cam_world=np.eye(4))
+    pixels = Pixels.full((camera, camera))
+    mask = torch.zeros(2, 64, 64)
+    mask[:, 16:48, 16:48] = 1
+    covered, second = pixels.of_image(mask), (pixels.view == 1).float()
+    grey, brighter = srgb_to_linear(np.array([100, 110]) / 255).tolist()
+    normals = torch.tensor([0.0, 0.0, 1.0]) * covered[:, None]
+    rotated = torch.tensor([np.sin(np.radians(10)), 0.0, np.cos(np.radians(10))], dtype=torch.float32)
+    lower = ((pixels.y >= 40) & (pixels.view == 1)).float() * covered
+    skin = torch.stack([covered, torch.zeros_like(covered)], -1)
+    targets = Targets(
+        names=("a", "b"),
+        class_names=("skin", "ears"),
+        pixels=pixels,
+        rgb=torch.full((len(covered), 3), grey) * covered[:, None],
+        rgb_weight=covered,
+        normals=normals,
+        normal_weight=covered,
+        mask=covered,
+        mask_weight=torch.ones_like(covered),
+        classes=skin,
+        class_weight=covered,
+        landmarks={},
+        px_per_head=32.0,
+    )
+    rendered = Rendered(
+        rgb=(grey + (brighter - grey) * second[:, None]) * covered[:, None].repeat(1, 3),
+        normals=torch.where(second[:, None] > 0, rotated * covered[:, None], normals),
+        classes=torch.stack([covered - lower, lower], -1),
+        mask=covered,
+    )
+    return targets, rendered
+
+
+def test_residuals_of_known_differences() -> None:
+    targets, rendered = square_subject()
+    views = view_residuals(targets, rendered, torch.tensor([1.5, float("nan")]))
+    assert views["a"] == pytest.approx(
+        {"silhouette_px": 0, "normals_deg": 0, "colour_levels": 0, "labels_percent": 0, "landmarks_px": 1.5}, abs=1e-2
+    )
+    assert views["b"] == pytest.approx(
+        {"silhouette_px": 0, "normals_deg": 10, "colour_levels": 10, "labels_percent": 25}, rel=1e-3, abs=1e-6
+    )
+
+
+def test_what_a_view_lacks_has_no_residual() -> None:
+    targets, rendered = square_subject()
+    nothing = torch.zeros_like(targets.mask)
+    bare = replace(targets, normal_weight=nothing, rgb_weight=nothing, class_weight=nothing, mask_weight=nothing)
+    assert view_residuals(bare, rendered, torch.full((2,), torch.nan)) == {"a": {}, "b": {}}
+    without_classes = replace(targets, classes=targets.classes[:, :0])
+    assert "labels_percent" not in view_residuals(without_classes, rendered, torch.zeros(2))["a"]
+
+
+def test_overall_is_the_median_of_the_trusted_views() -> None:
+    views = {"a": {"normals_deg": 1.0}, "b": {"normals_deg": 3.0}, "c": {"normals_deg": 90.0, "colour_levels": 5.0}}
+    assert residual_figures(views, ["c"]) == {"overall": {"normals_deg": 2.0}, "views": views}
+    assert residual_figures(views)["overall"] == {"normals_deg": 3.0, "colour_levels": 5.0}
+    assert residual_figures({}) == {"overall": {}, "views": {}}
+
+
+def test_values_have_units() -> None:
+    assert RESIDUALS["normals_deg"].text(2.04) == "2.0°"
+    assert RESIDUALS["silhouette_px"].text(0.5) == "0.5\N{NO-BREAK SPACE}px"
