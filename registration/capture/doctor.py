@@ -12,18 +12,17 @@ from rich.box import SIMPLE
 from rich.console import Console
 from rich.table import Table
 from rich.text import Text
-from scipy.spatial import cKDTree
 
 from registration.capture import leftovers, native, pixels, triangulation
 from registration.capture.contact_sheet import draw_contact_sheet
 from registration.capture.scan import Scan, read_scan, read_truth
+from registration.capture.scan_checks import scan_facts, scan_warnings
 from registration.capture.text import listed
 from registration.capture.validation import eye_distance, validate_capture
 from registration.frames import MM_PER_M, opencv_intrinsics
 from registration.geometry.meshlab import scan_topology
 from registration.types import Camera, Capture, View
 
-MAX_SCAN_DISTANCE_MM = 10.0  # median distance of the landmarks from the scan, which shows the skin that they lie on
 NO_TOPOLOGY = "not checked, PyMeshLab is not installed or cannot start (make setup-optional)"
 _LENSES = {0: "pinhole", 4: "k1 k2 p1 p2", 5: "k1 k2 p1 p2 k3", 8: "k1 k2 p1 p2 k3..k6"}
 
@@ -101,8 +100,7 @@ class CaptureReport:
         if self.eye_distance_mm is not None:
             facts.append(f"outer eye corners: {self.eye_distance_mm:.1f} mm apart")
         if self.scan is not None:
-            extent = " x ".join(f"{MM_PER_M * side:.0f}" for side in np.ptp(self.scan.vertices, axis=0))
-            facts.append(f"scan: {len(self.scan.vertices)} vertices, {len(self.scan.triangles)} faces, {extent} mm")
+            facts.append(f"scan: {scan_facts(self.scan)}")
             if len(self.scan.triangles):
                 topology = scan_topology(self.scan.vertices, self.scan.triangles)
                 facts.append(f"scan's topology: {topology or NO_TOPOLOGY}")
@@ -141,7 +139,7 @@ def check_capture(path: Path, sheet: Path | None = None) -> CaptureReport:
         eye_distance_mm=None if distance is None else MM_PER_M * distance,
         scan=scan,
         warnings=(
-            *_warnings(views, triangulated, scan),
+            *_warnings(capture, views, triangulated, scan),
             *leftovers.warnings(capture, leftovers.match_files(capture)),
         ),
         sheet=sheet,
@@ -168,7 +166,10 @@ def _view_report(view: View, scheme: str | None, points: Float[np.ndarray, "L 3"
 
 
 def _warnings(
-    views: tuple[ViewReport, ...], triangulated: Mapping[str, Float[np.ndarray, "L 3"]], scan: Scan | None
+    capture: Capture,
+    views: tuple[ViewReport, ...],
+    triangulated: Mapping[str, Float[np.ndarray, "L 3"]],
+    scan: Scan | None,
 ) -> list[str]:
     warnings = []
     for part, missing in (
@@ -193,13 +194,8 @@ def _warnings(
             f"landmarks 68: {listed(jaw)} go backwards; the jaw must run from the right ear over the chin to the left"
         )
     if scan is None:
-        warnings.append("no scan: distances to it cannot be evaluated")
-    elif np.isfinite(points).any():
-        valid = points[np.isfinite(points).all(-1)]
-        distance = MM_PER_M * float(np.median(cKDTree(scan.vertices).query(valid)[0]))
-        if distance > MAX_SCAN_DISTANCE_MM:
-            warnings.append(f"the scan is {distance:.0f} mm from the landmarks; check its frame and unit")
-    return warnings
+        return [*warnings, "no scan: distances to it cannot be evaluated"]
+    return [*warnings, *scan_warnings(capture, scan, points)]
 
 
 def _folds(camera: Camera) -> bool:

@@ -7,6 +7,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 
+from registration.capture.scan import SCAN, unread_scans
 from registration.capture.text import listed
 from registration.errors import InputError
 from registration.types import Capture
@@ -101,7 +102,15 @@ def warnings(capture: Capture, files: Mapping[str, FolderFiles]) -> list[str]:
                 lines.append(f"{path.name}/ with {count} files is not read; rename it to {meant}/")
         elif (meant := _meant_root_file(path)) is not None and not (capture.root / meant).exists():
             lines.append(f"{path.name} is not read; convert or rename it to {meant}")
-    return lines
+    return lines + _other_scans(capture)
+
+
+def _other_scans(capture: Capture) -> list[str]:
+    """A line about meshes in other files or formats than the scan's."""
+    if not (names := unread_scans(capture.root)):
+        return []
+    mend = f"convert or rename it to {SCAN}" if capture.scan is None else f"only {SCAN} is; remove what is out of date"
+    return [f"{listed(names)} is not read; {mend}"]
 
 
 def files_in(folder: Path) -> list[str]:
@@ -141,9 +150,11 @@ def _expected(capture: Capture) -> dict[str, list[str]]:
 def _meant_root_file(path: Path) -> str | None:
     name = path.name.casefold()
     for expected in _ROOT_FILES:
+        if expected == SCAN:  # `_other_scans` finds them
+            continue
         if name == expected or (PurePosixPath(name).stem == PurePosixPath(expected).stem):
             return expected
-    return "scan.ply" if path.suffix.casefold() in (".ply", ".obj", ".stl", ".off", ".glb") else None
+    return None
 
 
 def _conversion(name: str, near: str) -> str:

@@ -69,6 +69,13 @@ def edges(triangles: Int[np.ndarray, "F 3"]) -> Edges:
     )
 
 
+def directed_edges_used_twice(triangles: Int[np.ndarray, "F 3"]) -> int:
+    """Count the edges along which two triangles run in the same direction: their windings disagree."""
+    start, end = triangles.T.astype(np.int64), np.roll(triangles, -1, 1).T.astype(np.int64)
+    keys = np.sort((start * (triangles.max(initial=0) + 1) + end).ravel())
+    return int((np.diff(keys) == 0).sum())
+
+
 def connected_parts(triangles: Int[np.ndarray, "F 3"]) -> Int[np.ndarray, "F"]:
     """Return for each triangle the number of its connected component; triangles are connected by common vertices."""
     count = int(triangles.max()) + 1

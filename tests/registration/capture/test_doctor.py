@@ -133,10 +133,9 @@ def test_landmark_schemes_may_have_different_lengths(tmp_path: Path) -> None:
     assert report.schemes == {"5": (5, 5), "68": (68, 68)} and report.eye_distance_mm == pytest.approx(90)
 
 
-@pytest.mark.parametrize("scale", [1000.0, 0.01])
-def test_a_scan_in_other_units_is_reported(tmp_path: Path, scale: float) -> None:
+def test_a_scan_that_is_not_at_the_landmarks_is_reported(tmp_path: Path) -> None:
     root = make(tmp_path / "capture")
-    write_ply(root / "scan.ply", ball(scale).vertices, ball().triangles)
+    write_ply(root / "scan.ply", ball(0.7).vertices, ball().triangles)
     (warning,) = check_capture(root).warnings
     assert "check its frame and unit" in warning
 
