@@ -8,15 +8,14 @@ from workflows.engine.client import QueueClient
 from workflows.engine.jobs import DRIVER, FlowJob
 from workflows.farm.local import LocalFarm, run_until_done
 from workflows.ids import check_id
-from workflows.pages.coregistration import render_coregistration_page
 from workflows.records.coregistration import (
     MANIFEST,
     PLAN,
     CoregistrationPlan,
     CoregistrationState,
     initial_state,
-    write_state,
 )
+from workflows.steps.coregistration_page import write_record
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -50,9 +49,10 @@ def submit_coregistration(url: str, plan: CoregistrationPlan, *, run: str | None
 
 def start_coregistration(plan: CoregistrationPlan) -> Path:
     """Write the record before the first round, and the plan, whose file is returned."""
-    write_state(initial_state(plan), render_coregistration_page)
     file = plan.out / PLAN
+    plan.out.mkdir(parents=True, exist_ok=True)
     plan.write(file)
+    write_record(initial_state(plan))
     return file
 
 
@@ -89,5 +89,17 @@ def coregister(
     name = submit_coregistration(url, plan)
     roots = tuple(str(path) for path in (plan.dataset, plan.model.parent, plan.out, folder.resolve()))
     farm = LocalFarm(url=url, folder=folder, roots=roots, workers=workers, gpus=gpus)
-    stopped = run_until_done(farm, name, progress or NullProgress()).reason
-    return CoregistrationResult(state=CoregistrationState.read(plan.out / MANIFEST), stopped=stopped)
+    try:
+        stopped = run_until_done(farm, name, progress or NullProgress()).reason
+    except BaseException:
+        _write_stopped(plan, "the command ended before the run; the same command continues it")
+        raise
+    state = _write_stopped(plan, stopped)
+    return CoregistrationResult(state=state, stopped=stopped)
+
+
+def _write_stopped(plan: CoregistrationPlan, reason: str) -> CoregistrationState:
+    """Note in the record and on the page why the run has ended, if that was without a verdict on its last round."""
+    state = replace(CoregistrationState.read(plan.out / MANIFEST), stopped=reason)
+    write_record(state)
+    return state

@@ -1,14 +1,13 @@
 """The record of a coregistration, `coregistration.json`, and its plan, `plan.json`, for coordinators and workers."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 from coregister.next_model.recipes import ModelRecipe
 from coregister.stopping_rule import RoundMetrics, StoppingRule, StoppingVerdict
 from registration.options import RegisterOptions
-from registration.storage.files import atomic_write_text, refuse_foreign
+from registration.storage.files import refuse_foreign
 from registration.storage.hashing import versions
 from registration.storage.records import Record
 from workflows.records.dataset import Split
@@ -87,6 +86,7 @@ class CoregistrationState(
     specificity_mm: Curves = field(default_factory=dict)
     at: int = 0  # the number of components that the stopping rule uses
     verdict: StoppingVerdict | None = None
+    stopped: str = ""  # why the run ended without a verdict on its last round, as far as the command knows
     versions: Mapping[str, str] = field(default_factory=versions)
 
 
@@ -100,17 +100,11 @@ def initial_state(plan: CoregistrationPlan, held_out: HoldOutResult | None = Non
     )
 
 
-def write_state(state: CoregistrationState, page: Callable[[Mapping[str, Any]], str]) -> None:
-    """Write `coregistration.json` and `index.html`, each in one rename.
-
-    Args:
-        state: is written into the plan's output folder.
-        page: makes the page from the entries of `coregistration.json`.
-    """
+def write_state(state: CoregistrationState) -> None:
+    """Write `coregistration.json` into the plan's output folder, in one rename."""
     out = state.plan.out
     out.mkdir(parents=True, exist_ok=True)
     state.write(out / MANIFEST)
-    atomic_write_text(out / PAGE, page(state.to_json()))
 
 
 def check_out(out: Path) -> None:

@@ -17,11 +17,13 @@ from workflows.pages.model import render_model_page
 from workflows.records.dataset import read_dataset
 from workflows.records.step_results import BuildResult, RejectedRegistration
 from workflows.records.training_subjects import RegisteredSubjects
+from workflows.steps.coregistration_page import shown_on_page
 from workflows.steps.products import Product
 
 MODEL, PAGE = "gnm_head.npz", "index.html"
 
 
+@shown_on_page()
 def build_next_model(
     *,
     run: str,

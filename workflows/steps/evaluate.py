@@ -19,6 +19,7 @@ from registration.storage.records import Record
 from workflows.pages.evaluation import render_evaluation_page
 from workflows.records.held_out import read_held_out
 from workflows.records.step_results import EvaluateResult
+from workflows.steps.coregistration_page import shown_on_page
 
 MANIFEST, PAGE, VERTICES = "manifest.json", "index.html", "vertices.npz"
 _FILES = (MANIFEST, PAGE, VERTICES)
@@ -87,6 +88,7 @@ def evaluate_models(
     return manifest
 
 
+@shown_on_page()
 def evaluate_round(
     *,
     models: Mapping[str, str],

@@ -20,11 +20,13 @@ from workflows.records.training_subjects import (
     true_meshes,
     write_held_out,
 )
+from workflows.steps.coregistration_page import shown_on_page
 from workflows.steps.products import Product
 
 HELD_OUT = "held_out.npz"
 
 
+@shown_on_page()
 def hold_out(
     *, dataset: str, names: Sequence[str], registrations: str, model: str, out: str, progress: Progress | None = None
 ) -> dict[str, Any]:

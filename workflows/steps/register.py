@@ -19,6 +19,7 @@ from workflows.pages.thumbnail import thumbnail
 from workflows.records.headline import brief
 from workflows.records.remote import fetch_capture, fetch_model
 from workflows.records.store import Store
+from workflows.steps.coregistration_page import shown_on_page
 from workflows.steps.job_options import from_job
 from workflows.steps.subject import start_subject
 
@@ -92,6 +93,7 @@ def _write_thumbnail(result: Registration, file: Path, progress: Progress) -> bo
     return True
 
 
+@shown_on_page(often=True)
 def register_capture(
     *,
     capture: str,

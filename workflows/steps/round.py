@@ -8,7 +8,6 @@ from typing import Any
 from coregister.stopping_rule import RoundMetrics, apply_stopping_rule
 from registration.progress import Progress
 from registration.storage.records import structure, to_json
-from workflows.pages.coregistration import render_coregistration_page
 from workflows.records.coregistration import (
     FIRST_MODEL,
     CoregistrationPlan,
@@ -17,10 +16,10 @@ from workflows.records.coregistration import (
     RoundRecord,
     initial_state,
     model_name,
-    write_state,
 )
 from workflows.records.step_results import CaptureResult, EvaluateResult, HoldOutResult
 from workflows.records.subject import read_subject
+from workflows.steps.coregistration_page import write_record
 
 
 def end_round(
@@ -49,7 +48,7 @@ def end_round(
     held_out_result = HoldOutResult.from_json(held_out, where=where)
     products: tuple[RoundProducts, ...] = structure(rounds, tuple[RoundProducts, ...], where=where, title="rounds")
     state = apply_verdict(initial_state(record, held_out_result), products)
-    write_state(state, render_coregistration_page)
+    write_record(state)
     verdict: dict[str, Any] = to_json(state.verdict)
     return verdict
 

@@ -29,6 +29,7 @@ from workflows.records.decisions import read_decisions
 from workflows.records.run import STABILIZED, Selection, StabilizationInputs, read_run
 from workflows.records.step_results import StabilizeResult
 from workflows.records.subject import read_usable
+from workflows.steps.coregistration_page import shown_on_page
 
 LOG = "decisions.jsonl"  # within the run
 Reuse = Literal["same inputs", "any decisions", "none"]
@@ -107,6 +108,7 @@ def stabilize_run(
     return StabilizationResult(out=out, dataset=dataset, figures=figures)
 
 
+@shown_on_page()
 def stabilize_subjects(
     *, run: str, names: Sequence[str], model: str, out: str, progress: Progress | None = None
 ) -> dict[str, Any]:

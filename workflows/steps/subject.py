@@ -35,6 +35,7 @@ from workflows.records.subject import (
     read_captures,
     write_subject,
 )
+from workflows.steps.coregistration_page import shown_on_page
 from workflows.steps.job_options import from_job
 from workflows.steps.products import Product
 
@@ -80,6 +81,7 @@ def register_subject(
     return _register_captures(captures.captures, register_one, _SubjectWriter(initial, out), leave or {}, progress)
 
 
+@shown_on_page(often=True)
 def collect_subject(
     *,
     subject_dir: str,
