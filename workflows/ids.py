@@ -7,12 +7,12 @@ import re
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
-from urllib.parse import unquote, urlsplit
+from urllib.parse import unquote
 
 from registration.errors import InputError
 
 _ID = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,99}(/[A-Za-z0-9][A-Za-z0-9._-]{0,99}){0,7}")
-_SCHEMES = ("", "file", "s3")
+_URL = re.compile(r"([A-Za-z][A-Za-z0-9+.-]*)://|file:", re.IGNORECASE)
 
 
 def check_id(identity: str) -> str:
@@ -38,8 +38,53 @@ def id_part(name: str, length: int = 100) -> str:
     return part if part[:1].isalnum() else f"x{part}"
 
 
-def check_location(location: Any, roots: Sequence[str], where: str) -> None:
-    """Refuse a path or URL that is not below one of the roots, also by `..` or through a symbolic link.
+def resolve_place(location: Any, where: str) -> str:
+    """Return what a path or URL names, in the one form in which it is checked and opened.
+
+    That is an absolute path without "..", symbolic links or escapes, or `s3://bucket/key`. A path is taken literally:
+    only what begins with `scheme://` or `file:` is a URL. Open nothing but the result: libraries read more into a
+    location than a path, such as chains ("a::b"), queries and home folders.
+
+    Args:
+        location: from anywhere, thus of any type.
+        where: the name of the argument, for the message.
+
+    Raises:
+        InputError: the location is empty or no text; its URL has another scheme than file or s3, a query, a fragment,
+            credentials, or another host's file.
+    """
+    if not isinstance(location, str) or not location or "\0" in location:
+        raise _no_place(where, expected="a path or URL", got=shortened(location))
+    url = _URL.match(location)
+    if url is None:
+        return _absolute(location, where)
+    scheme, rest = (url[1] or "file").lower(), location[url.end() :]
+    if scheme not in ("file", "s3"):
+        raise _no_place(where, expected="a path, file:// or s3:// URL", got=f"a URL of the scheme {scheme}")
+    host, slash, path = rest.partition("/")
+    if "@" in host or (scheme == "s3" and ":" in host and not host.startswith("arn:")):
+        raise _no_place(where, expected="a URL without credentials", got="one with credentials")
+    if found := next((c for c in location if c in "?#" or not c.isprintable()), None):
+        raise _no_place(where, expected="a URL without query, fragment or control characters", got=repr(found))
+    if scheme == "s3":
+        if not host or {".", ".."} & set(path.split("/")):
+            raise _no_place(where, expected='s3://bucket/key without ".."', got=shortened(location))
+        return f"s3://{host}/{path}".rstrip("/")
+    if not slash or host.lower() not in ("", "localhost") or (host and url[1] is None):
+        raise _no_place(where, expected="file:///path of this machine", got=shortened(location))
+    try:
+        return _absolute("/" + unquote(path, errors="strict"), where)
+    except UnicodeDecodeError:
+        raise _no_place(where, expected="escapes of UTF-8 text", got=shortened(location)) from None
+
+
+def is_remote(place: str) -> bool:
+    """Return whether a place, as `resolve_place` returns it, is in object storage."""
+    return place.startswith("s3://")
+
+
+def check_location(location: Any, roots: Sequence[str], where: str) -> str:
+    """Return what a path or URL names, as `resolve_place`, if that is below one of the roots; open nothing else.
 
     Args:
         location: from a job, thus of any type.
@@ -47,27 +92,25 @@ def check_location(location: Any, roots: Sequence[str], where: str) -> None:
         where: the name of the argument, for the message.
 
     Raises:
-        InputError: the location is outside the roots, or its URL has another scheme than file or s3, or credentials.
+        InputError: as `resolve_place`, or the place is outside the roots.
     """
-    if not isinstance(location, str) or not location or "\0" in location:
-        raise job_refused(where, expected="a path or URL", got=shortened(location))
-    parts = urlsplit(location)
-    if parts.scheme not in _SCHEMES:
-        raise job_refused(where, expected="a path, file:// or s3:// URL", got=shortened(redact(location)))
-    if "@" in parts.netloc:
-        raise job_refused(where, expected="a URL without credentials", got=shortened(redact(location)))
-    if ".." in Path(unquote(parts.path)).parts:
-        raise job_refused(where, expected='a path or URL without ".."', got=shortened(location))
-    resolved = _resolve(location)
-    if not any(resolved == root or resolved.startswith(root.rstrip("/") + "/") for root in roots):
-        raise job_refused(
-            where, expected=f"a path or URL below {', '.join(roots) or 'a root'}", got=shortened(location)
-        )
+    place = resolve_place(location, where)
+    if not any(place == root or place.startswith(root.rstrip("/") + "/") for root in roots):
+        allowed = ", ".join(roots) or "a root"
+        raise job_refused(where, expected=f"a path or URL below {allowed}", got=shortened(location))
+    return place
 
 
 def resolve_roots(roots: Iterable[str | Path]) -> tuple[str, ...]:
-    """Return roots in the form that `check_location` compares with: local ones absolute, without symbolic links."""
-    return tuple(_resolve(str(root)) for root in roots)
+    """Return roots in the form that `check_location` compares with. Raises InputError as `resolve_place`."""
+    return tuple(resolve_place(str(root), "--root") for root in roots)
+
+
+def check_name(name: Any, where: str) -> str:
+    """Return the name of a folder or file if it is one, not a path. Raises InputError."""
+    if not isinstance(name, str) or name in ("", ".", "..") or "/" in name or "\0" in name:
+        raise job_refused(where, expected="names of folders, not paths", got=shortened(name))
+    return name
 
 
 def nearest(name: str, known: Iterable[str], count: int = 3) -> list[str]:
@@ -97,9 +140,19 @@ def shortened(value: Any) -> str:
     return text if len(text) <= 200 else text[:200] + "..."
 
 
-def _resolve(location: str) -> str:
-    """Comparable forms: /absolute/path, or s3://bucket/key."""
-    parts = urlsplit(location)
-    if parts.scheme == "s3":
-        return f"s3://{parts.netloc}{parts.path}".rstrip("/")
-    return os.path.realpath(unquote(parts.path) if parts.scheme == "file" else location)
+def _absolute(path: str, where: str) -> str:
+    try:
+        os.fsencode(path)
+        return "/" + os.path.realpath(path).lstrip("/")  # "//x" is another name of "/x"
+    except (OSError, ValueError):
+        raise _no_place(where, expected="a path", got=shortened(path)) from None
+
+
+def _no_place(where: str, *, expected: str, got: str) -> InputError:
+    return InputError(
+        "The path or URL cannot be used",
+        where=where,
+        expected=expected,
+        got=got,
+        fix="give a path, or s3://bucket/key; keys of object storage come from the environment",
+    )

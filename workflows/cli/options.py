@@ -147,9 +147,10 @@ class RunOptions(FarmOptions):
         """
         if self.folder is not None or not self.local:
             return self.directory
-        from workflows.records.remote import is_remote, local_path
+        from workflows.ids import is_remote, resolve_place
 
-        if is_remote(str(out)):
+        place = resolve_place(str(out), "--out")
+        if is_remote(place):
             raise InputError(
                 "A farm on this machine needs a folder",
                 where="--folder",
@@ -157,7 +158,7 @@ class RunOptions(FarmOptions):
                 got="none",
                 fix="add --folder DIR",
             )
-        path = local_path(str(out)).resolve()
+        path = Path(place)
         return path.with_name(f"{path.name}.farm")
 
     def url_for(self, folder: Path) -> str:

@@ -60,7 +60,7 @@ class PermanentStepError(Exception):
 
 
 def validate_arguments(spec: Any, steps: Mapping[str, Step], roots: Sequence[str]) -> tuple[Step, dict[str, Any]]:
-    """Return the step and the arguments of a job that a worker took from the queue.
+    """Return the step and the arguments of a job that a worker took from the queue, with paths as they are opened.
 
     Args:
         spec: as `Job.spec` returns it, but from an untrusted source.
@@ -80,10 +80,18 @@ def validate_arguments(spec: Any, steps: Mapping[str, Step], roots: Sequence[str
         raise job_refused(name, expected="an object of arguments", got=type(arguments).__name__)
     if (size := len(json.dumps(arguments))) > MAX_BYTES:
         raise job_refused(name, expected=f"arguments of at most {MAX_BYTES} bytes", got=f"{size} bytes")
-    for key in steps[name].path_arguments:
-        value = arguments.get(key)
-        value = list(value.values()) if isinstance(value, dict) else value
-        for location in value if isinstance(value, list) else [value]:
-            if location is not None:
-                check_location(location, roots, where=f"{name}: {key}")
-    return steps[name], arguments
+    places = {
+        key: _checked(arguments[key], roots, where=f"{name}: {key}")
+        for key in steps[name].path_arguments
+        if arguments.get(key) is not None
+    }
+    return steps[name], {**arguments, **places}
+
+
+def _checked(value: Any, roots: Sequence[str], where: str) -> Any:
+    """The places that an argument names: one, or some in a list or an object."""
+    if isinstance(value, dict):
+        return {key: _checked(item, roots, where) for key, item in value.items()}
+    if isinstance(value, list):
+        return [_checked(item, roots, where) for item in value]
+    return check_location(value, roots, where)

@@ -11,8 +11,7 @@ from registration.options import RegisterOptions
 from registration.storage.reading import read_list
 from registration.storage.records import to_json
 from workflows.engine.jobs import DRIVER, FlowJob, Job
-from workflows.ids import check_id, id_part, redact
-from workflows.records.remote import is_remote, local_path
+from workflows.ids import check_id, id_part, is_remote, redact, resolve_place
 from workflows.steps import table
 from workflows.steps.job_options import to_job
 
@@ -58,11 +57,13 @@ def batch_jobs(
         InputError: there is no capture that can be used, a list or the model is missing, or the options cannot be used
             by a worker.
     """
-    shared = {"model": _absolute(model), "store": _absolute(out), "options": to_json(to_job(options))}
-    locations = list(dict.fromkeys(_absolute(location) for word in captures for location in _expand(word)))
+    model, store = resolve_place(model, "--model"), resolve_place(out, "--out")
+    shared = {"model": model, "store": store, "options": to_json(to_job(options))}
+    locations, refused = _places([location for word in captures for location in _expand(word)])
     if not locations:
-        raise _input_error("There is nothing to register", where="CAPTURE", expected="captures", got="none")
-    if not is_remote(model) and not local_path(model).is_file():
+        expected, got = "captures", next((f"{word}: {reason}" for word, reason in refused.items()), "none")
+        raise _input_error("There is nothing to register", where="CAPTURE", expected=expected, got=got)
+    if not is_remote(model) and not Path(model).is_file():
         raise _input_error("The model is missing", where=model, expected="a GNM NPZ file", got="no such file")
     name = run or PurePosixPath(out.rstrip("/")).name
     by_key, left_out = _keys(locations)
@@ -78,13 +79,13 @@ def batch_jobs(
         )
         for key, location in by_key.items()
     )
-    inputs = {location.rpartition("/")[0] for location in (*by_key.values(), _absolute(model))}
+    inputs = {location.rpartition("/")[0] for location in (*by_key.values(), model)}
     return Batch(
         run=check_id(name),
         jobs=jobs,
-        roots=(*sorted(inputs), _absolute(out)),
+        roots=(*sorted(inputs), store),
         missing=missing,
-        left_out=left_out,
+        left_out=refused | left_out,
     )
 
 
@@ -138,6 +139,18 @@ def _expand(word: str) -> list[str]:
     return read_list(file, partial(InputError, "The list of captures cannot be read", where=file, fix=fix))
 
 
+def _places(words: Sequence[str]) -> tuple[list[str], dict[str, str]]:
+    """The places that the words name, each once; and word -> why it names none."""
+    places: dict[str, None] = {}
+    refused: dict[str, str] = {}
+    for word in words:
+        try:
+            places[resolve_place(word, "CAPTURE")] = None
+        except InputError as error:
+            refused[redact(word)] = f"expected {error.expected}, got {error.got}"
+    return list(places), refused
+
+
 def _keys(locations: Sequence[str]) -> tuple[dict[str, str], dict[str, str]]:
     """Key -> location, and location -> why it has none.
 
@@ -155,11 +168,7 @@ def _keys(locations: Sequence[str]) -> tuple[dict[str, str], dict[str, str]]:
 
 
 def _may_exist(location: str) -> bool:
-    return is_remote(location) or (local_path(location) / "capture.toml").is_file()
-
-
-def _absolute(location: str) -> str:
-    return location.rstrip("/") if is_remote(location) else str(local_path(location).resolve())
+    return is_remote(location) or Path(location, "capture.toml").is_file()
 
 
 def _input_error(what: str, *, where: object, expected: str, got: object) -> InputError:

@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import TYPE_CHECKING, Any
 
 from registration.errors import InputError
@@ -11,7 +11,8 @@ from registration.progress import Progress
 from workflows.engine.child import function_of
 from workflows.engine.jobs import validate_arguments
 from workflows.engine.reader import JobRow
-from workflows.records.remote import fetch_capture, fetch_folder, fetch_model, is_remote, local_path
+from workflows.ids import is_remote
+from workflows.records.remote import fetch_capture, fetch_folder, fetch_model
 from workflows.steps.job_options import from_job
 from workflows.steps.register import REGISTRATION
 from workflows.steps.table import REGISTER, REGISTER_STORED, STEPS
@@ -43,8 +44,8 @@ def debug(row: JobRow, out: Path, progress: Progress, *, port: int | None = None
         raise _input_error(row.id, expected="a job", got="a flow: see its jobs with `gnmreg status`")
     if out.exists() and any(out.iterdir()):
         raise _input_error(str(out), expected="a new or empty folder", got="one with files in it")
-    validate_arguments(row.spec, STEPS, roots=("/", "s3:/"))  # the operator chose it: any path will do
-    name, arguments = row.spec["step"], row.spec["arguments"]
+    _, arguments = validate_arguments(row.spec, STEPS, roots=("/", "s3:/"))  # the operator chose it: any path will do
+    name = row.spec["step"]
     if name in (REGISTER, REGISTER_STORED):
         return _register(arguments, out, progress, port)
     if port is not None:
@@ -67,7 +68,7 @@ def _register(arguments: Mapping[str, Any], out: Path, progress: Progress, port:
 
     location = str(arguments["capture"])
     if is_remote(location):
-        copy = out / INPUTS / local_path(location).name
+        copy = out / INPUTS / PurePosixPath(location).name
         progress.message(f"downloading {location}")
         fetch_folder(location, copy)
         location = str(copy)

@@ -10,22 +10,36 @@ from pathlib import Path, PurePosixPath
 from typing import Any
 
 import fsspec
+from fsspec.implementations.local import LocalFileSystem
 
 from registration.errors import InputError
 from registration.storage.cache import cache_folder, make_cache_folder
-from workflows.ids import redact
+from workflows.ids import is_remote, redact, resolve_place
 
 MAX_BYTES = 64 * 2**30  # of one capture: more than any has; limits the download of a hostile listing
 
 
-def is_remote(location: str) -> bool:
-    """Return whether a path or URL is outside the file system."""
-    return "://" in location and not location.startswith("file://")
+def filesystem(place: str) -> tuple[Any, str]:
+    """Return the file system of a place, as `resolve_place` returns it, and the place's path in it.
 
+    The place is not parsed again.
 
-def local_path(location: str) -> Path:
-    """Return the path of a location that is not remote."""
-    return Path(location.removeprefix("file://"))
+    Raises:
+        InputError: the library for object storage is not installed.
+    """
+    if not is_remote(place):
+        return LocalFileSystem(), place
+    try:
+        # A listing must show what other machines wrote meanwhile.
+        return fsspec.filesystem("s3", use_listings_cache=False), place.removeprefix("s3://")
+    except (ValueError, ImportError) as error:
+        raise InputError(
+            "Object storage cannot be used",
+            where=place,
+            expected="the optional package s3fs",
+            got=redact(str(error)),
+            fix="pip install 'gnm-registration[s3]'",
+        ) from None
 
 
 @contextmanager
@@ -35,18 +49,19 @@ def fetch_capture(location: str) -> Iterator[Path]:
     Raises:
         InputError: the remote folder is missing, too large, or names files outside itself.
     """
-    if not is_remote(location):
-        yield local_path(location)
+    place = resolve_place(location, "capture")
+    if not is_remote(place):
+        yield Path(place)
         return
     with tempfile.TemporaryDirectory(prefix="gnmreg-capture-") as name:
-        folder = Path(name) / PurePosixPath(location).name
-        fetch_folder(location, folder)
+        folder = Path(name) / PurePosixPath(place).name
+        fetch_folder(place, folder)
         yield folder
 
 
 def fetch_folder(location: str, folder: Path) -> None:
     """Download all files below a URL into a folder. Raises InputError as `fetch_capture`."""
-    fs, root = fsspec.core.url_to_fs(location)
+    fs, root = filesystem(resolve_place(location, "capture"))
     files = fs.find(root, detail=True)
     if not files:
         raise _input_error(location, expected="files below this URL", got="none")
@@ -67,9 +82,10 @@ def fetch_model(location: str) -> Path:
     Raises:
         InputError: there is no such file.
     """
-    if not is_remote(location):
-        return local_path(location)
-    fs, path = fsspec.core.url_to_fs(location)
+    place = resolve_place(location, "model")
+    if not is_remote(place):
+        return Path(place)
+    fs, path = filesystem(place)
     folder, _, name = path.rpartition("/")
     try:
         infos = {p: i for p, i in fs.find(folder, maxdepth=1, detail=True).items() if p == path or _is_scheme(p)}
@@ -79,7 +95,7 @@ def fetch_model(location: str) -> Path:
         raise _input_error(location, expected="a model's NPZ file", got="no such file")
     versions = {p: [str(i.get(k)) for k in ("size", "ETag", "etag", "LastModified", "mtime")] for p, i in infos.items()}
     cache = cache_folder() / "fetched"
-    cached = cache / hashlib.sha256(json.dumps([location, versions], sort_keys=True).encode()).hexdigest()[:32]
+    cached = cache / hashlib.sha256(json.dumps([place, versions], sort_keys=True).encode()).hexdigest()[:32]
     if not cached.is_dir():
         make_cache_folder(cache)
         temporary = Path(tempfile.mkdtemp(prefix=".fetch-", dir=cache))

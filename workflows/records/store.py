@@ -21,12 +21,11 @@ from importlib.metadata import version
 from pathlib import Path, PurePosixPath
 from typing import Any
 
-import fsspec
-
 from registration.errors import InputError
 from registration.storage.files import atomic_write_text
 from registration.storage.records import Record
-from workflows.ids import check_id, redact
+from workflows.ids import check_id, is_remote, redact, resolve_place
+from workflows.records.remote import filesystem
 
 MANIFEST = "artifact.json"
 ATTEMPT = "attempt-"
@@ -84,20 +83,11 @@ class Store:
     """Artifacts below one folder or URL (`s3://bucket/prefix`)."""
 
     def __init__(self, url: str | Path) -> None:
-        """Nothing is read or created yet. Raises InputError for a scheme that is not installed."""
-        self.url = str(url)
-        try:
-            self._fs, root = fsspec.core.url_to_fs(self.url, **_options(self.url))
-        except (ValueError, ImportError) as error:
-            raise InputError(
-                "The store cannot be used",
-                where=redact(self.url),
-                expected="a folder or an s3:// URL",
-                got=redact(str(error)),
-                fix="correct the URL; for s3:// install the extra: pip install 'gnm-registration[s3]'",
-            ) from None
+        """Nothing is read or created yet. Raises InputError for a URL that cannot be used."""
+        self.url = resolve_place(str(url), "store")
+        self._fs, root = filesystem(self.url)
         self._root = root.rstrip("/")
-        self.local = Path(root) if "file" in _protocols(self._fs) else None
+        self.local = None if is_remote(self.url) else Path(root)
 
     def find(self, key: str) -> Artifact | None:
         """Return the published artifact of a key, or None.
@@ -110,7 +100,7 @@ class Store:
             content = self._fs.cat_file(path)
         except FileNotFoundError:
             return None
-        return _checked(content, where=f"{redact(self.url)}/{key}/{MANIFEST}", key=key)
+        return _checked(content, where=f"{self.url}/{key}/{MANIFEST}", key=key)
 
     def produce(self, key: str, *, input_hash: str, make: Callable[[Path], Mapping[str, Any]]) -> Artifact:
         """Return the artifact of a key: the published one if it has this input hash, else a new one.
@@ -263,15 +253,6 @@ class Store:
 
     def _path(self, *parts: str) -> str:
         return "/".join((self._root, *(part for part in parts if part)))
-
-
-def _options(url: str) -> dict[str, Any]:
-    # A listing must show what other machines wrote meanwhile.
-    return {"use_listings_cache": False} if url.startswith("s3://") else {}
-
-
-def _protocols(fs: Any) -> tuple[str, ...]:
-    return (fs.protocol,) if isinstance(fs.protocol, str) else tuple(fs.protocol)
 
 
 def _files(folder: Path) -> list[Path]:

@@ -1,13 +1,16 @@
 """The step that ends a round: the stopping rule, the record of the coregistration and its page."""
 
+import os
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from coregister.stopping_rule import RoundMetrics, apply_stopping_rule
+from registration.errors import InputError
 from registration.progress import Progress
 from registration.storage.records import structure, to_json
+from workflows.ids import check_name
 from workflows.records.coregistration import (
     FIRST_MODEL,
     CoregistrationPlan,
@@ -45,12 +48,29 @@ def end_round(
     """
     where = "arguments of the step"
     record = CoregistrationPlan.read(Path(plan))
+    _check_places(record, Path(plan))
     held_out_result = HoldOutResult.from_json(held_out, where=where)
     products: tuple[RoundProducts, ...] = structure(rounds, tuple[RoundProducts, ...], where=where, title="rounds")
+    for product in products:
+        check_name(product.name, "rounds")
     state = apply_verdict(initial_state(record, held_out_result), products)
     write_record(state)
     verdict: dict[str, Any] = to_json(state.verdict)
     return verdict
+
+
+def _check_places(record: CoregistrationPlan, file: Path) -> None:
+    """Refuse a plan of another folder: the file's place was checked, what it says was not."""
+    if Path(os.path.realpath(record.out)) != Path(os.path.realpath(file)).parent:
+        raise InputError(
+            "The plan is of another coregistration",
+            where=file,
+            expected=f"the plan of {file.parent}",
+            got=record.out,
+            fix="run `gnmreg coregister` again",
+        )
+    for name in (*record.split.training, *record.split.held_out):
+        check_name(name, "plan: split")
 
 
 def apply_verdict(state: CoregistrationState, products: Sequence[RoundProducts]) -> CoregistrationState:

@@ -1,7 +1,9 @@
 """Pages that viser serves on the loopback interface, over one port, to those who know their token."""
 
+import io
 import socket
 import time
+from contextlib import redirect_stdout
 
 import viser
 
@@ -38,7 +40,7 @@ class PageServer:
                     fix="choose another one with --port",
                 ) from error
         self._gate = Gate()
-        with guarded_servers(self._gate):
+        with guarded_servers(self._gate), redirect_stdout(io.StringIO()):  # viser prints a URL without the token
             self._server = viser.ViserServer(host=_HOST, port=port, label=title, verbose=False)
         self.port = self._server.get_port()
         gui, scene = self._server.gui, self._server.scene

@@ -14,10 +14,24 @@ STEPS = {"register": Step(function="m:f", path_arguments=("capture", "out"))}
 
 def test_a_job_within_the_roots_is_accepted(tmp_path: Path) -> None:
     roots = resolve_roots((tmp_path, "s3://bucket/runs"))
-    for location in (str(tmp_path / "a"), f"file://{tmp_path}/a", "s3://bucket/runs/a", str(tmp_path)):
-        arguments = {"capture": location, "seed": 3}
+    (tmp_path / "a").mkdir()
+    (tmp_path / "link").symlink_to(tmp_path / "a")
+    opened = {"s3://bucket/runs/a": "s3://bucket/runs/a", str(tmp_path): str(tmp_path)}
+    for form in ("{}/a", "//{}/a/", "{}/a/../a", "{}/link", "file://{}/a", "file:{}/a", "FILE://localhost{}/%61"):
+        opened[form.format(tmp_path)] = f"{tmp_path}/a"
+    for location, place in opened.items():
+        arguments = {"capture": location, "out": None, "seed": 3}
         step, got = validate_arguments({"step": "register", "arguments": arguments}, STEPS, roots)
-        assert (step.function, got) == ("m:f", arguments)
+        assert (step.function, got) == ("m:f", {**arguments, "capture": place}), location
+
+
+def test_lists_and_objects_of_locations_are_checked_to_the_last(tmp_path: Path) -> None:
+    roots = resolve_roots((tmp_path,))
+    for value in ({"a": [f"{tmp_path}/x", f"{tmp_path}/y/../z"]}, [f"{tmp_path}/x"]):
+        validate_arguments({"step": "register", "arguments": {"capture": value}}, STEPS, roots)
+    for value in ({"a": ["/etc"]}, [[f"{tmp_path}/x", None]], {"a": {"b": 5}}):
+        with pytest.raises(InputError):
+            validate_arguments({"step": "register", "arguments": {"capture": value}}, STEPS, roots)
 
 
 @pytest.mark.parametrize(
@@ -57,6 +71,30 @@ def test_a_malformed_job_is_refused(spec: object, expected: str) -> None:
         7,
         ["/etc/passwd"],
         "{root}/link/x",
+        "file://{root}/link/x",
+        "file:/etc/passwd",
+        "file://localhost/etc/passwd",
+        "file://{root}/%2e%2e%2fother",
+        "file://{root}?/../../etc/passwd",
+        "file://{root}#/../../etc/passwd",
+        "file:///etc/passwd?{root}",
+        "file:{root}/../other",
+        "file://otherhost{root}/x",
+        "file://user:secret@host{root}/x",
+        "FILE:///etc/passwd",
+        "local:///etc/passwd",
+        "simplecache::file:///etc/passwd",
+        "~/x",
+        " file:///etc",
+        "s3://bucket/runs?versionId=1",
+        "s3://bucket/runs#x",
+        "s3://bucket/runs/./../x",
+        "s3://bucket/runs-beside",
+        "s3://key:se/cret@bucket/runs",
+        "s3://bucket\n/runs/x",
+        "s3:///runs",
+        "{root}/\ud800",
+        "file://",
     ],
 )
 def test_a_location_outside_the_roots_is_refused(tmp_path: Path, location: object) -> None:

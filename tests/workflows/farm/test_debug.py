@@ -86,7 +86,7 @@ def test_the_page_is_closed_when_the_registration_is_refused(monkeypatch: pytest
 
     ports: list[int] = []
     monkeypatch.setattr(pipeline, "register", refuse)
-    monkeypatch.setattr(NullProgress, "message", lambda self, text: ports.append(int(text.split(":")[2].split(" ")[0])))
+    monkeypatch.setattr(NullProgress, "message", lambda self, text: ports.append(int(text.split(":")[2].split("/")[0])))
     capture = small.make(tmp_path / "capture")
     with pytest.raises(InputError, match="no"):
         debug(row(capture=str(capture), model=str(synthetic.MODEL)), tmp_path / "out", NullProgress(), port=0)
