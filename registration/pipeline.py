@@ -10,7 +10,7 @@ import numpy as np
 import torch
 
 from registration.evaluate.audit import audit_penetration
-from registration.evaluate.evaluation import RegistrationEvaluation, evaluate_registration
+from registration.evaluate.evaluation import RegistrationEvaluation, evaluate_registration, without_scan
 from registration.evaluate.verdict import judge
 from registration.evaluate.viewpoint import intersection_figures
 from registration.fit.context import FitContext
@@ -298,6 +298,9 @@ def _evaluate(
         progress.message("measuring against the scan")
         evaluation = evaluate_registration(registration, inputs.capture)
         registration = replace(registration, figures={**registration.figures, **evaluation.metrics})
+    elif inputs.capture.scan is None:
+        unmeasured = without_scan(inputs.capture)
+        registration = replace(registration, figures={**registration.figures, "unmeasured": unmeasured})
     verdict = judge(registration.status, registration.figures).figure
     registration = replace(registration, figures={**registration.figures, "verdict": verdict})
     progress.message("writing the report")

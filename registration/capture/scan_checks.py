@@ -16,7 +16,7 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from registration.capture import pixels
-from registration.capture.scan import Scan
+from registration.capture.scan import Scan, read_scan, read_truth
 from registration.capture.triangulation import triangulate
 from registration.errors import InputError
 from registration.frames import MM_PER_M
@@ -87,6 +87,21 @@ def _frames() -> Iterator[_Frame]:
     for frame in turned:
         for unit in _UNITS:
             yield _Frame(unit=unit, axes=frame.axes, signs=frame.signs)
+
+
+def require_frames(capture: Capture) -> None:
+    """Read a capture's scan and its true vertices, and refuse them as `require_frame` does.
+
+    Raises:
+        InputError: a file cannot be read, or is in another unit or frame than the cameras.
+    """
+    if capture.scan is None and capture.ground_truth is None:
+        return
+    landmarks = surface_landmarks(capture)
+    if capture.scan is not None:
+        require_frame("scan", capture.scan, read_scan(capture.scan).vertices, capture, landmarks)
+    if capture.ground_truth is not None and len(truth := read_truth(capture.ground_truth)):
+        require_frame("ground truth", capture.ground_truth, truth.astype(np.float64), capture, landmarks)
 
 
 def require_frame(

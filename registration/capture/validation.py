@@ -6,8 +6,7 @@ import numpy as np
 from jaxtyping import Float
 
 from registration.capture import headers, leftovers, pixels, rig_checks, triangulation
-from registration.capture.scan import read_scan, read_truth
-from registration.capture.scan_checks import require_frame, surface_landmarks
+from registration.capture.scan_checks import require_frames
 from registration.errors import InputError
 from registration.types import Capture, View
 
@@ -42,7 +41,7 @@ def validate_capture(capture: Capture) -> None:
     agree, sized = _check_landmarks(capture)
     boxes = {view.name: _check_pixels(capture, view) for view in capture.views}
     rig_checks.check_mask_rays(capture, boxes, poses=not agree, size=not sized)
-    _check_meshes(capture)  # last: cameras that are wrong would blame them
+    require_frames(capture)  # last: cameras that are wrong would blame them
 
 
 def _check_camera(capture: Capture, view: View) -> None:
@@ -122,16 +121,6 @@ def _check_landmarks(capture: Capture) -> tuple[bool, bool]:
         for name in {name for view in capture.views for name in view.landmarks}:
             rig_checks.check_landmark_size(capture, name, triangulation.triangulate(capture, name)[0])
     return agree, distance is not None
-
-
-def _check_meshes(capture: Capture) -> None:
-    scan = None if capture.scan is None else read_scan(capture.scan)
-    truth = None if capture.ground_truth is None else read_truth(capture.ground_truth)
-    landmarks = surface_landmarks(capture) if scan is not None or truth is not None else np.zeros((0, 3))
-    if scan is not None and capture.scan is not None:
-        require_frame("scan", capture.scan, scan.vertices, capture, landmarks)
-    if truth is not None and capture.ground_truth is not None and len(truth):
-        require_frame("ground truth", capture.ground_truth, truth.astype(np.float64), capture, landmarks)
 
 
 def eye_distance(points: Float[np.ndarray, "L 3"]) -> float | None:

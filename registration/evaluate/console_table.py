@@ -13,7 +13,7 @@ from registration.types import METRIC_TITLES
 
 
 def print_metrics(metrics: Mapping[str, Any], title: str, console: Console | None = None) -> None:
-    """Print the distance statistics, one metric and region per row, in millimetres.
+    """Print the distance statistics, one metric and region per row, in millimetres, and why others are missing.
 
     Args:
         metrics: `RegistrationEvaluation.metrics`, or the `figures` of a manifest; other entries are ignored.
@@ -30,7 +30,10 @@ def print_metrics(metrics: Mapping[str, Any], title: str, console: Console | Non
             values = [row[field] for field in ("mean_mm", "median_mm", "std_mm", "p95_mm")]
             cells = ("-" if value is None else f"{value:.3f}" for value in values)
             table.add_row(metric_title, region, f"{row['points']:,}", *cells)
-    (console or Console()).print(table)
+    console = console or Console()
+    console.print(table)
+    for key, reason in metrics.get("unmeasured", {}).items():
+        console.print(f"{METRIC_TITLES[key]}: not measured: {escape(reason)}", highlight=False, soft_wrap=True)
 
 
 def print_assessment(figures: Mapping[str, Any], console: Console | None = None) -> None:

@@ -13,6 +13,7 @@ from registration.geometry.topology import edges
 
 SAMPLE_COUNT = 100_000
 MAX_NORMAL_ANGLE_DEG = 60.0  # between the normals of a sample and of its closest point
+_FEW_REVERSED = 0.01
 _EPSILON = 1e-9  # barycentric; a point this close to an edge or a vertex lies on it
 
 
@@ -56,7 +57,11 @@ def distances_mm(points: Float[np.ndarray, "P 3"], surface: TriangleSurface) -> 
 
 
 def scan_to_mesh_area_uniform(
-    scan: TriangleSurface, within: Bool[np.ndarray, "V"], mesh: TriangleSurface, seed: int = 0
+    scan: TriangleSurface,
+    within: Bool[np.ndarray, "V"],
+    mesh: TriangleSurface,
+    towards_cameras: Float[np.ndarray, "V 3"] | None = None,
+    seed: int = 0,
 ) -> dict[str, Any]:
     """Measure the distance of 100,000 points of the scan, sampled uniformly by area, to the mesh.
 
@@ -67,6 +72,8 @@ def scan_to_mesh_area_uniform(
         scan: the surface to sample.
         within: scan vertices; triangles with all three corners among them are sampled.
         mesh: the registered surface, in the scan's frame.
+        towards_cameras: a direction from each scan vertex to the side that cameras see. Normals of the scan that point
+            away from it are reversed if they are more than a few: an inside-out scan is measured like any other.
         seed: of the random points.
 
     Returns:
@@ -80,7 +87,10 @@ def scan_to_mesh_area_uniform(
     scan_face, weight = sample_surface(region.vertices, region.triangles, SAMPLE_COUNT, rng)
     samples = barycentric_points(region.vertices, region.triangles, scan_face, weight)
     distance, mesh_face, barycentric = closest_points(samples, mesh.vertices, mesh.triangles)
-    mesh_normal, scan_normal = mesh.normals()[mesh_face], region.normals()[scan_face]
+    scan_normals = region.normals()
+    if towards_cameras is not None:
+        scan_normals = _outward(scan_normals, towards_cameras[region.triangles].sum(1))
+    mesh_normal, scan_normal = mesh.normals()[mesh_face], scan_normals[scan_face]
     length = np.linalg.norm(mesh_normal, axis=1) * np.linalg.norm(scan_normal, axis=1)
     opposed = (mesh_normal * scan_normal).sum(1) < np.cos(np.radians(MAX_NORMAL_ANGLE_DEG)) * length
     boundary = on_boundary(mesh.triangles, mesh_face, barycentric)
@@ -89,6 +99,16 @@ def scan_to_mesh_area_uniform(
         "dropped_normals": float(opposed.mean()),
         "dropped_boundary": float((boundary & ~opposed).mean()),
     }
+
+
+def _outward(normals: Float[np.ndarray, "F 3"], outwards: Float[np.ndarray, "F 3"]) -> Float[np.ndarray, "F 3"]:
+    """Reverse the normals (with the area as length) that point inwards, unless their share of the area is negligible:
+    at grazing angles the direction to the cameras is ambiguous."""
+    inward = (normals * outwards).sum(1) < 0
+    area = np.linalg.norm(normals, axis=1)
+    if area[inward].sum() <= _FEW_REVERSED * area.sum():
+        return normals
+    return np.where(inward[:, None], -normals, normals)
 
 
 def on_boundary(

@@ -73,8 +73,25 @@ def visible_in_two_views(
         cameras: calibrated in the same world.
         tolerance: metres; a surface that is nearer to the camera than the point by less does not occlude it.
     """
-    count = np.zeros(len(points), int)
+    return views_of(points, vertices, triangles, cameras, tolerance)[0] >= 2
+
+
+def views_of(
+    points: Float[np.ndarray, "P 3"],
+    vertices: Float[np.ndarray, "V 3"],
+    triangles: Int[np.ndarray, "F 3"],
+    cameras: Sequence[Camera],
+    tolerance: float = 5e-4,
+) -> tuple[Int[np.ndarray, "P"], Float[np.ndarray, "P 3"]]:
+    """Return how many cameras see each point, and the sum of the unit directions from the point to these cameras.
+
+    Arguments as of `visible_in_two_views`. The direction tells the outer side of a surface, however it is wound.
+    """
+    count, towards = np.zeros(len(points), int), np.zeros((len(points), 3))
     mesh = RayCaster(vertices, triangles)
     for camera in cameras:
-        count += mesh.visible(points, camera, tolerance)
-    return count >= 2
+        seen = np.flatnonzero(mesh.visible(points, camera, tolerance))
+        count[seen] += 1
+        direction = camera.centre - points[seen]
+        towards[seen] += direction / np.linalg.norm(direction, axis=1, keepdims=True)
+    return count, towards

@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from typing import Any, Protocol, runtime_checkable
 
 from registration.evaluate.audit import BEYOND_KEY
-from registration.types import Status
+from registration.types import METRIC_TITLES, Status
 
 # Pair of the penetration audit -> what lies where, and where to look.
 _PAIRS = {
@@ -45,7 +45,8 @@ def headline(registration: Assessed) -> str:
     sentence = f"{opening}: {registration.reason}." if registration.reason else f"{opening}."
     face = registration.figures.get("scan_to_mesh", {}).get("face", {})
     if face.get("mean_mm") is None:
-        return f"{sentence} There is no scan of the face to measure it against."
+        why = registration.figures.get("unmeasured", {}).get("scan_to_mesh", "there is no scan of the face")
+        return f"{sentence} Its distance from a scan is not measured: {why}."
     return (
         f"{sentence} On the face the scan lies {format_mm(face['mean_mm'])} mm from the mesh on average; "
         f"half of its points are within {format_mm(face['median_mm'])} mm and 95 % within "
@@ -62,6 +63,12 @@ def remarks(registration: Assessed) -> list[str]:
         for view, why in figures.get("views_not_trusted", {}).items()
     ]
     lines += [f"{note[:1].upper()}{note[1:]}." for note in figures.get("notes", [])]
+    unmeasured = figures.get("unmeasured", {})
+    lines += [
+        f"{METRIC_TITLES[name]} is not measured: {unmeasured[name]}."
+        for name in ("scan_to_mesh_by_area", "mesh_to_scan")
+        if name in unmeasured
+    ]
     lines += [
         _intersection(pair, row[BEYOND_KEY], row["max_excess_mm"], row.get("view"))
         for pair, row in figures.get("intersections", {}).get("pairs", {}).items()

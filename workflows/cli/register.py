@@ -85,7 +85,7 @@ def evaluate(
 ) -> int:
     """Compare a registration with its capture's scan and ground truth.
 
-    The metrics are printed and stored with the registration.
+    The metrics are printed, and stored with the registration if the capture is the one that was registered.
 
     Args:
         registration: The registration folder.
@@ -93,7 +93,7 @@ def evaluate(
         neutral: The same subject's neutral registration: adds the surface's drift against it.
         neutral_capture: The capture of that neutral registration.
     """
-    from registration.evaluate.evaluation import evaluate_folder
+    from registration.evaluate.folder import evaluate_folder
 
     evaluate_folder(registration, capture, neutral, neutral_capture)
     return 0

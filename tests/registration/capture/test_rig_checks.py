@@ -64,6 +64,7 @@ def with_poses(root: Path, target: Path, edit: Callable[[np.ndarray], np.ndarray
     shutil.rmtree(target / "sparse")
     write_model(target / "sparse", moved, np.zeros((0, 3)))
     (target / "scan.ply").unlink()
+    (target / "ground_truth.npz").unlink()
     return native.read_capture(target)
 
 

@@ -13,8 +13,10 @@ from registration.capture.native import read_capture
 from registration.capture.scan import read_scan, read_truth
 from registration.errors import InputError
 from registration.evaluate.console_table import print_assessment, print_metrics
-from registration.evaluate.evaluation import evaluate_folder, evaluate_registration
+from registration.evaluate.evaluation import evaluate_registration
+from registration.evaluate.folder import evaluate_folder
 from registration.evaluate.residuals import residual_figures
+from registration.storage.hashing import hash_capture
 from registration.storage.mesh import write_ply
 from registration.storage.registration_folder import load_registration, save_registration
 from registration.types import Camera, Capture, Registration, View
@@ -135,8 +137,45 @@ def test_turned_normals_and_the_mesh_boundary_are_excluded_and_counted(tmp_path)
     cut = by_area(half)
     assert 0.4 < cut["dropped_boundary"] < 0.6 and cut["dropped_normals"] == 0
     assert cut["mean_mm"] < 0.01 and cut["points"] == round(100_000 * (1 - cut["dropped_boundary"]))
-    inside_out = by_area(FACES[:, ::-1])
+    inside_out = by_area(FACES[:, ::-1])  # of the registration, which is a defect
     assert inside_out["dropped_normals"] == 1 and inside_out["mean_mm"] is None
+
+
+@pytest.mark.parametrize("share", [1, 2])
+def test_the_winding_of_a_scan_makes_no_difference(tmp_path, share):
+    wound = FACES.copy()
+    wound[::share] = wound[::share, ::-1]
+    expected, turned = (
+        evaluate_registration(a_registration(1.01 * POINTS), a_capture(tmp_path / name, faces=faces)).metrics
+        for name, faces in (("as it is", FACES), ("turned", wound))
+    )
+    assert turned["scan_to_mesh_by_area"]["face"]["dropped_normals"] == 0
+    for kind in ("scan_to_mesh", "scan_to_mesh_by_area", "mesh_to_scan"):
+        assert turned[kind]["face"]["mean_mm"] == pytest.approx(expected[kind]["face"]["mean_mm"], rel=1e-3)
+
+
+def test_a_missing_metric_has_a_reason(tmp_path):
+    far = evaluate_registration(a_registration(), a_capture(tmp_path / "far", scan=POINTS + [0, 0.5, 0])).metrics
+    assert far["scan_to_mesh"]["face"]["mean_mm"] is None
+    assert "no vertex of the scan lies in the face" in far["unmeasured"]["scan_to_mesh"]
+    assert far["unmeasured"].keys() >= {"scan_to_mesh", "scan_to_mesh_by_area", "vertex_error", "drift"}
+    plain = evaluate_registration(a_registration(), a_capture(tmp_path / "plain")).metrics["unmeasured"]
+    assert plain.keys() == {"vertex_error", "drift"} and "no ground_truth.npz" in plain["drift"]
+    short = a_capture(tmp_path / "short", truth=POINTS[:-1])
+    unmeasured = evaluate_registration(a_registration(), short).metrics["unmeasured"]
+    assert f"{len(POINTS) - 1} vertices, the mesh {len(POINTS)}" in unmeasured["vertex_error"]
+    assert "needs the registration and the capture" in unmeasured["drift"]
+    others = [short, dataclasses.replace(short, ground_truth=None), dataclasses.replace(short, scan=None)]
+    for neutral_capture, why in zip(others, ("", "no ground_truth.npz", "no scan"), strict=True):
+        metrics = evaluate_registration(
+            a_registration(), short, neutral=a_registration(), neutral_capture=neutral_capture
+        ).metrics
+        assert ("drift" in metrics) == (why == "") and why in metrics["unmeasured"].get("drift", "")
+    inside = evaluate_registration(a_registration(triangles=FACES[:, ::-1]), a_capture(tmp_path / "in")).metrics
+    assert "100% for their normals" in inside["unmeasured"]["scan_to_mesh_by_area"]
+    console = Console(file=io.StringIO(), width=200)
+    print_metrics(far, "title", console)
+    assert "Scan to mesh: not measured: no vertex of the scan lies in the face" in console.file.getvalue()
 
 
 def test_regions_split_mesh_to_scan(tmp_path):
@@ -151,7 +190,10 @@ def test_regions_split_mesh_to_scan(tmp_path):
 def test_a_point_cloud_has_distances_and_no_surface_metrics(tmp_path):
     evaluation = evaluate_registration(a_registration(POINTS * 1.01), a_capture(tmp_path, faces=np.zeros((0, 3), int)))
     assert evaluation.metrics["scan_to_mesh"]["face"]["mean_mm"] == pytest.approx(1, rel=0.02)
-    assert set(evaluation.metrics) == {"face_ball", "scan_to_mesh"} and np.isnan(evaluation.vertex_distance_mm).all()
+    assert set(evaluation.metrics) == {"face_ball", "scan_to_mesh", "unmeasured"}
+    assert np.isnan(evaluation.vertex_distance_mm).all()
+    for name in ("scan_to_mesh_by_area", "mesh_to_scan"):
+        assert "point cloud" in evaluation.metrics["unmeasured"][name]
     assert 0.2 < evaluation.scan_visible.mean() < 0.6  # the far side is hidden by the registered surface
 
 
@@ -193,7 +235,7 @@ def test_the_table_prints_every_metric(tmp_path):
     text = console.file.getvalue()
     for name in ("Scan to mesh", "Scan to mesh, by area", "Mesh to scan", "Vertex error", "1.000"):
         assert name in text
-    assert "drift" not in text
+    assert "Drift from the neutral: not measured" in text
 
 
 def test_residuals_and_the_verdict_are_printed():
@@ -217,7 +259,9 @@ def truth_registration(capture: Capture) -> Registration:
 @needs_shared
 def test_the_truth_has_no_error_and_metrics_are_stored(tmp_path, capsys):
     root = SHARED / "data/captures/gnm_identity_a/neutral"
-    save_registration(truth_registration(read_capture(root)), tmp_path / "r", report_html="kept")
+    capture = read_capture(root)
+    registration = dataclasses.replace(truth_registration(capture), inputs={"capture": hash_capture(capture)})
+    save_registration(registration, tmp_path / "r", report_html="kept")
     evaluation = evaluate_folder(tmp_path / "r", root)
     stored = load_registration(tmp_path / "r").figures
     assert stored["vertex_error"]["face"]["mean_mm"] == 0 and stored["scan_to_mesh"]["face"]["p95_mm"] < 1e-6

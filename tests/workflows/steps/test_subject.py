@@ -13,7 +13,7 @@ import torch
 
 import workflows.steps.subject
 from registration.errors import InputError
-from registration.evaluate.evaluation import evaluate_folder
+from registration.evaluate.folder import evaluate_folder
 from registration.fit.recipes import RECIPES, Recipe, draft
 from registration.options import RegisterOptions
 from registration.pipeline import register
