@@ -75,6 +75,7 @@ def read_inputs(
     if neutral is not None:
         start = load_registration(neutral)
         _check_topology(start, data, neutral, model_path)
+        _check_subject(start, neutral, capture)
     schemes = read_schemes(model_path, data, options.landmark_files)
     landmarks = _triangulated(selected, schemes)
     _check_head_can_be_found(selected, landmarks)
@@ -205,4 +206,16 @@ def _check_topology(neutral: Registration, data: gnm_npz.GNMData, neutral_path: 
             expected=f"identity, expression, vertices {expected} and the triangles of {model_path}",
             got=f"{sizes}, {'the same' if same else 'other'} triangles",
             fix="register the neutral with this model first",
+        )
+
+
+def _check_subject(neutral: Registration, neutral_path: Path, capture: Capture) -> None:
+    shown = neutral.figures.get("subject", capture.subject)
+    if shown != capture.subject:
+        raise InputError(
+            "The neutral shows another subject",
+            where=neutral_path,
+            expected=f"a registration of {capture.subject}, as in {capture.root / 'capture.toml'}",
+            got=shown,
+            fix="give this subject's neutral, or correct `subject` in capture.toml and register the neutral again",
         )

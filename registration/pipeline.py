@@ -241,6 +241,8 @@ def _collect(inputs: RegistrationInputs, fitted: _Fitted, comparison: Comparison
         seconds=fitted.seconds,
         history=trace.history,
         figures={
+            "subject": inputs.capture.subject,
+            "expression": inputs.capture.expression,
             "motion_mm": trace.motion_mm,
             "landmark_residual_px": landmark_px,
             "camera_gains": problem.appearance.gains.cpu().numpy().round(4).tolist(),

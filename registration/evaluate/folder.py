@@ -71,6 +71,9 @@ def differences(
         neutral_capture: its capture.
     """
     lines = []
+    shown = registration.figures.get("subject", capture.subject)
+    if shown != capture.subject:
+        lines.append(f"the registration shows {shown}, the capture {capture.subject}")
     if not is_capture_of(registration, capture):
         lines.append(
             f"{capture.root} is not the capture that was registered, or it has changed: its cameras, images, "

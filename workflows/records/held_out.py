@@ -15,11 +15,12 @@ from registration.capture.scan import read_scan
 from registration.errors import InputError
 from registration.evaluate.evaluation import CLOUD_TOLERANCE
 from registration.evaluate.face import face_sphere, visible_in_two_views
+from registration.evaluate.folder import is_capture_of
 from registration.stabilize import stabilized_folder as stabilized
 from registration.storage.hashing import hash_arrays, hash_capture
 from registration.storage.npz import NpzSchema
 from registration.storage.registration_folder import load_registration
-from registration.types import Registration
+from registration.types import Capture, Registration
 from workflows.records.dataset import CATEGORY
 from workflows.records.run import STABILIZED
 from workflows.records.subject import MANIFEST, NEUTRAL, is_subject_folder, read_subject
@@ -46,6 +47,7 @@ class HeldOutSet:
     subjects: tuple[HeldOutSubject, ...]
     triangles: Int[np.ndarray, "F 3"]
     inputs: Mapping[str, str]
+    warnings: tuple[str, ...] = ()  # captures that differ from those that were registered
 
 
 def read_held_out(source: Path, captures: Path | None = None) -> HeldOutSet:
@@ -66,22 +68,27 @@ def read_held_out(source: Path, captures: Path | None = None) -> HeldOutSet:
     if not folders:
         raise _input_error("There are no held-out subjects", source, f"folders with {MANIFEST}, or an NPZ file", "none")
     expressions = _stabilized(source / STABILIZED)
-    subjects, topologies, inputs = [], [], {}
+    subjects, topologies, inputs, warnings = [], [], {}, []
     for folder in folders:
         subject, registration, neutral = _from_folder(folder)
         if subject.subject in expressions:
             subject = replace(subject, **expressions[subject.subject])
         if captures is not None:
             capture_folder = Path(captures) / folder.name
-            subject = _with_captures(subject, capture_folder, registration, neutral)
-            inputs[f"capture {subject.subject}"] = hash_capture(read_capture(capture_folder / neutral))
+            capture = read_capture(capture_folder / neutral)
+            if capture.subject != subject.subject:
+                warnings.append(f"{capture.root} shows {capture.subject}, {folder / neutral} {subject.subject}")
+            elif not is_capture_of(registration, capture):
+                warnings.append(f"{capture.root} is not the capture of {folder / neutral}, or it has changed")
+            subject = _with_captures(subject, capture, registration)
+            inputs[f"capture {subject.subject}"] = hash_capture(capture)
         subjects.append(subject)
         topologies.append(registration.triangles)
     if other := [s.subject for s, t in zip(subjects, topologies, strict=True) if not np.array_equal(t, topologies[0])]:
         got = f"another of {other[0]}"
         raise _input_error("The held-out subjects have different topologies", source, "one topology", got)
     inputs["held_out"] = _digest(subjects)
-    return HeldOutSet(subjects=tuple(subjects), triangles=topologies[0], inputs=inputs)
+    return HeldOutSet(subjects=tuple(subjects), triangles=topologies[0], inputs=inputs, warnings=tuple(warnings))
 
 
 def _digest(subjects: Sequence[HeldOutSubject]) -> str:
@@ -156,11 +163,10 @@ def _stabilized(folder: Path) -> dict[str, dict[str, Any]]:
     }
 
 
-def _with_captures(subject: HeldOutSubject, folder: Path, registration: Registration, neutral: str) -> HeldOutSubject:
-    """Add the tags and the scan of the neutral's capture, and the categories that captures have."""
-    capture = read_capture(folder / neutral)
+def _with_captures(subject: HeldOutSubject, capture: Capture, registration: Registration) -> HeldOutSubject:
+    """Add the tags and the scan of the neutral's capture, and the categories that captures beside it have."""
     labels = {}
-    for path in sorted(path.parent for path in folder.glob("*/capture.toml")):
+    for path in sorted(path.parent for path in capture.root.parent.glob("*/capture.toml")):
         other = read_capture(path)
         labels[other.expression] = str(other.tags.get(CATEGORY, other.expression))
     scan: Float[np.ndarray, "P 3"] | None = None

@@ -4,6 +4,9 @@ from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
+from jaxtyping import Float
+
 from registration.capture.native import natural_key
 from registration.errors import InputError
 from registration.model import gnm_npz
@@ -70,6 +73,7 @@ def read_run(folder: Path, data: GNMData, selection: Selection = Selection()) ->
     subjects = tuple(_subject(path, selection.skip_failed) for path in folders)
     inputs = {"model": gnm_npz.content_hash(data)}
     for subject in subjects:
+        identity: np.ndarray | None = None
         for name in (subject.neutral, *(name for name, _ in subject.expressions)):
             key = f"{subject.subject}/{name}"
             if key in inputs:
@@ -80,8 +84,12 @@ def read_run(folder: Path, data: GNMData, selection: Selection = Selection()) ->
                     got=subject.subject,
                     fix="move one of them, or correct `subject` in its capture.toml files",
                 )
-            inputs[key] = read_manifest(subject.folder / name).content_id
-            _check_arrays(subject.folder / name, topology, data)
+            manifest = read_manifest(subject.folder / name)
+            inputs[key] = manifest.content_id
+            own = _check_arrays(subject.folder / name, topology, data)
+            identity = own if identity is None else identity  # the neutral comes first
+            if "neutral" in manifest.inputs:
+                _check_identity(subject.folder / name, own, identity, subject.neutral)
     return StabilizationInputs(subjects=subjects, inputs=inputs, skin=skin)
 
 
@@ -150,10 +158,10 @@ def _subject(folder: Path, skip_failed: bool) -> StabilizationSubject:
     )
 
 
-def _check_arrays(folder: Path, topology: str, data: GNMData) -> None:
-    """Check the arrays other than textures: in milliseconds, before anything is computed."""
+def _check_arrays(folder: Path, topology: str, data: GNMData) -> Float[np.ndarray, "I"]:
+    """Check the arrays other than textures, in milliseconds, before anything is computed. Return the identity."""
     file = folder / "registration.npz"
-    arrays = SCHEMA.read(file, only=("triangles", "vertices", "confidence"))
+    arrays = SCHEMA.read(file, only=("triangles", "vertices", "confidence", "identity"))
     triangles, vertices = arrays["triangles"], arrays["vertices"]
     if gnm_npz.topology_hash(triangles) != topology:
         raise InputError(
@@ -162,6 +170,21 @@ def _check_arrays(folder: Path, topology: str, data: GNMData) -> None:
             expected=f"the model's {len(data.template_vertex_positions)} vertices and {len(data.triangles)} triangles",
             got=f"{len(vertices)} vertices and {len(triangles)} triangles, or another order",
             fix="register all subjects with one model, and give that one with --model",
+        )
+    return arrays["identity"]
+
+
+def _check_identity(
+    folder: Path, identity: Float[np.ndarray, "I"], neutral: Float[np.ndarray, "J"], neutral_name: str
+) -> None:
+    """Refuse an expression that started from another neutral than the subject's: it would have that one's identity."""
+    if identity.shape != neutral.shape or not np.allclose(identity, neutral, atol=1e-3):
+        raise InputError(
+            "An expression was registered from another neutral than its subject's",
+            where=folder,
+            expected=f"the identity of {folder.parent / neutral_name}",
+            got="another identity, perhaps another person's",
+            fix="register the subject again with `gnmreg subject`",
         )
 
 

@@ -12,7 +12,7 @@ from coregister.evaluate.linear_fit import identity_part
 from registration.errors import InputError
 from registration.model import gnm_npz
 from registration.model.gnm_npz import GNMData
-from registration.progress import Progress
+from registration.progress import NullProgress, Progress
 from registration.storage.files import atomic_directory, refuse_foreign
 from registration.storage.hashing import input_hash, to_jsonable, versions
 from registration.storage.records import Record
@@ -70,6 +70,8 @@ def evaluate_models(
     named = model_paths if isinstance(model_paths, Mapping) else _named(model_paths)
     models = {name: gnm_npz.read(path) for name, path in named.items()}
     subjects = read_held_out(held_out, captures)
+    for warning in subjects.warnings:
+        (progress or NullProgress()).message(f"warning: {warning}")
     check(models, subjects.subjects, subjects.triangles, settings)
     inputs = {**{f"model {name}": gnm_npz.content_hash(data) for name, data in models.items()}, **subjects.inputs}
     digest, file = input_hash(inputs, to_jsonable(settings)), Path(out) / MANIFEST

@@ -6,7 +6,7 @@ import pickle
 import shutil
 import zipfile
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +18,7 @@ from registration.model.atlas import texture_atlas
 from registration.model.gnm import GNM
 from registration.options import RegisterOptions
 from registration.pipeline import register
-from registration.storage.registration_folder import save_registration
+from registration.storage.registration_folder import load_registration, save_registration
 from registration.types import Registration
 
 
@@ -308,6 +308,14 @@ def neutral_of_another_basis(request: Request) -> None:
         joint_identity_basis=data.joint_identity_basis[:5],
         identity_names=data.identity_names[:5],
     )
+
+
+@bad("The neutral shows another subject", where="neutral", got="somebody", fix="this subject's neutral")
+def neutral_of_another_subject(request: Request) -> None:
+    data = gnm_npz.read(request.model)
+    folder = write_neutral(request.folder / "neutral", data)
+    save_registration(replace(load_registration(folder), figures={"subject": "somebody"}), folder)
+    request.options["neutral"] = folder
 
 
 def write_neutral(out: Path, data: gnm_npz.GNMData) -> Path:

@@ -226,6 +226,7 @@ def test_captures_add_tags_and_face_points_of_the_scan(run, tmp_path):
     for folder in ("subject_2", "subject_10"):
         small.make(tmp_path / "captures" / folder / "rest")
     held_out = read_held_out(run, tmp_path / "captures")
+    assert len(held_out.warnings) == len(held_out.subjects) and "shows ball" in held_out.warnings[0]
     for subject in held_out.subjects:
         assert subject.tags["age"] == 30
         assert subject.scan is not None and 10 < len(subject.scan)

@@ -2,6 +2,7 @@
 
 import json
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +14,7 @@ from registration.model import gnm_npz
 from registration.stabilize import stabilized_folder as disk
 from registration.stabilize.decisions import Decision
 from registration.stabilize.pipeline import stabilize
+from registration.storage.registration_folder import load_registration, save_registration
 from tests.coregister.conftest import head_assembly, model, model_file, source, wheel  # noqa: F401  fixtures
 from tests.registration.stabilize import runs
 from workflows.cli.app import main
@@ -96,6 +98,22 @@ def test_decisions_of_another_dataset_or_none_are_refused(run, outcome, model_fi
         with pytest.raises(InputError, match="cannot be read"):
             read_decisions(log, outcome.dataset)
     assert [path.name for path in tmp_path.iterdir()] == ["decisions.jsonl"]
+
+
+@pytest.mark.parametrize("own", [True, False])
+def test_an_expression_that_started_from_another_neutral_is_refused(run_copy, model, own):  # noqa: F811
+    folder = run_copy / "synth_0000" / "smile"
+    registration = load_registration(folder)
+    identity = registration.identity if own else registration.identity + 0.5
+    save_registration(
+        replace(registration, identity=identity, inputs={**registration.inputs, "neutral": "0" * 64}), folder
+    )
+    if own:
+        read_run(run_copy, model)
+        return
+    with pytest.raises(InputError) as error:
+        read_run(run_copy, model)
+    assert "another neutral" in error.value.what and error.value.where.endswith("smile")
 
 
 def remove_neutral(run: Path) -> None:
