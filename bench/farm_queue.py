@@ -20,6 +20,7 @@ from bench.support.postgres_server import server
 from workflows.engine.client import QueueClient
 from workflows.engine.database import checked_url, default_url, engine, is_sqlite, sqlite_file
 from workflows.engine.jobs import DRIVER, FlowJob, Job
+from workflows.engine.metrics import queue_metrics
 from workflows.engine.process import migrate
 from workflows.engine.reader import QueueReader, ended
 
@@ -88,7 +89,7 @@ def _start(kind: str, url: str, folder: Path, name: str) -> "subprocess.Popen[by
 
 def _status_seconds(reader: QueueReader) -> float:
     start = time.perf_counter()
-    reader.metrics("bench")
+    queue_metrics(reader, "bench")
     return time.perf_counter() - start
 
 

@@ -5,6 +5,7 @@ import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -15,14 +16,41 @@ from workflows.cli.options import NOT_SET, FarmOptions, JobId, JobOptions, Port,
 
 if TYPE_CHECKING:
     from workflows.engine.client import QueueClient
-    from workflows.engine.reader import JobRow, QueueMetrics
+    from workflows.engine.reader import JobRow
     from workflows.farm.batch_page import BatchPage
 
-CAPTURES_PER_DAY = 10_000  # the throughput that status compares with
 REFRESH_S = 2.0
-MAX_REASONS = MAX_IDS = 20  # that are listed
+MAX_IDS, MAX_JOBS = 20, 100  # that are listed
 QueueName = Literal["gpu", "rebuild"]
+State = Literal["waiting", "running", "interrupted", "done", "failed", "cancelled"]
 _FARM, _RUN, _FIT = FarmOptions(), RunOptions(), JobOptions()
+
+
+@dataclass(frozen=True, kw_only=True)
+class ListOptions:
+    """A list of jobs.
+
+    Attributes:
+        jobs: List jobs instead: id, state, since when, stage and capture. The options below imply it.
+        state: Only jobs in this state. interrupted: its process has ended, and another one will take it.
+        subject: Only jobs of this subject: the name of the folder that holds its captures.
+        text: Only jobs whose id, arguments or failure contain this text.
+        limit: Number of jobs to list; 0: all.
+    """
+
+    jobs: bool = False
+    state: Annotated[State | None, arg(help_behavior_hint=NOT_SET)] = None
+    subject: Annotated[str | None, arg(metavar="NAME", help_behavior_hint=NOT_SET)] = None
+    text: Annotated[str | None, arg(metavar="TEXT", help_behavior_hint=NOT_SET)] = None
+    limit: Annotated[int | None, arg(metavar="N", help_behavior_hint="(default: 100)")] = None
+
+    @property
+    def wanted(self) -> bool:
+        """Whether jobs are to be listed."""
+        return self.jobs or any(value is not None for value in (self.state, self.subject, self.text, self.limit))
+
+
+_LIST = ListOptions()
 
 
 def worker(
@@ -115,9 +143,11 @@ def batch(
     """
     from registration.progress import console_progress
     from workflows.engine.process import migrate
+    from workflows.engine.reader import QueueReader
     from workflows.farm.batch import batch_jobs, made_and_kept, submit_batch
     from workflows.farm.batch_page import BatchPage
     from workflows.farm.local import LocalFarm, local_gpus, run_until_done
+    from workflows.farm.status import status_lines
 
     jobs = batch_jobs(captures, model=model, out=out, run=run, options=fit.register_options())
     folder = farm.farm_folder(out)
@@ -143,7 +173,8 @@ def batch(
             result = run_until_done(machine, jobs.run, progress, page.update)
     finally:
         _say_page(page, live=False)
-    print("\n".join((*_status_lines(_figures(url, jobs.run)), *filter(None, [result.reason]))))
+    lines = status_lines(QueueReader(url), jobs.run, folder / "logs")
+    print("\n".join((*lines, *filter(None, [result.reason]))))
     made, kept = made_and_kept(url, jobs)
     print(f"{made} registered, {kept} kept: their inputs did not change")
     return 0 if not jobs.remarks and result.counts.get("done", 0) == sum(result.counts.values()) else 1
@@ -159,17 +190,25 @@ def status(
     farm: FarmOptions = _FARM,
     run: Annotated[str | None, arg(metavar="RUN", help_behavior_hint="(default: all runs)")] = None,
     watch: bool = False,
+    listed: ListOptions = _LIST,
 ) -> int:
-    """Show queue progress: counts, throughput, failures by reason, active workers.
+    """Show queue progress: counts, throughput, expected end, workers, failures.
 
     Args:
-        farm: Which farm.
+        farm: Which farm; its folder must be that of the workers' logs to show the stages of their jobs.
         run: Only this run, or part of a run such as RUN/it00.
         watch: Refresh every two seconds until Ctrl-C.
+        listed: A list of jobs.
     """
-    url = farm.url
+    from workflows.engine.reader import QueueReader
+    from workflows.farm.status import JobFilter, job_lines, status_lines
+
+    reader, logs = QueueReader(farm.url), farm.directory / "logs"
+    chosen = JobFilter(state=listed.state, subject=listed.subject, text=listed.text)
+    limit = MAX_JOBS if listed.limit is None else listed.limit
     while True:
-        text = "\n".join(_status_lines(_figures(url, run)))
+        lines = job_lines(reader, run, chosen, logs, limit) if listed.wanted else status_lines(reader, run, logs)
+        text = "\n".join(lines)
         print(f"\033[H\033[J{text}" if watch and sys.stdout.isatty() else text, flush=True)
         if not watch:
             return 0
@@ -177,19 +216,25 @@ def status(
 
 
 def logs(job: JobId, /, farm: FarmOptions = _FARM) -> int:
-    """Print a job's state and its output.
+    """Print a job's state and its output; of a run, a round or a subject, its jobs.
 
     Args:
-        job: The job's id, such as RUN/it00/s00007/e003.
+        job: An id as `gnmreg status --jobs` prints it, or its end if that is unique, such as ann/smile.
         farm: Which farm; its folder must be the one of the machine that executed the job, or shared with it.
     """
+    from workflows.engine.reader import QueueReader
+    from workflows.farm.status import find_jobs, group_lines
     from workflows.ids import check_id
 
-    row = _row(farm.url, job)
+    identity, rows = find_jobs(QueueReader(farm.url), job)
+    if rows[0].id != identity or rows[0].kind != "job":
+        print("\n".join(group_lines(identity, rows)))
+        return 0
+    row = rows[0]
     print(f"{row.id}: {row.state}" + (f" on {row.executor}" if row.executor else ""))
     if row.failure:
         print(f"{row.failure['status']}: {row.failure['reason']}")
-    file = farm.directory / "logs" / f"{check_id(job)}.log"
+    file = farm.directory / "logs" / f"{check_id(row.id)}.log"
     print(file.read_text("utf-8", "replace") if file.is_file() else f"no log here: {file}", end="")
     return 0
 
@@ -207,7 +252,8 @@ def debug(
     The queue and its results are not changed.
 
     Args:
-        job: The job's id.
+        job: An id as `gnmreg status --jobs` prints it, or its end if that is unique. Of a run, a round or a subject,
+            its failed job is repeated if there is only one.
         out: A new folder for the results: stages/, registration/, and inputs/ if they had to be downloaded.
         view: Also show the fit in the browser in 3D, with the scan and the cameras, until Ctrl-C.
         port: Port of that page on this machine's loopback interface; from elsewhere: ssh -L PORT:127.0.0.1:PORT HOST.
@@ -216,7 +262,7 @@ def debug(
     from registration.progress import console_progress
     from workflows.farm.debug import debug
 
-    row = _row(farm.url, job)
+    row = _job_to_repeat(farm.url, job)
     if row.failure:
         print(f"in the farm: {row.failure['status']}: {row.failure['reason']}")
     with console_progress() as progress:
@@ -236,6 +282,7 @@ def retry(run: RunName, /, cancelled: bool = False, farm: FarmOptions = _FARM) -
         cancelled: Also requeue cancelled jobs.
         farm: Which farm.
     """
+    _require(farm.url, run)
     with _queue(farm.url) as queue:
         requeued = queue.retry(run, failed=True, cancelled=cancelled)
     print(f"{len(requeued)} requeued" + "".join(f"\n  {identity}" for identity in requeued[:MAX_IDS]))
@@ -249,42 +296,39 @@ def cancel(run: RunName, /, farm: FarmOptions = _FARM) -> int:
         run: The run, or part of a run such as RUN/it00/s00007.
         farm: Which farm.
     """
+    _require(farm.url, run)
     with _queue(farm.url) as queue:
         print(f"{queue.cancel(run)} cancelled")
     return 0
 
 
-def _status_lines(figures: "QueueMetrics") -> list[str]:
-    """What status prints."""
-    total = sum(figures.counts.values())
-    counts = ", ".join(f"{figures.counts[state]} {state}" for state in sorted(figures.counts)) or "none"
-    flows = ", ".join(f"{figures.flows[state]} {state}" for state in sorted(figures.flows)) or "none"
-    lines = [f"jobs: {total} ({counts})", f"flows: {sum(figures.flows.values())} ({flows})"]
-    percent = 100 * figures.a_day / CAPTURES_PER_DAY
-    rate = f"throughput: {figures.a_day:,.0f} jobs a day, {percent:.0f} % of {CAPTURES_PER_DAY:,}"
-    lines.append(f"{rate}; {figures.ended_last_hour} ended in the last hour")
-    lines += [f"{name}: {count} running" for name, count in sorted(figures.workers.items())]
-    if figures.failures:
-        lines.append("failed:")
-        lines += [f"{count:7d}  {reason[:200]}" for reason, count in list(figures.failures.items())[:MAX_REASONS]]
-    return lines
-
-
-def _figures(url: str, run: str | None) -> "QueueMetrics":
+def _require(url: str, run: str) -> None:
+    """Raise InputError, with near names, if there is no such run."""
     from workflows.engine.reader import QueueReader
+    from workflows.farm.status import require_part
 
-    return QueueReader(url).metrics(run)
+    require_part(QueueReader(url), run)
 
 
-def _row(url: str, job: str) -> "JobRow":
-    from workflows.engine.reader import QueueReader
+def _job_to_repeat(url: str, typed: str) -> "JobRow":
+    from workflows.engine.reader import FAILED, QueueReader
+    from workflows.farm.status import find_jobs
 
-    row = QueueReader(url).rows([job]).get(job)
-    if row is None:
-        raise InputError(
-            "There is no such job", where="JOB", expected="an id that the queue knows", got=job, fix="see gnmreg status"
-        )
-    return row
+    identity, rows = find_jobs(QueueReader(url), typed)
+    jobs = [row for row in rows if row.kind == "job"]
+    if jobs and rows[0].id == identity and rows[0].kind == "job":
+        return rows[0]
+    failed = [row for row in jobs if row.state == FAILED]
+    if len(failed) == 1:
+        print(f"the failed job of {identity}: {failed[0].id}")
+        return failed[0]
+    raise InputError(
+        "One job can be repeated, not a group",
+        where="JOB",
+        expected="the id of one job",
+        got=f"{identity}, with {len(jobs)} jobs",
+        fix=f"name one of {', '.join(row.id for row in (failed or jobs)[:10]) or 'another group'}",
+    )
 
 
 @contextmanager

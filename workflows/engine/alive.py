@@ -30,6 +30,12 @@ def ended_processes(url: str, names: Iterable[str]) -> set[str]:
     return {name for name in wanted if lock_key(name) % 2**32 not in held}
 
 
+def lock_names(url: str) -> set[str]:
+    """Return all executor ids that ever had a lock file beside a SQLite queue; none for PostgreSQL."""
+    folder = locks_folder(url) if is_sqlite(url) else None
+    return {path.name for path in folder.iterdir()} if folder is not None and folder.is_dir() else set()
+
+
 def locks_folder(url: str) -> Path:
     """Return the folder of the lock files of a SQLite queue, one for each executor id."""
     database = sqlite_file(url)

@@ -4,7 +4,8 @@ A step may crash its process, hold the interpreter's lock or never end. The proc
 all of that, so it runs no step itself. Whatever happens becomes an outcome, a small dict:
 
     {"status": "done" | "bad input" | "unusable" | "failed" | "timed out" | "died" | "refused", "reason": str,
-     "seconds": float, "result": what the step returned, only if done}
+     "seconds": float, "result": what the step returned, only if done,
+     "what": what is wrong in general, "fix": how to mend it, both only if an `InputError` says so}
 """
 
 import asyncio
@@ -52,7 +53,9 @@ class StepProcess:
         pid: int = self._schedule(os.getpid, (), None).result()
         return pid
 
-    async def run(self, function: str, arguments: Mapping[str, Any], *, log: Path, timeout_s: float) -> StepOutcome:
+    async def run(
+        self, function: str, arguments: Mapping[str, Any], *, log: Path, timeout_s: float, title: str = "attempt"
+    ) -> StepOutcome:
         """Run "module:name" in the child and return its outcome.
 
         Cancelling the awaiting task kills the child, and so does a run longer than `timeout_s`.
@@ -60,11 +63,14 @@ class StepProcess:
         Args:
             function: as in the table of steps.
             arguments: keywords of the function.
-            log: file to which everything that it prints is appended.
+            log: file to which everything that it prints is appended, between two lines that say when and how it began
+                and ended.
             timeout_s: time limit, seconds.
+            title: of these lines.
         """
         started_s = time.monotonic()
         log.parent.mkdir(parents=True, exist_ok=True)
+        _write_line(log, f"{title} begins")
         try:
             future = self._schedule(_call, (function, dict(arguments), str(log)), timeout_s)
             outcome = await asyncio.wrap_future(future)
@@ -76,10 +82,10 @@ class StepProcess:
             outcome = _outcome("died", f"its process could not be started: {error}")
         if self._stopping:
             await asyncio.Event().wait()  # `kill` ended the child: this is no outcome of the job
-        if outcome["status"] in ("timed out", "died"):
-            with log.open("a") as file:
-                print(f"{outcome['status']}: {outcome['reason']}", file=file)
-        return {**outcome, "seconds": round(time.monotonic() - started_s, 3)}
+        seconds = round(time.monotonic() - started_s, 3)
+        reason = f": {outcome['reason']}" if outcome["status"] in ("timed out", "died") else ""  # else it is above
+        _write_line(log, f"{title} ends after {seconds:.1f} s, {outcome['status']}{reason}")
+        return {**outcome, "seconds": seconds}
 
     def kill(self) -> None:
         """Kill the child; calls of `run` that wait for it never return."""
@@ -110,7 +116,7 @@ class JsonlProgress:
 
     def message(self, text: str) -> None:
         self._line({"note": text})
-        print(text, flush=True)
+        print(f"{time.strftime('%H:%M:%S')} {text}", flush=True)
 
     def update(self, done: int, total: int, label: str) -> None:
         now = time.monotonic()
@@ -145,7 +151,7 @@ def _call(dotted: str, arguments: dict[str, Any], log: str) -> StepOutcome:
             return _done(function(**arguments))
         except InputError as error:
             print(error, flush=True)
-            return _outcome("bad input", error.line)
+            return {**_outcome("bad input", error.line), "what": redact(error.what), "fix": redact(error.fix)}
         except PermanentStepError as error:
             print(error, flush=True)
             return _outcome("unusable", str(error))
@@ -153,6 +159,11 @@ def _call(dotted: str, arguments: dict[str, Any], log: str) -> StepOutcome:
             print(redact(traceback.format_exc()), flush=True)
             first, *_ = str(error).splitlines() or [""]
             return _outcome("failed", f"{type(error).__name__}: {first}")
+
+
+def _write_line(log: Path, text: str) -> None:
+    with log.open("a", encoding="utf-8") as file:
+        print(f"--- {time.strftime('%Y-%m-%d %H:%M:%S')} {text}", file=file)
 
 
 def _done(result: Any) -> StepOutcome:

@@ -85,7 +85,7 @@ def serve(process: EngineProcess) -> NoReturn:
     child = StepProcess(modules=process.modules) if process.steps else None
     if child is not None:
         child.warm()
-    _register_workflows(process, url, child)
+    _register_workflows(process, url, child, name)
     refuse_unreadable_rows()
     DBOS(config=_config(url, name))
     DBOS.listen_queues(list(process.queues))
@@ -122,7 +122,7 @@ def _config(url: str, name: str) -> DBOSConfig:
     }
 
 
-def _register_workflows(process: EngineProcess, url: str, child: StepProcess | None) -> None:
+def _register_workflows(process: EngineProcess, url: str, child: StepProcess | None, name: str) -> None:
     """Register the two kinds of workflows: `job` runs one step, `flow` runs a function that submits jobs and waits."""
     roots = resolve_roots(process.roots)
 
@@ -135,7 +135,8 @@ def _register_workflows(process: EngineProcess, url: str, child: StepProcess | N
             return {"status": "refused", "reason": f"{error.where}: expected {error.expected}, got {error.got}"}
         if number > 1:
             log.warning("%s: attempt %d", DBOS.workflow_id, number)
-        return await child.run(step.function, arguments, log=file, timeout_s=step.timeout_s)
+        title = f"attempt {number} of {ATTEMPTS} on {name}"
+        return await child.run(step.function, arguments, log=file, timeout_s=step.timeout_s, title=title)
 
     @DBOS.workflow(name="job", max_recovery_attempts=RECOVERIES)
     async def job(spec: Any, queue: str) -> Any:

@@ -1,17 +1,17 @@
 """Read-only queries of the queue's rows."""
 
 import json
-import time
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from decimal import Decimal
 from typing import Any
 
-from workflows.engine.database import BELOW, Ask, below, checked_url, reading, require_queue, table
+from workflows.engine.alive import ended_processes
+from workflows.engine.database import BELOW, below, checked_url, reading, require_queue, table
 from workflows.ids import check_id
 
-DAY_S = 24 * 3600.0
 WAITING, RUNNING, DONE, FAILED, CANCELLED = "waiting", "running", "done", "failed", "cancelled"
+INTERRUPTED = "interrupted"  # running, says the queue, but its process has ended: another one will take it
 STATES = {
     "ENQUEUED": WAITING,
     "DELAYED": WAITING,
@@ -38,18 +38,30 @@ class JobRow:
     failure: dict[str, Any] | None  # {"status", "reason", ...}
     created: float  # seconds since 1970
     ended: float | None
+    started: float | None = None  # when a worker last took it
+    queue: str | None = None
+    version: str | None = None  # of the flows' structure; workers take jobs of their own only
+
+    @property
+    def since(self) -> float:
+        """When its state began, seconds since 1970."""
+        return self.ended or (self.started if self.state in (RUNNING, INTERRUPTED) else None) or self.created
 
 
-@dataclass(frozen=True, kw_only=True)
-class QueueMetrics:
-    """Counts of a run, or of the whole queue; of jobs unless stated otherwise."""
+@dataclass(frozen=True, slots=True)
+class JobTimes:
+    """What the figures of a queue need of a job or flow: little, as there may be many."""
 
-    counts: dict[str, int]  # state -> jobs
-    flows: dict[str, int]  # state -> flows
-    ended_last_hour: int
-    a_day: float  # jobs per day at the rate since the oldest of the last 1,000 done
-    failures: dict[str, int]  # "status: reason" -> jobs
-    workers: dict[str, int]  # executor id -> running jobs
+    id: str
+    kind: str
+    state: str
+    executor: str | None
+    ended: float | None
+    started: float | None
+    version: str | None
+    captures: bool  # whether it registers a capture
+    made: bool  # whether it computed something, or found the result of the same inputs
+    failure: dict[str, Any] | None
 
 
 class QueueReader:
@@ -96,62 +108,43 @@ class QueueReader:
         among = BELOW.replace("workflow_uuid", "w.workflow_uuid")
         return [_row(row) for row in self._rows(self._select(f"w.name = 'job' AND {among}"), below(check_id(run)))]
 
-    def metrics(self, run: str | None = None) -> QueueMetrics:
-        """Return everything that `gnmreg status` shows, of a run or of the whole queue."""
-        among = f"{BELOW} AND " if run else ""
-        parameters = below(check_id(run)) if run else {}
-        now_ms = time.time() * 1000
-        with reading(self.url) as ask:
-            jobs = ask(
-                f"SELECT name, status, count(*) FROM {self._status} WHERE {among}1 = 1 GROUP BY name, status",
-                parameters,
-            )
-            hour = ask(
-                f"SELECT count(*) FROM {self._status} WHERE {among}name = 'job' AND completed_at > :since",
-                {**parameters, "since": int(now_ms - 3600 * 1000)},
-            )
-            last = ask(
-                "SELECT count(*), min(completed_at) FROM ("
-                f"SELECT completed_at FROM {self._status} WHERE {among}name = 'job' AND status = 'SUCCESS' "
-                "AND completed_at IS NOT NULL ORDER BY completed_at DESC LIMIT 1000) AS last",
-                parameters,
-            )
-            workers = ask(
-                f"SELECT executor_id, count(*) FROM {self._status} WHERE {among}status = 'PENDING' AND name = 'job' "
-                "GROUP BY executor_id",
-                parameters,
-            )
-            failures = self._failures(ask, among, parameters)
-        done, since = last[0][0], _number(last[0][1])
-        return QueueMetrics(
-            counts=_by_state([row[1:] for row in jobs if row[0] == "job"]),
-            flows=_by_state([row[1:] for row in jobs if row[0] == "flow"]),
-            ended_last_hour=int(hour[0][0]),
-            a_day=done * DAY_S * 1000 / max(now_ms - since, 1000.0) if done else 0.0,
-            failures=failures,
-            workers={str(name): int(count) for name, count in workers},
-        )
+    def listing(self, run: str | None = None) -> list[JobRow]:
+        """Return the jobs and flows of a run, or of the whole queue; interrupted ones have that state."""
+        where, parameters = _among(run)
+        rows = [_row(row) for row in self._rows(self._select(where), parameters)]
+        ended = ended_processes(self.url, {row.executor for row in rows if row.state == RUNNING and row.executor})
+        return [
+            replace(row, state=INTERRUPTED) if row.state == RUNNING and row.executor in ended else row for row in rows
+        ]
 
-    def _failures(self, ask: Ask, among: str, parameters: dict[str, Any]) -> dict[str, int]:
-        among = among.replace("workflow_uuid", "w.workflow_uuid")
-        rows = ask(
-            f"SELECT coalesce(o.error, w.error), count(*) FROM {self._status} w "
-            f"LEFT JOIN {self._output} o ON o.workflow_uuid = w.workflow_uuid "
-            f"WHERE {among}w.name = 'job' AND w.status IN {_FAILED} "
-            "GROUP BY coalesce(o.error, w.error)",
-            parameters,
+    def times(self, run: str | None = None) -> list[JobTimes]:
+        """Return what `listing` does, in short."""
+        where, parameters = _among(run)
+        rows = self._rows(
+            "SELECT w.workflow_uuid, w.name, w.status, w.executor_id, w.completed_at, w.started_at_epoch_ms, "
+            "w.application_version, "
+            "CASE WHEN coalesce(i.inputs, w.inputs) LIKE :capture THEN 1 ELSE 0 END, "
+            "CASE WHEN coalesce(o.output, w.output) LIKE :kept THEN 0 ELSE 1 END, "
+            f"CASE WHEN w.status IN {_FAILED} THEN coalesce(o.error, w.error) END "
+            f"FROM {self._status} w LEFT JOIN {self._output} o ON o.workflow_uuid = w.workflow_uuid "
+            f"LEFT JOIN {self._input} i ON i.workflow_uuid = w.workflow_uuid WHERE {where}",
+            {**parameters, "capture": '%"capture": "%', "kept": '%"made": false%'},
         )
-        total: dict[str, int] = {}
-        for error, count in rows:
-            record = _failure(error, DEAD)
-            text = f"{record['status']}: {record['reason']}"
-            total[text] = total.get(text, 0) + int(count)
-        return dict(sorted(total.items(), key=lambda item: -item[1]))
+        ended = ended_processes(self.url, {row[3] for row in rows if STATES.get(row[2]) == RUNNING and row[3]})
+        return [_times(row, ended) for row in rows]
+
+    def ids(self, run: str | None = None) -> list[str]:
+        """Return the ids of a run, or of the whole queue."""
+        where, parameters = _among(run)
+        return [
+            str(row[0]) for row in self._rows(f"SELECT workflow_uuid FROM {self._status} w WHERE {where}", parameters)
+        ]
 
     def _select(self, where: str) -> str:
         return (
             "SELECT w.workflow_uuid, w.name, w.status, w.executor_id, coalesce(i.inputs, w.inputs), "
-            "coalesce(o.output, w.output), coalesce(o.error, w.error), w.created_at, w.completed_at "
+            "coalesce(o.output, w.output), coalesce(o.error, w.error), w.created_at, w.completed_at, "
+            "w.started_at_epoch_ms, w.queue_name, w.application_version "
             f"FROM {self._status} w LEFT JOIN {self._output} o ON o.workflow_uuid = w.workflow_uuid "
             f"LEFT JOIN {self._input} i ON i.workflow_uuid = w.workflow_uuid WHERE {where}"
         )
@@ -166,6 +159,13 @@ def ended(counts: dict[str, int]) -> int:
     return sum(counts.get(state, 0) for state in (DONE, FAILED, CANCELLED))
 
 
+def _among(run: str | None) -> tuple[str, dict[str, str]]:
+    """The condition for the rows `w` of a run, or of the whole queue, and its parameters."""
+    if run is None:
+        return "1 = 1", {}
+    return BELOW.replace("workflow_uuid", "w.workflow_uuid"), below(check_id(run))
+
+
 def _by_state(rows: Sequence[Any]) -> dict[str, int]:
     counts: dict[str, int] = {}
     for status, count in rows:
@@ -175,7 +175,7 @@ def _by_state(rows: Sequence[Any]) -> dict[str, int]:
 
 
 def _row(row: Any) -> JobRow:
-    identity, kind, status, executor, inputs, output, error, created, ended_ms = row
+    identity, kind, status, executor, inputs, output, error, created, ended_ms, started, queue, version = row
     state = STATES.get(status, status)
     dead = DEAD if status == "MAX_RECOVERY_ATTEMPTS_EXCEEDED" else ""
     return JobRow(
@@ -188,6 +188,27 @@ def _row(row: Any) -> JobRow:
         failure=_failure(error, dead) if state == FAILED else None,
         created=_number(created) / 1000,
         ended=_number(ended_ms) / 1000 if ended_ms else None,
+        started=_number(started) / 1000 if started else None,
+        queue=queue,
+        version=version,
+    )
+
+
+def _times(row: Any, ended_processes: set[str]) -> JobTimes:
+    identity, kind, status, executor, ended_ms, started, version, captures, made, error = row
+    state = STATES.get(status, status)
+    dead = DEAD if status == "MAX_RECOVERY_ATTEMPTS_EXCEEDED" else ""
+    return JobTimes(
+        id=str(identity),
+        kind=kind,
+        state=INTERRUPTED if state == RUNNING and executor in ended_processes else state,
+        executor=executor,
+        ended=_number(ended_ms) / 1000 if ended_ms else None,
+        started=_number(started) / 1000 if started else None,
+        version=version,
+        captures=bool(captures),
+        made=bool(made),
+        failure=_failure(error, dead) if state == FAILED else None,
     )
 
 

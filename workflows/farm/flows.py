@@ -20,12 +20,15 @@ from workflows.engine.jobs import (
     FlowJob,
     Job,
 )
+from workflows.ids import id_part
 from workflows.records.coregistration import FIRST_MODEL, CoregistrationPlan, RoundProducts, model_name
 from workflows.records.step_results import BuildResult, EvaluateResult, HoldOutResult, StabilizeResult
 from workflows.steps import table
 
 if TYPE_CHECKING:
     from workflows.engine.scope import FlowScope
+
+NAME_LENGTH = 60  # of subjects' and captures' names in ids, which begin with their numbers
 
 
 async def batch(scope: "FlowScope") -> dict[str, int]:
@@ -60,8 +63,10 @@ async def subject(
     neutral, *others = captures
     shared = {"model": model, "options": dict(options)}
 
+    neutral_id = "neutral" if neutral == "neutral" else f"neutral-{id_part(neutral, NAME_LENGTH)}"
+
     def job(number: int, name: str) -> Job:
-        kind = "neutral" if number == 0 else f"e{number:03d}"
+        kind = f"e{number:03d}-{id_part(name, NAME_LENGTH)}" if number else neutral_id
         arguments = {"capture": f"{subject_dir}/{name}", "out": f"{out}/{name}", **shared}
         arguments |= {"neutral": f"{out}/{neutral}"} if number else {"subject_dir": subject_dir}
         priority = NEUTRAL_PRIORITY if number == 0 else EXPRESSION_PRIORITY
@@ -186,7 +191,7 @@ async def _register(
     options = to_json(plan.options)
     flows = [
         FlowJob(
-            id=f"{scope.id}/{part}/s{number:05d}",
+            id=f"{scope.id}/{part}/s{number:05d}-{id_part(name, NAME_LENGTH)}",
             flow="subject",
             arguments={
                 "subject_dir": f"{plan.dataset}/{name}",

@@ -1,5 +1,6 @@
 import asyncio
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -31,8 +32,31 @@ def test_the_output_of_a_step_is_written_to_its_log(process: StepProcess, tmp_pa
     log = tmp_path / "a" / "job.log"
     outcome = run(process, "talk", log, text="from a note")
     assert (outcome["status"], outcome["result"]) == ("done", "from a note")
-    assert set(log.read_text().split("\n")) >= {"from a note", "from Python", "from C"}
+    text = log.read_text()
+    assert set(text.split("\n")) >= {"from Python", "from C"} and re.search(r"^\d\d:\d\d:\d\d from a note$", text, re.M)
     assert '"done": 1' in log.with_suffix(".jsonl").read_text()
+
+
+def test_the_log_says_when_each_attempt_began_and_how_it_ended(process: StepProcess, tmp_path: Path) -> None:
+    log = tmp_path / "job.log"
+    for title, step in (
+        ("attempt 1 of 3 on w0", "fail"),
+        ("attempt 2 of 3 on w1", "crash"),
+        ("attempt 3 of 3", "talk"),
+    ):
+        arguments = {"text": "hello"} if step == "talk" else {}
+        asyncio.run(process.run(f"{STEPS}:{step}", arguments, log=log, timeout_s=60.0, title=title))
+    lines = [line.split(" ", 3) for line in log.read_text().splitlines() if line.startswith("--- ")]
+    assert all(re.fullmatch(r"\d{4}-\d\d-\d\d \d\d:\d\d:\d\d", f"{day} {clock}") for _, day, clock, _ in lines)
+    said = [re.sub(r"[\d.]+ s,", "T,", text) for _, _, _, text in lines]
+    assert said == [
+        "attempt 1 of 3 on w0 begins",
+        "attempt 1 of 3 on w0 ends after T, failed",
+        "attempt 2 of 3 on w1 begins",
+        "attempt 2 of 3 on w1 ends after T, died: its process was killed by SIGSEGV",
+        "attempt 3 of 3 begins",
+        "attempt 3 of 3 ends after T, done",
+    ]
 
 
 def test_one_warm_process_serves_all_steps(process: StepProcess, tmp_path: Path) -> None:

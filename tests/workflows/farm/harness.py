@@ -13,6 +13,7 @@ from typing import Any
 
 from tests.conftest import ROOT
 from workflows.engine.client import QueueClient
+from workflows.engine.metrics import queue_metrics
 from workflows.engine.process import migrate
 from workflows.engine.reader import QueueReader
 
@@ -89,7 +90,7 @@ class Farm:
         while not condition():
             if time.monotonic() - start > within_s:
                 outputs = "\n".join(f"--- {n}\n{self.output(n)[-3000:]}" for n in self.processes)
-                raise AssertionError(f"waited {within_s} s for {what}\n{self.reader.metrics()}\n{outputs}")
+                raise AssertionError(f"waited {within_s} s for {what}\n{queue_metrics(self.reader)}\n{outputs}")
             time.sleep(0.05)
         return time.monotonic() - start
 

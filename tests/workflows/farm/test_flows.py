@@ -39,7 +39,7 @@ def test_a_subject_registers_its_neutral_then_expressions_then_collects() -> Non
     result, log = run_subject(lambda job: {})
     assert result == {"usable": 3, "failed": 0}
     assert [(j.step, j.priority) for j in log] == [("register", 5), ("register", 10), ("register", 10), ("collect", 3)]
-    assert [j.id for j in log[:3]] == ["r/s1/neutral", "r/s1/e001", "r/s1/e002"]
+    assert [j.id for j in log[:3]] == ["r/s1/neutral-rest", "r/s1/e001-smile", "r/s1/e002-jaw"]
     assert [j.arguments.get("neutral") for j in log[:3]] == [None, "/o/ann/rest", "/o/ann/rest"]
     assert log[1].arguments["capture"] == "/c/ann/smile" and log[1].arguments["out"] == "/o/ann/smile"
     assert log[3].arguments["leave"] == {}
@@ -48,7 +48,7 @@ def test_a_subject_registers_its_neutral_then_expressions_then_collects() -> Non
 
 def test_a_failed_expression_does_not_stop_the_others() -> None:
     def step(job: Job) -> dict[str, Any]:
-        if job.id.endswith("e001"):
+        if "/e001-" in job.id:
             raise failed("broken")
         return {}
 
@@ -59,7 +59,7 @@ def test_a_failed_expression_does_not_stop_the_others() -> None:
 
 def test_without_a_neutral_nothing_else_is_registered() -> None:
     def step(job: Job) -> dict[str, Any]:
-        if job.id.endswith("neutral"):
+        if "/neutral-" in job.id:
             raise failed("broken")
         return {}
 
@@ -135,11 +135,11 @@ def test_each_round_uses_the_previous_model_until_the_verdict_stops(plan: Path) 
 
 def test_too_many_failures_park_the_run_before_a_model_is_built(plan: Path) -> None:
     with pytest.raises(JobFailed, match="parked: it00: 2 of 8 captures failed"):
-        run_loop(plan, Rounds([True], broken=("it00/s00001/neutral",)))
+        run_loop(plan, Rounds([True], broken=("it00/s00001-p1/neutral",)))
 
 
 def test_few_failures_do_not_park_the_run(plan: Path) -> None:
-    result, _ = run_loop(plan, Rounds([False], broken=("it00/s00001/e001",)))
+    result, _ = run_loop(plan, Rounds([False], broken=("it00/s00001-p1/e001",)))
     assert result["rounds"] == 1
 
 
@@ -150,6 +150,6 @@ def test_a_failed_step_parks_the_run_and_is_named(plan: Path) -> None:
 
 def test_different_arguments_give_a_different_job_id(plan: Path) -> None:
     _, first = run_loop(plan, Rounds([False]))
-    _, second = run_loop(plan, Rounds([False], broken=("it00/s00001/e001",)))
+    _, second = run_loop(plan, Rounds([False], broken=("it00/s00001-p1/e001",)))
     ids = [{job.id for job in log if "/collect" in job.id} for log in (first, second)]
     assert len(ids[0] - ids[1]) == 1 and len(ids[0] & ids[1]) == 4
