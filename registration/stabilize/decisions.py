@@ -157,11 +157,16 @@ def compute_corrections(
             right_side += (coefficients - label_effects(coefficients, labels)) @ part.twists[subtracted] @ region_gram
         for k in range(len(part.energy)):
             if actions[part.region, k] == "drop":
-                field = np.zeros_like(head.points)
-                field[part.rows] = part.modes[k] * _border_fade(part, head)[:, None]
-                dropped.append((part.coefficients[:, k], field))
+                dropped.append((part.coefficients[:, k], dropped_displacement(part, k, head)))
     twists = np.linalg.lstsq(gram, right_side.T, rcond=None)[0].T if gram.any() else right_side
     return Corrections(twists=twists, dropped=tuple(dropped))
+
+
+def dropped_displacement(part: RegionalComponents, component: int, head: HeadGeometry) -> Float[np.ndarray, "V 3"]:
+    """Return what dropping a component removes from every vertex, metres per unit coefficient."""
+    field = np.zeros_like(head.points)
+    field[part.rows] = part.modes[component] * _border_fade(part, head)[:, None]
+    return field
 
 
 def correction_effect(corrections: Corrections, head: HeadGeometry) -> CorrectionEffect:

@@ -9,15 +9,27 @@ from jaxtyping import Float
 from registration.report.templates import environment
 from registration.stabilize.components import HeadGeometry, RegionalComponents
 from registration.stabilize.decisions import CorrectionEffect
+from registration.stabilize.edge_stretch import EdgeStretch
 from registration.stabilize.stabilized_folder import StoredComponents
+from workflows.web.review_state import WorkItem
 
 _BINS, _MAX_SIGMAS = 24, 3.0  # of a histogram: bars, and its range to either side
 _MAX_LABELS = 24
 _TOP = 10
 
 
-def about(part: RegionalComponents, k: int, action: str, head: HeadGeometry) -> str:
-    """Scores of a component, and its rigid part in degrees and mm."""
+def work_list(items: Sequence[WorkItem], here: tuple[str, int]) -> str:
+    """What has been reviewed, and the components with their decisions; `here` is displayed."""
+    flagged = [item for item in items if item.flagged]
+    counts = (
+        f"reviewed {sum(item.decided for item in items)} of {len(items)}",
+        f"flagged: {sum(item.decided for item in flagged)} of {len(flagged)}",
+    )
+    return _panel("work_list", items=items, counts=counts, here=here)
+
+
+def about(part: RegionalComponents, k: int, action: str, head: HeadGeometry, stretch: EdgeStretch) -> str:
+    """Scores of a component, its rigid part in degrees and mm, and what dropping it would do to the mesh."""
     turn = np.degrees(np.linalg.norm(part.twists[k, :3]))
     moves = part.rigid_rms_mm(head)[k]
     rows = (
@@ -28,8 +40,11 @@ def about(part: RegionalComponents, k: int, action: str, head: HeadGeometry) -> 
         ("label independence", f"{part.label_independence[k]:.2f}"),
         ("motion shared by nose and neck", f"{part.shared_motion[k]:.2f}"),
         ("rigid motion, one σ", f"{turn:.2f}° \N{NO-BREAK SPACE} {moves:.2f} mm"),
+        ("edge stretch if dropped", f"{stretch.ratio:.2f} times, {stretch.longer_mm:.1f} mm longer"),
+        ("edges torn if dropped", f"{len(stretch.torn)}"),
     )
-    return _panel("about", rows=rows, flagged=bool(part.flagged[k]), action=action)
+    tears = action == "drop" and stretch.tears
+    return _panel("about", rows=rows, flagged=bool(part.flagged[k]), action=action, tears=tears)
 
 
 def colour_bar(limit_mm: float, title: str) -> str:
@@ -37,15 +52,15 @@ def colour_bar(limit_mm: float, title: str) -> str:
     return _panel("colour_bar", limit_mm=limit_mm, title=title)
 
 
-def error(effect: CorrectionEffect, undecided: int) -> str:
+def error(effect: CorrectionEffect, unsaved: int, tearing: Sequence[WorkItem]) -> str:
     """How the rebuilt set differs from the one that it was built from, with the current decisions."""
     rows = (
         ("difference after reconstruction, rms", f"{effect.rms_mm:.3f} mm"),
         ("largest difference of a sample", f"{effect.max_mm:.2f} mm"),
         ("rotation of heads, rms", f"{effect.rotation_deg:.3f}°"),
-        ("decisions not saved", f"{undecided}"),
+        ("decisions not saved", f"{unsaved}"),
     )
-    return _panel("error", rows=rows)
+    return _panel("error", rows=rows, tearing=tearing)
 
 
 def histogram(coefficients: Float[np.ndarray, "S"], labels: Sequence[str]) -> str:

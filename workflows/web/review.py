@@ -2,9 +2,10 @@
 
 import threading
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
+from jaxtyping import Float
 
 from registration.errors import InputError
 from registration.model import gnm_npz, regions
@@ -23,6 +24,7 @@ from workflows.web.review_state import ReviewState
 from workflows.web.server import PageServer
 
 _OFFSET_M = 0.15  # of each head from the centre
+_TORN = (220, 20, 40)  # colour of torn edges
 
 
 def review(
@@ -76,9 +78,10 @@ class ReviewPage(PageServer):
         number[self._vertices] = np.arange(len(self._vertices))
         faces = number[data.triangles]
         self._faces = faces[(faces >= 0).all(1)]
+        self._torn: Any = None  # what shows the torn edges
+        self._moving = False
         super().__init__(port, "Stabilization")
         self._build()
-        self._show()
 
     @property
     def _part(self) -> RegionalComponents:
@@ -100,6 +103,8 @@ class ReviewPage(PageServer):
         gui.add_markdown(f"### Head motion in expressions\n{samples} expressions of {subjects} subjects")
         names = tuple(region.replace("_", " ") for region in self._parts)
         # viser's setters have types of their own that type checkers take for read-only properties.
+        self._work = gui.add_html("")
+        turn = gui.add_button_group("Undecided", ("previous undecided", "next undecided"))
         self._region: Any = gui.add_dropdown("Region", names)
         self._number: Any = gui.add_slider("Component", min=1, max=2, step=1, initial_value=1)
         steps = gui.add_button_group("Step", ("previous", "next"))
@@ -112,18 +117,44 @@ class ReviewPage(PageServer):
         self._bar, self._histogram, self._strongest = (gui.add_html("") for _ in range(3))
         for text, x in (("before", -_OFFSET_M), ("after", _OFFSET_M)):
             server.scene.add_label(f"/{text} label", text, position=(x, -0.185, 0.0))
-        self._region.on_update(lambda _: self._select(1))
-        self._number.on_update(lambda _: self._show())
+        self._region.on_update(lambda _: self._on_control(1))
+        self._number.on_update(lambda _: self._on_control(self._component + 1))
         steps.on_click(lambda _: self._select(self._component + 1 + (1 if steps.value == "next" else -1)))
+        turn.on_click(lambda _: self._turn(1 if turn.value == "next undecided" else -1))
         self._action.on_click(lambda _: self._decide())
         undo.on_click(lambda _: self._undo())
         save.on_click(lambda _: self._save())
-        self._select(1)
+        first = self.review.work_list()[0]
+        self._go_to(first.region, first.component)
 
     def _select(self, number: int) -> None:
-        count = len(self._part.energy)
-        self._number.max = max(count, 2)
-        self._number.value = int(np.clip(number, 1, count))
+        """Show the component of this number, from 1, or the nearest one that the region has."""
+        self._go_to(self._part.region, number - 1)
+
+    def _on_control(self, number: int) -> None:
+        """Show the component of this number when an operator changed a control, not this page."""
+        if not self._moving:
+            self._select(number)
+
+    def _turn(self, step: Literal[-1, 1]) -> None:
+        """Show the next or previous undecided component."""
+        with self._lock:
+            item = self.review.undecided(self._part.region, self._component, step)
+        if item is None:
+            self._message.content = "All others are decided."
+            return
+        self._go_to(item.region, item.component)
+
+    def _go_to(self, region: str, component: int) -> None:
+        """Show a component of a region."""
+        count = len(self._parts[region].energy)
+        self._moving = True  # a change of the controls must not show what is between
+        try:
+            self._region.value = region.replace("_", " ")
+            self._number.max = max(count, 2)
+            self._number.value = int(np.clip(component + 1, 1, count))
+        finally:
+            self._moving = False
         self._show()
 
     def _decide(self) -> None:
@@ -138,15 +169,16 @@ class ReviewPage(PageServer):
         if last is None:
             self._message.content = "There is no unsaved decision to undo."
             return
-        self._region.value = last.region.replace("_", " ")
-        self._select(last.component + 1)
+        self._go_to(last.region, last.component)
         self._message.content = "Undone."
 
     def _save(self) -> None:
         with self._lock:
             try:
                 count = self.review.save()
-                self._message.content = f"{count} decisions saved in `{self.review.log}`."
+                tearing = len(self.review.tearing)
+                warning = f" **{tearing} of all decisions tear the mesh.**" if tearing else ""
+                self._message.content = f"{count} decisions saved in `{self.review.log}`.{warning}"
             except (InputError, OSError) as error:
                 self._message.content = f"Not saved: {error}"
         self._show()
@@ -156,8 +188,10 @@ class ReviewPage(PageServer):
         with self._lock:
             part, k = self._part, min(self._component, len(self._part.energy) - 1)
             review = self.review
-            self._about.content = panels.about(part, k, review.action(part.region, k), review.head)
-            self._error.content = panels.error(review.effect, review.unsaved)
+            action, stretch = review.action(part.region, k), review.stretch(part.region, k)
+            self._work.content = panels.work_list(review.work_list(), (part.region, k))
+            self._about.content = panels.about(part, k, action, review.head, stretch)
+            self._error.content = panels.error(review.effect, review.unsaved, review.tearing)
             self._histogram.content = panels.histogram(part.coefficients[:, k], review.stored.labels)
             self._strongest.content = panels.strongest(part, k, review.stored)
             before, after = (motion[self._vertices] for motion in review.motions(part.region, k))
@@ -169,3 +203,15 @@ class ReviewPage(PageServer):
                 colours = scale_colours(1e3 * AMPLITUDE_SIGMAS * np.linalg.norm(motion, axis=1) / limit)
                 glb = animated_glb(points, motion, self._faces, colours)
                 self._server.scene.add_glb(f"/{name}", glb, position=(x, 0.0, 0.0))
+            torn = stretch.torn if action == "drop" else stretch.torn[:0]
+            self._show_torn(review.head.points[torn])
+
+    def _show_torn(self, lines: Float[np.ndarray, "N 2 3"]) -> None:
+        """Draw the torn edges on the head after the decisions, at rest."""
+        if self._torn is not None:
+            self._torn.remove()
+            self._torn = None
+        if len(lines):
+            position = (_OFFSET_M, 0.0, 0.0)
+            lines = lines.astype(np.float32)
+            self._torn = self._server.scene.add_line_segments("/torn", lines, _TORN, thickness=6e-4, position=position)

@@ -1,7 +1,10 @@
 """The state of a review: decisions that are made, undone and saved; independent of the browser."""
 
 from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 from jaxtyping import Float
@@ -17,8 +20,24 @@ from registration.stabilize.decisions import (
     correction_effect,
     decided_actions,
 )
+from registration.stabilize.edge_stretch import EdgeStretch, drop_stretch, skin_edges
 from registration.stabilize.stabilized_folder import StoredComponents
 from workflows.records.decisions import append_decisions
+
+
+@dataclass(frozen=True, kw_only=True)
+class WorkItem:
+    """A component on the work list."""
+
+    region: str
+    component: int  # from 0
+    flagged: bool
+    decided: bool  # by an operator, saved or not
+    action: Action
+
+    @property
+    def key(self) -> tuple[str, int]:
+        return self.region, self.component
 
 
 class ReviewState:
@@ -30,11 +49,58 @@ class ReviewState:
         self.stored, self.head, self.log, self.dataset = stored, head, log, dataset
         self.decisions = list(saved)
         self._saved = len(self.decisions)
+        self._stretches: dict[tuple[str, int], EdgeStretch] = {}
         self._update()
 
     def action(self, region: str, component: int) -> Action:
         """Return the current action for a component."""
         return self._actions[region, component]
+
+    def work_list(self) -> list[WorkItem]:
+        """Return all components, the flagged ones first; the order does not depend on decisions."""
+        decided = {(decision.region, decision.component) for decision in self.decisions}
+        items = [
+            WorkItem(
+                region=part.region,
+                component=k,
+                flagged=bool(part.flagged[k]),
+                decided=(part.region, k) in decided,
+                action=self.action(part.region, k),
+            )
+            for part in self.stored.components
+            for k in range(len(part.energy))
+        ]
+        return sorted(items, key=lambda item: not item.flagged)
+
+    def undecided(self, region: str, component: int, step: Literal[-1, 1]) -> WorkItem | None:
+        """Return the next or previous undecided component of the work list after a component; None if there is none.
+
+        The search begins again at the other end; the component itself is not returned.
+        """
+        items = self.work_list()
+        here = [item.key for item in items].index((region, component))
+        others = [items[(here + step * k) % len(items)] for k in range(1, len(items))]
+        return next((item for item in others if not item.decided), None)
+
+    def stretch(self, region: str, component: int) -> EdgeStretch:
+        """Return how far dropping a component stretches the mesh."""
+        key = (region, component)
+        if key not in self._stretches:
+            part = next(part for part in self.stored.components if part.region == region)
+            self._stretches[key] = drop_stretch(
+                part, component, self.stored.mean_displacement, self.head, self._skin_edges
+            )
+        return self._stretches[key]
+
+    @property
+    def tearing(self) -> list[WorkItem]:
+        """Components whose current action tears the mesh."""
+        dropped = (item for item in self.work_list() if item.action == "drop")
+        return [item for item in dropped if self.stretch(*item.key).tears]
+
+    @cached_property
+    def _skin_edges(self) -> np.ndarray:
+        return skin_edges(self.head)
 
     def decide(self, region: str, component: int, action: Action, reason: str) -> None:
         """Append a decision. Raises InputError for a component or an action that does not exist."""

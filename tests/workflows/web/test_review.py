@@ -13,7 +13,7 @@ from registration.stabilize.decisions import Decision
 from registration.stabilize.pipeline import stabilize
 from tests.coregister.conftest import head_assembly, model, model_file, source, wheel  # noqa: F401  fixtures
 from tests.registration.stabilize import runs
-from tests.workflows.browser import CHROMIUM, FLAGS, needs_browser
+from tests.workflows.browser import CHROMIUM, FLAGS, launch, needs_browser
 from workflows.records.decisions import read_decisions
 from workflows.records.run import read_run
 from workflows.steps.stabilize import stabilize_run
@@ -87,6 +87,67 @@ def test_a_reviewer_steps_subtracts_undoes_and_saves(page, run, model, model_fil
         replay = disk.read_subject(replayed.out, number)
         np.testing.assert_allclose(replay.vertices, subject.vertices, atol=1e-6)
         np.testing.assert_allclose(replay.T_neutral_expression, subject.T_neutral_expression, atol=1e-9)
+
+
+@needs_browser
+def test_a_reviewer_walks_the_work_list_and_is_warned(page):
+    sync_api = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
+    items = page.review.work_list()
+    torn = next(item for item in items if page.review.stretch(*item.key).tears)
+    with launch(sync_api) as browser:
+        tab = browser.new_page(viewport={"width": 1360, "height": 900})
+        tab.set_default_timeout(60_000)
+        tab.goto(page.url)
+        see = sync_api.expect
+        see(tab.get_by_text(f"reviewed 0 of {len(items)}")).to_be_visible()
+        tab.get_by_role("button", name="keep", exact=True).click()
+        see(tab.get_by_text(f"reviewed 1 of {len(items)}")).to_be_visible()
+        tab.get_by_role("button", name="next undecided").click()
+        second = f"▸ {items[1].region.replace('_', ' ')} {items[1].component + 1}"
+        see(tab.get_by_text(second, exact=True)).to_be_visible()
+        tab.get_by_role("button", name="previous undecided").click()
+        last = f"▸ {items[-1].region.replace('_', ' ')} {items[-1].component + 1}"
+        see(tab.get_by_text(last, exact=True)).to_be_attached()  # the first one is decided
+        page._go_to(*torn.key)
+        warning = tab.get_by_text("Dropping it tears the mesh")
+        see(warning).to_have_count(0)
+        tab.get_by_role("button", name="drop", exact=True).click()
+        see(warning).to_be_visible()
+        see(tab.get_by_text("These decisions tear the mesh")).to_be_visible()
+        tab.get_by_role("button", name="subtract", exact=True).click()
+        see(warning).to_have_count(0)
+
+
+def test_the_work_list_begins_with_flagged_components(page):
+    review: ReviewState = page.review
+    items = review.work_list()
+    flags = [item.flagged for item in items]
+    assert flags == sorted(flags, reverse=True) and not any(item.decided for item in items)
+    assert {item.key for item in items} == {
+        (part.region, k) for part in review.stored.components for k in range(len(part.energy))
+    }
+    first, second, third = items[:3]
+    review.decide(*second.key, "keep", "")
+    assert [item.key for item in review.work_list()] == [item.key for item in items]
+    assert review.work_list()[1].decided and review.work_list()[1].action == "keep"
+    assert review.undecided(*first.key, 1).key == third.key  # type: ignore[union-attr]
+    assert review.undecided(*first.key, -1).key == items[-1].key  # type: ignore[union-attr]
+    assert review.undecided(*items[-1].key, 1).key == first.key  # type: ignore[union-attr]
+    for item in items[1:]:
+        review.decide(*item.key, "keep", "")
+    assert review.undecided(*second.key, 1).key == first.key  # type: ignore[union-attr]
+    assert review.undecided(*first.key, 1) is None
+    review.undo()
+    assert review.undecided(*first.key, 1).key == items[-1].key  # type: ignore[union-attr]
+
+
+def test_decisions_that_tear_are_known(page):
+    review: ReviewState = page.review
+    torn = next(item for item in review.work_list() if review.stretch(*item.key).tears)
+    review.decide(*torn.key, "subtract", "")
+    assert review.tearing == []  # one motion of the whole head
+    review.decide(*torn.key, "drop", "")
+    assert [item.key for item in review.tearing] == [torn.key]
 
 
 def test_a_review_resumes_its_log(page, run, model_file):  # noqa: F811
