@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from registration.capture.ledger import Ledger
 from registration.capture.native import read_capture
 from registration.capture.triangulation import triangulate
 from registration.capture.validation import validate_capture
@@ -37,6 +38,7 @@ class RegistrationInputs:
     """The inputs of a registration, read and checked."""
 
     capture: Capture  # with the selected views only
+    ledger: Ledger  # of all views
     data: gnm_npz.GNMData
     schemes: Mapping[str, LandmarkScheme]
     landmarks: Mapping[str, Float[np.ndarray, "L 3"]]  # triangulated, of the schemes that capture and model share
@@ -54,7 +56,7 @@ class RegistrationInputs:
 def read_inputs(
     capture_path: Path, model_path: Path, options: RegisterOptions, neutral: Path | None = None
 ) -> RegistrationInputs:
-    """Read and check the inputs of a registration. Images are not decoded; landmarks are triangulated.
+    """Read and check the inputs of a registration; landmarks are triangulated.
 
     Args:
         capture_path: a native capture folder.
@@ -67,7 +69,7 @@ def read_inputs(
     """
     recipe = load_recipe(options.recipe)
     capture = read_capture(capture_path)
-    validate_capture(capture)
+    ledger = validate_capture(capture)
     selected = _select_views(capture, options.views)
     data = gnm_npz.read(model_path)
     _check_model(data)
@@ -82,6 +84,7 @@ def read_inputs(
     digests, config = _deciding(capture, data, schemes, start, options)
     return RegistrationInputs(
         capture=selected,
+        ledger=ledger,
         data=data,
         schemes=schemes,
         landmarks=landmarks,

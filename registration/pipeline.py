@@ -82,6 +82,8 @@ def register(
     out = Path(out)
     check_output_folder(out)
     inputs = read_inputs(Path(capture), Path(model), options, None if neutral is None else Path(neutral))
+    for warning in inputs.ledger.warnings:
+        progress.message(f"warning: {warning}")
     if not force and (same := find_existing(out, inputs.input_hash)) is not None:
         progress.message(f"{out} already holds the registration of these inputs")
         return same
@@ -140,6 +142,7 @@ def _context(inputs: RegistrationInputs, seed: int, device: torch.device, progre
         classes,
         finest_head_px=recipe.finest_head_px,
         levels=recipe.levels,
+        head_rows=inputs.ledger.head_rows,
         progress=lambda done: progress.update(done, count, "reading views"),
     )
     return FitContext(
@@ -248,6 +251,7 @@ def _collect(inputs: RegistrationInputs, fitted: _Fitted, comparison: Comparison
             "camera_gains": problem.appearance.gains.cpu().numpy().round(4).tolist(),
             "views_not_trusted": dict(problem.view_weights.notes),
             "notes": list(fitted.initial.notes),
+            "capture_warnings": list(inputs.ledger.warnings),
             "residuals": comparison.residuals,
         },
         config=inputs.config,

@@ -13,8 +13,9 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from registration.capture import leftovers, native, pixels, triangulation
+from registration.capture import native, triangulation
 from registration.capture.contact_sheet import draw_contact_sheet
+from registration.capture.ledger import Channel
 from registration.capture.scan import Scan, read_scan, read_truth
 from registration.capture.scan_checks import scan_facts, scan_warnings
 from registration.capture.text import listed
@@ -74,24 +75,31 @@ class CaptureReport:
     schemes: Mapping[str, tuple[int, int]]  # landmark scheme -> number of points, number of these triangulated
     eye_distance_mm: float | None
     scan: Scan | None
+    channels: tuple[Channel, ...]
     warnings: tuple[str, ...]
     sheet: Path | None
 
     def __str__(self) -> str:
         heads = ("view", "size px", "lens", "mask %", "normals", "labels", "landmarks", "residual px", "outliers")
-        table = Table(*heads, box=SIMPLE)
+        views = Table(*heads, box=SIMPLE)
         for view in self.views:
-            table.add_row(*map(Text, view.row))  # names may hold brackets, rich's markup
+            views.add_row(*map(Text, view.row))  # names may hold brackets, rich's markup
+        ledger = Table("channel", "files", "of views", "counts", "lost to", box=SIMPLE)
+        for channel in self.channels:
+            ledger.add_row(*map(Text, channel.row))
         text = io.StringIO()
         console = Console(file=text, width=200, color_system=None, legacy_windows=False)
-        console.print(table)
+        console.print(views)
+        console.print(ledger)
         for line in [*self._facts(), *(f"warning: {warning}" for warning in self.warnings)]:
             console.print(line, soft_wrap=True, markup=False, highlight=False)
         return text.getvalue().rstrip()
 
     def _facts(self) -> list[str]:
         capture = self.capture
-        facts = [f"{capture.root}: {capture.subject}, {capture.expression}; {len(self.views)} views, all checks passed"]
+        count = len(self.warnings)
+        verdict = "all checks passed" if not count else f"usable, with {count} warning{'s' if count > 1 else ''}"
+        facts = [f"{capture.root}: {capture.subject}, {capture.expression}; {len(self.views)} views, {verdict}"]
         facts += [f"{key}: {value}" for key, value in capture.tags.items()]
         if capture.classes:
             facts.append(f"classes: {', '.join(capture.classes)}")
@@ -122,13 +130,13 @@ def check_capture(path: Path, sheet: Path | None = None) -> CaptureReport:
         InputError: as `native.read_capture` and `validate_capture`; nothing is written then.
     """
     capture = native.read_capture(path)
-    validate_capture(capture)
+    ledger = validate_capture(capture)
     scan = None if capture.scan is None else read_scan(capture.scan)
     names = sorted({name for view in capture.views for name in view.landmarks})
     triangulated = {name: triangulation.triangulate(capture, name)[0] for name in names}
     main = "68" if "68" in triangulated else next(iter(triangulated), None)
     points = triangulated[main] if main is not None else np.zeros((0, 3))
-    views = tuple(_view_report(view, main, points) for view in capture.views)
+    views = tuple(_view_report(view, ledger.coverage.get(view.name), main, points) for view in capture.views)
     distance = eye_distance(triangulated.get("68", np.zeros((0, 3))))
     if sheet is not None:
         draw_contact_sheet(capture, {view.name: view.caption for view in views}, main, points, scan, Path(sheet))
@@ -138,15 +146,15 @@ def check_capture(path: Path, sheet: Path | None = None) -> CaptureReport:
         schemes={name: (len(xyz), int(np.isfinite(xyz).all(-1).sum())) for name, xyz in triangulated.items()},
         eye_distance_mm=None if distance is None else MM_PER_M * distance,
         scan=scan,
-        warnings=(
-            *_warnings(capture, views, triangulated, scan),
-            *leftovers.warnings(capture, leftovers.match_files(capture)),
-        ),
+        channels=ledger.channels,
+        warnings=(*_warnings(capture, views, triangulated, scan), *ledger.warnings),
         sheet=sheet,
     )
 
 
-def _view_report(view: View, scheme: str | None, points: Float[np.ndarray, "L 3"]) -> ViewReport:
+def _view_report(
+    view: View, coverage: float | None, scheme: str | None, points: Float[np.ndarray, "L 3"]
+) -> ViewReport:
     camera = view.camera
     errors, count = np.zeros(0), 0
     if scheme is not None and scheme in view.landmarks:
@@ -156,7 +164,7 @@ def _view_report(view: View, scheme: str | None, points: Float[np.ndarray, "L 3"
     return ViewReport(
         name=view.name,
         camera=camera,
-        coverage=None if view.mask is None else float(pixels.read_mask(view.mask, camera).mean() / 255),
+        coverage=coverage,
         normals=view.normals is not None,
         labels=view.segmentation is not None,
         landmarks=count,

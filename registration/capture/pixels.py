@@ -56,7 +56,7 @@ def read_view(view: View, capture: Capture, *, downsample: int = 1) -> ViewPixel
     normals = (
         None
         if view.normals is None
-        else _unit(_resample(read_normals(view.normals, camera), _to_normals, strips, valid))
+        else _unit(_resample(read_normals(view.normals, camera), decode_normals, strips, valid))
     )
     coverage = None
     if view.segmentation is not None:
@@ -277,7 +277,8 @@ def _to_coverage(raw: UInt8[np.ndarray, "H W"]) -> Float[np.ndarray, "H W"]:
     return raw.astype(np.float32) / 255
 
 
-def _to_normals(raw: np.ndarray) -> Float[np.ndarray, "H W 3"]:
+def decode_normals(raw: np.ndarray) -> Float[np.ndarray, "H W 3"]:
+    """Return the vectors that `read_normals` has encoded, as stored: about unit length; 0 where there is none."""
     background = (raw[..., 0] | raw[..., 1] | raw[..., 2]) == 0
     normals = raw * np.float32(2 / 65535) - 1
     normals[background] = 0

@@ -89,19 +89,24 @@ def _frames() -> Iterator[_Frame]:
             yield _Frame(unit=unit, axes=frame.axes, signs=frame.signs)
 
 
-def require_frames(capture: Capture) -> None:
+def require_frames(capture: Capture) -> Scan | None:
     """Read a capture's scan and its true vertices, and refuse them as `require_frame` does.
+
+    Returns:
+        The scan, if there is one.
 
     Raises:
         InputError: a file cannot be read, or is in another unit or frame than the cameras.
     """
     if capture.scan is None and capture.ground_truth is None:
-        return
-    landmarks = surface_landmarks(capture)
+        return None
+    landmarks, scan = surface_landmarks(capture), None
     if capture.scan is not None:
-        require_frame("scan", capture.scan, read_scan(capture.scan).vertices, capture, landmarks)
+        scan = read_scan(capture.scan)
+        require_frame("scan", capture.scan, scan.vertices, capture, landmarks)
     if capture.ground_truth is not None and len(truth := read_truth(capture.ground_truth)):
         require_frame("ground truth", capture.ground_truth, truth.astype(np.float64), capture, landmarks)
+    return scan
 
 
 def require_frame(

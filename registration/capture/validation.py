@@ -5,26 +5,42 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from registration.capture import headers, leftovers, pixels, rig_checks, triangulation
+from registration.capture import (
+    contradictions,
+    exchanged,
+    headers,
+    landmark_checks,
+    leftovers,
+    normal_axes,
+    rig_checks,
+    triangulation,
+)
+from registration.capture.class_names import BACKGROUND
+from registration.capture.ledger import Channel, Ledger, require_weight, take_stock
+from registration.capture.samples import ViewSample, sample_views
+from registration.capture.scan import Scan
 from registration.capture.scan_checks import require_frames
 from registration.errors import InputError
 from registration.types import Capture, View
 
 EYE_DISTANCE_M = (0.05, 0.15)  # between the outer corners; adults have 0.08 to 0.1
 OUTER_EYES = (36, 45)  # of the 68 scheme
-MAX_DECODED_PIXELS = 2**22  # images and normal maps up to this size are decoded whole
 
 
-def validate_capture(capture: Capture) -> None:
+def validate_capture(capture: Capture) -> Ledger:
     """Check a capture before it is registered: the headers of all views first, then contents.
 
-    Masks and label maps are decoded whole. Images and normal maps of more than `MAX_DECODED_PIXELS` are only checked
-    for truncation; other damage is reported when the views are decoded for the fit.
+    Masks and label maps are decoded whole. Images of more than `samples.MAX_DECODED_PIXELS` are only checked for
+    truncation, and so are all but some normal maps of more; other damage is reported when the views are decoded for the
+    fit.
+
+    Returns:
+        What of the capture counts, and what may be wrong with it.
 
     Raises:
         InputError: fewer than two views, a singular or non-finite camera, a missing or damaged file, a size that is not
             the camera's, landmarks, a scan or true vertices that cannot be used or are in another unit or frame than
-            the cameras, or a world that is not in metres.
+            the cameras, a world that is not in metres, or a kind of data of which nothing counts.
     """
     if len(capture.views) < 2:
         raise InputError(
@@ -37,11 +53,40 @@ def validate_capture(capture: Capture) -> None:
     for view in capture.views:
         _check_camera(capture, view)
         _check_headers(capture, view)
-    leftovers.match_files(capture)
-    agree, sized = _check_landmarks(capture)
-    boxes = {view.name: _check_pixels(capture, view) for view in capture.views}
+    files = leftovers.match_files(capture)
+    landmark_checks.check_values(capture)
+    landmark_checks.check_coordinates(capture)
+    points, agree, sized = _check_landmarks(capture)
+    samples = sample_views(capture)
+    boxes = {sample.name: _box(capture, sample) for sample in samples}
     rig_checks.check_mask_rays(capture, boxes, poses=not agree, size=not sized)
-    require_frames(capture)  # last: cameras that are wrong would blame them
+    scan = require_frames(capture)  # last: cameras that are wrong would blame them
+    channels = take_stock(capture, samples, files)
+    warnings = contradictions.check_views(capture, samples)
+    cameras = [view.camera for view in capture.views]
+    warnings += normal_axes.check_normal_axes(capture.root / "normals", samples, cameras)
+    warnings += require_weight(capture, channels)
+    warnings += exchanged.exchanged_views(capture, samples, points)
+    warnings += leftovers.warnings(capture, files)
+    return Ledger(
+        channels=(*channels, _scan_channel(scan)),
+        warnings=tuple(warnings),
+        coverage={sample.name: sample.coverage for sample in samples},
+        head_rows={sample.name: sample.head_rows for sample in samples},
+    )
+
+
+def _scan_channel(scan: Scan | None) -> Channel:
+    count, unused = (0, 0) if scan is None else (len(scan.vertices), scan.unused_vertices)
+    return Channel(
+        name="scan.ply",
+        files=int(scan is not None),
+        matched=int(scan is not None),
+        unit="vertices",
+        total=count + unused,
+        counted=count,
+        losses={"no face uses it": unused},
+    )
 
 
 def _check_camera(capture: Capture, view: View) -> None:
@@ -93,8 +138,8 @@ def _files(view: View) -> list[tuple[Path, str]]:
     return [(path, role) for path, role in files if path is not None]
 
 
-def _check_landmarks(capture: Capture) -> tuple[bool, bool]:
-    """Whether landmarks confirm the poses, and whether they confirm the unit."""
+def _check_landmarks(capture: Capture) -> tuple[Float[np.ndarray, "L 3"], bool, bool]:
+    """The triangulated points of scheme 68, whether landmarks confirm the poses, and whether they confirm the unit."""
     counts = {len(view.landmarks["68"]) for view in capture.views if "68" in view.landmarks}
     if counts - {68}:
         raise InputError(
@@ -106,6 +151,7 @@ def _check_landmarks(capture: Capture) -> tuple[bool, bool]:
         )
     agree = rig_checks.check_landmark_rays(capture)
     points = triangulation.triangulate(capture, "68")[0]
+    landmark_checks.check_chirality(capture, points)
     distance = eye_distance(points)
     if distance is not None and not EYE_DISTANCE_M[0] <= distance <= EYE_DISTANCE_M[1]:
         factor = 10.0 ** round(np.log10(0.09 / max(distance, 1e-12)))
@@ -120,7 +166,7 @@ def _check_landmarks(capture: Capture) -> tuple[bool, bool]:
     if distance is None:
         for name in {name for view in capture.views for name in view.landmarks}:
             rig_checks.check_landmark_size(capture, name, triangulation.triangulate(capture, name)[0])
-    return agree, distance is not None
+    return points, agree, distance is not None
 
 
 def eye_distance(points: Float[np.ndarray, "L 3"]) -> float | None:
@@ -132,26 +178,9 @@ def eye_distance(points: Float[np.ndarray, "L 3"]) -> float | None:
     return distance if np.isfinite(distance) else None
 
 
-def _check_pixels(capture: Capture, view: View) -> rig_checks.MaskBox | None:
-    """Decode what a view has. Returns the box of its mask, or else of its labels."""
-    camera, box = view.camera, None
-    if view.mask is not None:
-        mask = pixels.read_mask(view.mask, camera)
-        box = rig_checks.mask_box(mask > 127)
-        if not mask.any():
-            raise InputError(
-                "The mask is empty",
-                where=view.mask,
-                expected="255 where the subject is",
-                got="no pixel above 0",
-                fix="draw the mask, or remove this view or its mask",
-            )
-    if view.segmentation is not None:
-        labels = pixels.read_labels(view.segmentation, camera, capture.classes)
-        if box is None and "background" in capture.classes:
-            box = rig_checks.mask_box(labels != capture.classes.index("background"))
-    if camera.width_px * camera.height_px <= MAX_DECODED_PIXELS:
-        pixels.read_image(view.image, camera)
-        if view.normals is not None:
-            pixels.read_normals(view.normals, camera)
-    return box
+def _box(capture: Capture, sample: ViewSample) -> rig_checks.MaskBox | None:
+    """The box of a view's mask, or else of its labels, px of the stored image."""
+    if sample.mask is None and (sample.labels is None or BACKGROUND not in capture.classes):
+        return None
+    box = rig_checks.mask_box(sample.subject)
+    return box and rig_checks.MaskBox(low=box.low * sample.step, high=box.high * sample.step)

@@ -12,7 +12,8 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float
 
-from registration.capture.pixels import read_labels, read_mask, read_view, undistort_landmarks
+from registration.capture.pixels import read_view, undistort_landmarks
+from registration.capture.samples import sample_views
 from registration.targets.classes import BACKGROUND, ClassMap
 from registration.types import Camera, Capture, Pixels, Targets, View, ViewPixels
 
@@ -48,6 +49,7 @@ def build_pyramid(
     *,
     finest_head_px: int,
     levels: int,
+    head_rows: Mapping[str, int] | None = None,
     progress: Callable[[int], None] = lambda done: None,
 ) -> tuple[Targets, ...]:
     """Return the targets of all views from fine to coarse; each level has half the resolution of the one before.
@@ -58,12 +60,17 @@ def build_pyramid(
         finest_head_px: resolution at level 0. Views are downsampled by the integer factor that brings the subject's
             height closest to this from above, never enlarged.
         levels: how many.
+        head_rows: height of the head in each view, px of the stored image, by the view's name, as the ledger of a
+            validated capture has it; None: masks and labels are decoded once more to measure it.
         progress: called with the number of views that are decoded.
 
     Raises:
         InputError: an image cannot be decoded.
     """
-    downsample = max(1, int(_subject_height(capture) / finest_head_px))
+    if head_rows is None:
+        head_rows = {sample.name: sample.head_rows for sample in sample_views(capture)}
+    height_px = float(np.median([head_rows[view.name] for view in capture.views]))
+    downsample = max(1, int(height_px / finest_head_px))
     crops = []
     for done, view in enumerate(capture.views):
         progress(done)
@@ -79,22 +86,6 @@ def build_pyramid(
             crops = [_halved(crop) for crop in crops]
         pyramid.append(_targets(crops, mapping))
     return tuple(pyramid)
-
-
-def _subject_height(capture: Capture) -> float:
-    """Median height of the subject in full-size pixels, from masks or labels, else from the images."""
-    heights: list[int] = []
-    for view in capture.views:
-        rows = np.arange(view.camera.height_px)
-        if view.segmentation is not None:
-            labels = read_labels(view.segmentation, view.camera, capture.classes)
-            # The head alone: with shoulders the heads of close-ups and of busts would have different resolutions.
-            other = [i for i, name in enumerate(capture.classes) if name in (BACKGROUND, "neck_other")]
-            rows = np.flatnonzero(~np.isin(labels, other).all(1))
-        elif view.mask is not None:
-            rows = np.flatnonzero((read_mask(view.mask, view.camera) > 127).any(1))
-        heights.append(int(np.ptp(rows)) + 1 if len(rows) else view.camera.height_px)
-    return float(np.median(heights))
 
 
 def _view_crop(view: View, capture: Capture, mapping: ClassMap, downsample: int) -> _ViewCrop:

@@ -16,7 +16,7 @@ from registration.capture.scan import Scan
 from registration.types import Camera
 
 RADIUS_M = 0.09
-CLASSES = ("background", "right", "left")
+CLASSES = ("background", "skin", "neck_other")
 DISTORTIONS = {
     "SIMPLE_RADIAL": (0.9, 0.0, 0.0, 0.0),
     "RADIAL": (-1.5, 4.0, 0.0, 0.0),

@@ -1,0 +1,162 @@
+"""Find normal maps in other axes, or in the world's frame, from where normals must point.
+
+A surface that a camera sees faces it, and at the outline of the subject it points away from its inside. Both are linear
+in the normals: for each of the 48 signed permutations of their axes the mean agreement is a trace of one matrix, summed
+over the pixels once for normals as stored and once for normals in the world's frame.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import permutations, product
+from pathlib import Path
+
+import cv2
+import numpy as np
+from jaxtyping import Float
+
+from registration.capture.samples import ViewSample
+from registration.errors import InputError
+from registration.types import Camera
+
+_MARGIN = 0.15  # by which other axes must agree better, of 2: 1 for facing and 1 at the outline
+_RIM = 2  # samples, width of the outline
+_MIN_RIM, _MIN_PIXELS = 40, 200
+_MIN_LENGTH = 0.5
+_NAMES: dict[tuple[int, ...], str] = {
+    (1, 2, 3): "in the camera's frame",
+    (1, -2, -3): "in OpenGL's or Blender's camera axes (y up, z towards the camera)",
+    (1, -2, 3): "with y up",
+    (-1, 2, 3): "with x to the left",
+    (1, 2, -3): "with z towards the camera",
+    (-1, -2, -3): "pointing into the subject",
+    (3, 2, 1): "in the order blue, green, red",
+}
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Moments:
+    """Mean outer products of stored normals with the directions that they should have."""
+
+    camera: Float[np.ndarray, "3 3"]
+    world: Float[np.ndarray, "3 3"]
+
+
+def check_normal_axes(folder: Path, samples: Sequence[ViewSample], cameras: Sequence[Camera]) -> list[str]:
+    """Compare the axes of all normal maps with those that agree best with the outlines and the viewing directions.
+
+    Args:
+        folder: of the normal maps, for messages.
+        samples: of the views, as the next.
+        cameras: of the views.
+
+    Returns:
+        Warnings about single views.
+
+    Raises:
+        InputError: other axes agree better in all views together.
+    """
+    moments = {
+        sample.name: found
+        for sample, camera in zip(samples, cameras, strict=True)
+        if (found := _moments(sample, camera)) is not None
+    }
+    if not moments:
+        return []
+    total = _Moments(
+        camera=np.mean([m.camera for m in moments.values()], axis=0),
+        world=np.mean([m.world for m in moments.values()], axis=0),
+    )
+    (axes, world), better = _best(total)
+    if better > _MARGIN:
+        given = float(np.trace(total.camera))
+        raise InputError(
+            "The normals are in other axes",
+            where=folder,
+            expected="the camera's frame: x right, y down, z away from the camera, so that z < 0 where it sees",
+            got=f"normals {_name(axes, world)}: these agree with outlines and viewing directions by "
+            f"{_share(given + better)}, the camera's axes by {_share(given)}",
+            fix=_conversion(axes, world),
+        )
+    warnings = []
+    for name, found in moments.items():
+        (axes, world), better = _best(found)
+        if better > 2 * _MARGIN and not world:
+            warnings.append(f"{name}: its normals seem to be {_name(axes, world)}; {_conversion(axes, world)}")
+    return warnings
+
+
+def _moments(sample: ViewSample, camera: Camera) -> _Moments | None:
+    if sample.normals is None:
+        return None
+    length = np.linalg.norm(sample.normals, axis=-1)
+    has_normal = (length > _MIN_LENGTH) & sample.subject
+    normals = sample.normals / np.maximum(length, 1e-6)[..., None]
+    silhouette = sample.subject if not sample.subject.all() else has_normal
+    outward, rim = _outline(silhouette)
+    rim &= has_normal
+    if rim.sum() < _MIN_RIM or has_normal.sum() < _MIN_PIXELS:
+        return None
+    # At the outline the direction is that away from the subject in the image, elsewhere that to the camera.
+    at_rim = np.concatenate([outward[rim], np.zeros((int(rim.sum()), 1))], -1)
+    facing = normals[has_normal].T @ -sample.rays[has_normal] / has_normal.sum()
+    outlined = normals[rim].T @ at_rim / rim.sum()
+    moment = facing + outlined
+    return _Moments(camera=moment, world=moment @ camera.T_cam_world[:3, :3])
+
+
+def _outline(inside: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Directions out of a region in the image (h, w, 2), and its pixels at its outline, not at the image's border."""
+    padded = cv2.copyMakeBorder(inside.astype(np.uint8), _RIM, _RIM, _RIM, _RIM, cv2.BORDER_REPLICATE)
+    size = 2 * _RIM + 1
+    rim = inside & ~cv2.erode(padded, np.ones((size, size), np.uint8))[_RIM:-_RIM, _RIM:-_RIM].astype(bool)
+    smooth = cv2.GaussianBlur(inside.astype(np.float32), (0, 0), 2.0 * _RIM, borderType=cv2.BORDER_REPLICATE)
+    down, right = np.gradient(smooth)
+    outward = -np.stack([right, down], -1)
+    return outward / np.maximum(np.linalg.norm(outward, axis=-1, keepdims=True), 1e-6), rim
+
+
+def _best(moments: _Moments) -> tuple[tuple[tuple[int, ...], bool], float]:
+    """The axes that agree best, whether of the world, and by how much better than the camera's as they are."""
+    candidates = {}
+    for axes in _AXES:
+        matrix = _matrix(axes)
+        candidates[axes, False] = float(np.sum(matrix * moments.camera.T))
+        candidates[axes, True] = float(np.sum(matrix * moments.world.T))
+    best = max(candidates, key=lambda key: candidates[key])
+    return best, candidates[best] - candidates[(1, 2, 3), False]
+
+
+# Signed permutations: (1, -2, -3) stands for (x, -y, -z).
+_AXES = [
+    tuple(int(sign * axis) for sign, axis in zip(signs, order, strict=True))
+    for order in permutations((1, 2, 3))
+    for signs in product((1, -1), repeat=3)
+]
+
+
+def _matrix(axes: tuple[int, ...]) -> Float[np.ndarray, "3 3"]:
+    """The matrix that maps stored normals to these axes."""
+    matrix = np.zeros((3, 3))
+    for row, axis in enumerate(axes):
+        matrix[row, abs(axis) - 1] = np.sign(axis)
+    return matrix
+
+
+def _name(axes: tuple[int, ...], world: bool) -> str:
+    if world:
+        return "in the world's frame" + ("" if axes == (1, 2, 3) else f", as {_formula(axes)} of the capture's")
+    return _NAMES.get(axes, f"as {_formula(axes)}")
+
+
+def _conversion(axes: tuple[int, ...], world: bool) -> str:
+    if world:
+        return f"multiply ({_formula(axes)}) by the rotation of each view's pose, world to camera"
+    return f"store ({_formula(axes)}) in place of (x, y, z)"
+
+
+def _formula(axes: tuple[int, ...]) -> str:
+    return ", ".join(("-" if axis < 0 else "") + "xyz"[abs(axis) - 1] for axis in axes)
+
+
+def _share(agreement: float) -> str:
+    return f"{max(0.0, agreement / 2):.0%}"
