@@ -1,5 +1,8 @@
 """The one error that users see for bad input."""
 
+MAX_PART = 800  # letters of a part of a message: what was found in a file may be megabytes
+MAX_SEED = 2**63 - 1  # of random number generators, and of integers in databases
+
 
 class InputError(Exception):
     """The user's input cannot be used.
@@ -9,11 +12,11 @@ class InputError(Exception):
     """
 
     def __init__(self, what: str, *, where: object, expected: object, got: object, fix: str = "change it"):
-        self.what = what
-        self.where = str(where)
-        self.expected = str(expected)
-        self.got = str(got)
-        self.fix = fix
+        self.what = _shortened(what)
+        self.where = _shortened(str(where))
+        self.expected = _shortened(str(expected))
+        self.got = _shortened(str(got))
+        self.fix = _shortened(fix)
         super().__init__(what)
 
     @classmethod
@@ -41,3 +44,22 @@ class InputError(Exception):
     def line(self) -> str:
         """The message in one line, for tables."""
         return f"{self.what}: {self.where}; expected {self.expected}, got {self.got}; {self.fix}"
+
+
+def check_seed(seed: int, where: str = "seed") -> None:
+    """Refuse a seed that a random number generator does not take.
+
+    Raises:
+        InputError: it is negative, or larger than `MAX_SEED`. `where` names it in the message.
+    """
+    if not 0 <= seed <= MAX_SEED:
+        expected = f"a whole number from 0 to {MAX_SEED}"
+        raise InputError(
+            "The seed is out of range", where=where, expected=expected, got=seed, fix="choose another seed"
+        )
+
+
+def _shortened(text: str) -> str:
+    if len(text) > MAX_PART:
+        return f"{text[: MAX_PART // 2]} ... {text[-MAX_PART // 4 :]} ({len(text)} letters)"
+    return text or "nothing"

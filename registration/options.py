@@ -11,7 +11,7 @@ from typing import Annotated, Any, Literal
 from tyro.conf import arg
 from tyro.constructors import PrimitiveConstructorSpec
 
-from registration.errors import InputError
+from registration.errors import InputError, check_seed
 from registration.fit.recipes import Recipe
 
 
@@ -73,6 +73,9 @@ class RegisterOptions:
     deterministic: bool = False
     variant: Literal["llvm", "cuda"] = "llvm"
     landmark_files: Annotated[Mapping[str, Path], _LANDMARK_FILES, _LANDMARKS_ARGUMENT] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        check_seed(self.seed)
 
     @property
     def recipe_name(self) -> str:

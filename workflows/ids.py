@@ -12,6 +12,7 @@ from urllib.parse import unquote
 from registration.errors import InputError
 
 _ID = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,99}(/[A-Za-z0-9][A-Za-z0-9._-]{0,99}){0,7}")
+_BUCKET = re.compile(r"[A-Za-z0-9._-]{1,255}|arn:.+")
 _URL = re.compile(r"([A-Za-z][A-Za-z0-9+.-]*)://|file:", re.IGNORECASE)
 
 
@@ -67,7 +68,7 @@ def resolve_place(location: Any, where: str) -> str:
     if found := next((c for c in location if c in "?#" or not c.isprintable()), None):
         raise _no_place(where, expected="a URL without query, fragment or control characters", got=repr(found))
     if scheme == "s3":
-        if not host or {".", ".."} & set(path.split("/")):
+        if not _BUCKET.fullmatch(host) or {".", ".."} & set(path.split("/")):
             raise _no_place(where, expected='s3://bucket/key without ".."', got=shortened(location))
         return f"s3://{host}/{path}".rstrip("/")
     if not slash or host.lower() not in ("", "localhost") or (host and url[1] is None):

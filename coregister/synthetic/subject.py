@@ -14,7 +14,7 @@ from coregister.first_model.assembly import HeadAssembly, build_assembly
 from coregister.first_model.population import SyntheticPerson
 from coregister.synthetic import expressions
 from coregister.synthetic.capture import Studio, check_studio, render_capture
-from registration.errors import InputError
+from registration.errors import InputError, check_seed
 from registration.model import gnm_npz
 from registration.model.landmarks import schemes_beside
 from registration.render.studio.skin import SkinAppearance
@@ -94,8 +94,7 @@ def sample_subject(seed: int, *, spanned: bool = False, targets: Mapping[str, fl
     Raises:
         InputError: an unknown target, or a number out of range.
     """
-    if seed < 0:
-        raise _input_error("The seed is out of range", "seed", "a whole number from 0", seed)
+    check_seed(seed)
     for name, weight in (targets or {}).items():
         if not abs(weight) <= _MAX_WEIGHT:  # also true of NaN
             raise _input_error("A target's weight is out of range", name, f"-{_MAX_WEIGHT} to {_MAX_WEIGHT}", weight)

@@ -277,8 +277,8 @@ def _camera(source: ColmapCamera, T_cam_world: Float[np.ndarray, "4 4"], where: 
 def _matrix(pose: Pose, where: str) -> Float[np.ndarray, "4 4"]:
     """The transform of a pose; the quaternion is normalized."""
     quaternion, translation = np.array(pose[0]), np.array(pose[1])
-    length = np.linalg.norm(quaternion)
-    if not np.isfinite([*quaternion, *translation]).all() or not length > 1e-6:
+    length = math.hypot(*pose[0])  # does not overflow where the sum of squares would
+    if not np.isfinite([*quaternion, *translation, length]).all() or not length > 1e-6:
         raise InputError(
             "The pose is singular or not finite",
             where=where,

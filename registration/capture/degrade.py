@@ -22,7 +22,7 @@ from registration.capture.degradation import FAULTS, DegradationPreset
 from registration.capture.native_writer import check_new
 from registration.capture.scan import read_scan
 from registration.capture.validation import validate_capture
-from registration.errors import InputError
+from registration.errors import InputError, check_seed
 from registration.storage.files import atomic_directory
 from registration.types import Camera, Capture, View
 
@@ -59,8 +59,7 @@ def degrade(
     """
     source, target = Path(source), Path(target)
     check_new(target)
-    if seed < 0:
-        raise InputError("The seed is out of range", where="seed", expected="a whole number from 0", got=seed)
+    check_seed(seed)
     capture = native.read_capture(source)
     validate_capture(capture)
     _check(capture, preset, faults)

@@ -22,6 +22,7 @@ from registration.capture.text import listed
 from registration.capture.validation import eye_distance, validate_capture
 from registration.frames import MM_PER_M, opencv_intrinsics
 from registration.geometry.meshlab import scan_topology
+from registration.storage.files import check_output_file
 from registration.types import Camera, Capture, View
 
 NO_TOPOLOGY = "not checked, PyMeshLab is not installed or cannot start (make setup-optional)"
@@ -129,6 +130,8 @@ def check_capture(path: Path, sheet: Path | None = None) -> CaptureReport:
     Raises:
         InputError: as `native.read_capture` and `validate_capture`; nothing is written then.
     """
+    if sheet is not None:
+        check_output_file(Path(sheet))
     capture = native.read_capture(path)
     ledger = validate_capture(capture)
     scan = None if capture.scan is None else read_scan(capture.scan)

@@ -9,6 +9,7 @@ from registration.errors import InputError
 from registration.storage.reading import read_json
 
 _FORMAT = 'write {"<scheme>": [[x_px, y_px, confidence], ...]}'
+MAX_COORDINATE_PX = 1e9  # far beyond any image; squares of larger numbers overflow
 _NOT_SEEN = [0.0, 0.0, 0.0]
 
 
@@ -40,8 +41,9 @@ def read_landmarks(path: Path) -> dict[str, Float[np.ndarray, "L 3"]]:
             raise refuse(f'three numbers a point in scheme "{scheme}"', f"an array of shape {points.shape}", fix)
         if points.ndim != 2 or points.shape[1] != 3:
             raise refuse(f'three numbers a point in scheme "{scheme}"', f"an array of shape {points.shape}")
-        if not np.isfinite(points).all():
-            broken = int(np.argwhere(~np.isfinite(points))[0, 0])
+        usable = np.abs(points) < MAX_COORDINATE_PX  # false for NaN
+        if not usable.all():
+            broken = int(np.argwhere(~usable)[0, 0])
             raise refuse(f'finite numbers in scheme "{scheme}"', f"point {broken}: {rows[broken]}")
         landmarks[scheme] = points
     return landmarks

@@ -1,6 +1,8 @@
 """Read native capture folders: `capture.toml`, a COLMAP model, and image files (docs/formats.md)."""
 
+import os
 import re
+from functools import partial
 from pathlib import Path
 
 from registration.capture.colmap import read_cameras
@@ -9,6 +11,7 @@ from registration.capture.image_names import image_file
 from registration.capture.landmark_files import read_landmarks
 from registration.capture.settings import read_settings
 from registration.errors import InputError
+from registration.storage.reading import open_file
 from registration.types import Camera, Capture, View
 
 
@@ -75,12 +78,19 @@ def _read_view(root: Path, file_name: str, camera: Camera) -> View:
 
 
 def _optional(root: Path, path: Path) -> Path | None:
-    return _inside(root, path) if path.is_file() else None
+    """The path of a file that may be missing. Raises InputError if something else is in its place."""
+    if not os.path.lexists(path):
+        return None
+    fix = "put the file itself there, or remove what is in its place"
+    open_file(
+        _inside(root, path), partial(InputError, "A file of the capture cannot be read", where=path, fix=fix)
+    ).close()
+    return path
 
 
 def _inside(root: Path, path: Path) -> Path:
     """Return the path if it stays within the capture when symbolic links are followed. Raises InputError."""
-    if not (target := path.resolve()).is_relative_to(root.resolve()):
+    if not (target := Path(os.path.realpath(path))).is_relative_to(os.path.realpath(root)):
         raise InputError(
             "A link leads out of the capture",
             where=path,

@@ -128,13 +128,18 @@ def read_labels(path: Path, camera: Camera, classes: tuple[str, ...]) -> UInt8[n
     """Read a label map, distorted: indices into `classes`. Raises InputError for an index without a name."""
     header = require_size(path, "label map", camera.width_px, camera.height_px)
     require_complete(path, "label map")
+    refuse = _undecodable(path, "label map")
     try:
         with Image.open(path, formats=FORMATS) as image:  # unlike OpenCV it does not convert palette indices to colours
             mode, form = image.mode, image.format
-            labels = np.array(image)
+            plain = mode == "L" and header.png_bits == 8
+            labels = decode(path, cv2.IMREAD_UNCHANGED, refuse) if plain else np.array(image)
+    except InputError:
+        raise
     except Exception as error:  # a damaged file makes Pillow raise nearly anything
-        got = f"{type(error).__name__}: {error}"
-        raise _undecodable(path, "label map")(expected="a whole, undamaged image", got=got) from None
+        raise refuse(expected="a whole, undamaged image", got=f"{type(error).__name__}: {error}") from None
+    if not plain:  # Pillow takes pixels that are missing for 0
+        decode(path, cv2.IMREAD_UNCHANGED, refuse)
     if mode == "L" and header.png_bits in (2, 4):  # Pillow scales them to 8 bits
         labels = labels // (255 // (2**header.png_bits - 1))
     if form == "JPEG" or mode not in ("L", "P") or labels.dtype != np.uint8:

@@ -269,7 +269,7 @@ def load_named(recipe: str | T, table: Mapping[str, Callable[[], T]], type_: typ
         raise invalid(got=f"the name {name}")
     try:
         loaded = _import(module, function)()
-    except Exception as error:  # the module is the user's: anything may go wrong
+    except (Exception, SystemExit) as error:  # the module is the user's: anything may go wrong
         raise invalid(got=f"{type(error).__name__}: {error}") from error
     if not isinstance(loaded, type_):
         raise invalid(got=f"a function that returns {type(loaded).__name__}")

@@ -10,6 +10,7 @@ from rich.table import Table
 from registration.frames import MM_PER_M
 from registration.model import gnm_npz, landmarks, regions
 from registration.model.gnm_npz import GNMData
+from registration.storage.files import check_output_file
 
 COLOURS = {  # of the classes in images, linear
     "skin": (0.86, 0.70, 0.60),
@@ -35,6 +36,8 @@ def describe(path: Path, picture: Path | None = None, console: Console | None = 
         InputError: the file is not a GNM model.
     """
     console = console or Console()
+    if picture is not None:
+        check_output_file(Path(picture))
     data = gnm_npz.read(path)
     schemes = landmarks.schemes_beside(path, len(data.template_vertex_positions))
     console.print(f"[bold]{path}[/]  GNM {data.variant} {data.version}  sha256 {gnm_npz.content_hash(data)[:12]}")

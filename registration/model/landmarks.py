@@ -11,7 +11,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from registration.errors import InputError
-from registration.storage.reading import read_list
+from registration.storage.reading import read_text
 
 _PREFIX = "head_sparse_"
 _FIX = "write one landmark a row as `i0 w0 i1 w1 i2 w2`: vertex indices from 0, weights that sum to 1"
@@ -49,9 +49,9 @@ def read_scheme(path: Path, vertex_count: int, name: str | None = None) -> Landm
         InputError: the file has other rows, a vertex index is out of range, or weights do not sum to one.
     """
     path = Path(path)
-    lines = read_list(path, partial(InputError, "The landmark scheme cannot be read", where=path, fix=_FIX))
+    text = read_text(path, partial(InputError, "The landmark scheme cannot be read", where=path, fix=_FIX))
     try:
-        rows = [[float(word) for word in line.split()] for line in lines]
+        rows = [[float(word) for word in line.split()] for line in text.splitlines() if line.strip()]
     except ValueError as error:
         raise _input_error("cannot be read", path, "rows of six numbers", error) from None
     for number, row in enumerate(rows):

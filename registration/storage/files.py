@@ -123,6 +123,19 @@ def refuse_foreign(
         )
 
 
+def check_output_file(file: Path) -> None:
+    """Refuse, before any work, a file that cannot be written: a folder is in its place, or a file in its folder's.
+
+    Raises:
+        InputError: as above.
+    """
+    parents = [parent for parent in Path(file).absolute().parents if parent.exists()]
+    got = "a folder" if file.is_dir() else None if parents[0].is_dir() else f"{parents[0]} is no folder"
+    if got is not None:
+        fix = "choose another file"
+        raise InputError("The output file cannot be written", where=file, expected="a file's name", got=got, fix=fix)
+
+
 def read_json_of_kind(file: Path, kind: str) -> dict[str, Any] | None:
     """Return the JSON object in a file if its `kind` is this one, of any schema version, else None."""
     try:

@@ -134,8 +134,16 @@ def read_text(file: Path, refuse: Refuse, *, max_bytes: int = MAX_TEXT_BYTES) ->
 
 
 def read_list(file: Path, refuse: Refuse, *, max_bytes: int = MAX_TEXT_BYTES) -> list[str]:
-    """Read a list, one entry on each line; blank lines and spaces around entries are dropped. Raises as `read_text`."""
-    return [line.strip() for line in read_text(file, refuse, max_bytes=max_bytes).splitlines() if line.strip()]
+    """Read a list of names or paths, one on each line; blank lines and spaces around entries are dropped.
+
+    Raises:
+        InputError: as `read_text`; an entry can be no path.
+    """
+    entries = [line.strip() for line in read_text(file, refuse, max_bytes=max_bytes).splitlines()]
+    for number, entry in enumerate(entries, 1):
+        if defect := path_defect(entry):
+            raise refuse(expected="names or paths", got=f"{defect} in line {number}")
+    return [entry for entry in entries if entry]
 
 
 def raw_lines(file: Path, refuse: Refuse) -> Iterator[bytes]:

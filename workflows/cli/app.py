@@ -18,7 +18,14 @@ import tyro
 
 from registration.errors import InputError
 from workflows.cli import capture, coregister, farm, model, register, stabilize, store
-from workflows.cli.arguments import PRINT_COMPLETION, SHELLS, completion, merge_repeated_options
+from workflows.cli.arguments import (
+    PRINT_COMPLETION,
+    SHELLS,
+    check_words,
+    completion,
+    merge_repeated_options,
+    unusable_path,
+)
 from workflows.cli.options import Command
 from workflows.ids import nearest
 
@@ -80,9 +87,15 @@ def main(args: Sequence[str] | None = None) -> int:
             raise
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # else the interpreter complains when it ends
         return 141
+    except OSError as error:
+        if error.filename is None:  # not of a file that the user named
+            raise
+        print(unusable_path(error), file=sys.stderr)
+        return 2
 
 
 def _run(words: list[str]) -> int:
+    check_words(words)
     name = _command_name(words)
     if name is None:
         _explain(words)

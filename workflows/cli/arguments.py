@@ -25,6 +25,32 @@ class Option:
     choices: tuple[str, ...] = ()
 
 
+def check_words(words: Sequence[str]) -> None:
+    """Refuse arguments that are no UTF-8: they could neither be printed nor stored. Raises InputError."""
+    for word in words:
+        try:
+            word.encode("utf-8")
+        except UnicodeEncodeError:
+            raise InputError(
+                "An argument cannot be read",
+                where="the command line",
+                expected="text in UTF-8",
+                got=ascii(word),
+                fix="rename the file or folder",
+            ) from None
+
+
+def unusable_path(error: OSError) -> InputError:
+    """Return the error for a path that the system refuses: too long, a loop of links, without permission."""
+    return InputError(
+        "A file or folder cannot be used",
+        where=error.filename,
+        expected="a path that can be opened, read and written",
+        got=error.strerror or type(error).__name__,
+        fix="check the path, its permissions and the disk",
+    )
+
+
 def options_of(command: Callable[..., int]) -> dict[str, Option]:
     """Return the options of a command, by name, in the order of its help."""
     found = {option.name: option for option in _options(command, get_type_hints(command, include_extras=True))}

@@ -139,6 +139,13 @@ class RunOptions(FarmOptions):
         arg(metavar="DIR", help_behavior_hint="(default: the current folder; with --local, OUT.farm beside --out)"),
     ] = None
 
+    def __post_init__(self) -> None:
+        if self.workers < 1:
+            fix = "use one or more"
+            raise InputError(
+                "There are no workers", where="--workers", expected="at least 1", got=self.workers, fix=fix
+            )
+
     def farm_folder(self, out: str | Path) -> Path:
         """Return the farm's folder for a run whose results go to `out`.
 

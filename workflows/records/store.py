@@ -9,6 +9,7 @@ compute the same artifact do not interfere, and one that dies leaves files that 
 """
 
 import hashlib
+import os
 import posixpath
 import shutil
 import tempfile
@@ -23,6 +24,7 @@ from typing import Any
 
 from registration.errors import InputError
 from registration.storage.files import atomic_write_text
+from registration.storage.reading import MAX_TEXT_BYTES, open_file, read_bytes
 from registration.storage.records import Record
 from workflows.ids import check_id, is_remote, redact, resolve_place
 from workflows.records.remote import filesystem
@@ -96,11 +98,19 @@ class Store:
             InputError: the record is malformed, or names a file outside its attempt.
         """
         path = self._path(key, MANIFEST)
-        try:
-            content = self._fs.cat_file(path)
-        except FileNotFoundError:
-            return None
-        return _checked(content, where=f"{self.url}/{key}/{MANIFEST}", key=key)
+        where = f"{self.url}/{key}/{MANIFEST}"
+        if self.local is not None:
+            if not os.path.lexists(path):
+                return None
+            content = read_bytes(Path(path), partial(Artifact.invalid, where))
+        else:
+            try:
+                if (size := self._fs.size(path) or 0) > MAX_TEXT_BYTES:
+                    raise Artifact.invalid(where, expected=f"at most {MAX_TEXT_BYTES} bytes", got=size)
+                content = self._fs.cat_file(path)
+            except FileNotFoundError:
+                return None
+        return _checked(content, where=where, key=key)
 
     def produce(self, key: str, *, input_hash: str, make: Callable[[Path], Mapping[str, Any]]) -> Artifact:
         """Return the artifact of a key: the published one if it has this input hash, else a new one.
@@ -139,7 +149,15 @@ class Store:
                 yield posixpath.dirname(name)
 
     def verify(self) -> VerificationReport:
-        """Read every file of the store and compare it with the records."""
+        """Read every file of the store and compare it with the records.
+
+        Raises:
+            InputError: a local store that is no folder.
+        """
+        if self.local is not None and not self.local.is_dir():
+            got = "a file" if self.local.exists() else "no such folder"
+            fix = "check the path: `gnmreg batch --out` names it"
+            raise InputError("There is no store", where=self.url, expected="a folder", got=got, fix=fix)
         names, missing, altered, unreadable = set(self._names()), [], [], {}
         manifests = {name for name in names if posixpath.basename(name) == MANIFEST and not _in_attempt(name)}
         known = set(manifests)
@@ -155,7 +173,7 @@ class Store:
                 known.add(path)
                 if path not in names:
                     missing.append(path)
-                elif _digest(self._fs.open(self._path(path), "rb")) != stored.sha256:
+                elif self._digest_of(path) != stored.sha256:
                     altered.append(path)
         return VerificationReport(
             artifacts=len(manifests),
@@ -241,6 +259,15 @@ class Store:
             )
         except FileNotFoundError:
             return False
+
+    def _digest_of(self, name: str) -> str:
+        """sha256 of a file; empty if it is no regular file that can be read."""
+        if self.local is None:
+            return _digest(self._fs.open(self._path(name), "rb"))
+        try:
+            return _digest(open_file(Path(self._path(name)), partial(Artifact.invalid, name)))
+        except InputError:
+            return ""
 
     def _names(self, below: str = "") -> Iterator[str]:
         self._fs.invalidate_cache()

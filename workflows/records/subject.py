@@ -1,6 +1,7 @@
 """A subject on disk: the folder of their captures, and the folder of their registrations with its `subject.json`
 (docs/formats.md)."""
 
+import os
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -90,7 +91,7 @@ class SubjectRecord(
 
 def is_subject_folder(folder: Path) -> bool:
     """Return whether a folder holds a `subject.json`, valid or not."""
-    return (Path(folder) / MANIFEST).is_file()
+    return os.path.lexists(Path(folder) / MANIFEST)
 
 
 def read_subject(folder: Path) -> SubjectRecord | None:
@@ -190,7 +191,9 @@ def _capture_folders(folder: Path) -> list[Path]:
             got="a file" if folder.exists() else "no such folder",
             fix="check the path",
         )
-    below = [path for path in folder.iterdir() if not path.name.startswith(".") and (path / "capture.toml").is_file()]
+    below = [
+        path for path in folder.iterdir() if not path.name.startswith(".") and os.path.lexists(path / "capture.toml")
+    ]
     if not below:
         itself = (folder / "capture.toml").is_file()
         raise InputError(

@@ -6,7 +6,7 @@ from typing import Any
 
 from coregister.synthetic import expressions, subject
 from coregister.synthetic.capture import Studio, check_studio
-from registration.errors import InputError
+from registration.errors import InputError, check_seed
 from registration.progress import NullProgress, Progress
 from registration.storage.hashing import to_jsonable, versions
 from workflows.processes import run_parallel
@@ -63,6 +63,8 @@ def synth_dataset(
     """
     progress, out = progress or NullProgress(), Path(out)
     _check(population)
+    if jobs < 1:
+        raise _input_error("The number of jobs is out of range", "jobs", "at least 1", jobs)
     record = _make_record(population)
     _check_out(out, record)
     calls: dict[str, dict[str, Any]] = {}
@@ -139,8 +141,8 @@ def _check(population: Population) -> None:
         raise _input_error(
             "The number of subjects is out of range", "subjects", f"1 to {MAX_SUBJECTS}", population.subjects
         )
-    if population.seed < 0:
-        raise _input_error("The seed is out of range", "seed", "a whole number from 0", population.seed)
+    check_seed(population.seed)
+    check_seed(MAX_SUBJECTS * (population.seed + 1) - 1)  # the seeds of its subjects
     if not 0 <= population.held_out <= population.subjects:
         expected = f"0 to {population.subjects}"
         raise _input_error("More subjects are held out than there are", "held-out", expected, population.held_out)
