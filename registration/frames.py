@@ -13,6 +13,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 MM_PER_M = 1e3
+NEAR_ORIGIN_M = 5.0  # a subject within it is computed in the capture's world itself
+_FLOAT32_M = 8.0  # float32 is accurate to 0.25 micrometres within it
 
 
 def axis_angle_to_matrix(axis_angle: Float[Tensor, "... 3"]) -> Float[Tensor, "... 3 3"]:
@@ -42,6 +44,22 @@ def transform_points(
 ) -> Float[np.ndarray, "... 3"]:
     """Apply a rigid or affine 4x4 transform to points."""
     return points @ transform[:3, :3].T + transform[:3, 3]
+
+
+def local_origin(subject: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3"]:
+    """Return the origin near a subject around which it is computed, world, whole metres; zero if the world's is near.
+
+    Georeferenced worlds have coordinates of thousands of kilometres, for which float32 has steps of half a metre.
+
+    Args:
+        subject: about where it is, metres, world.
+    """
+    return np.zeros(3) if np.linalg.norm(subject) < NEAR_ORIGIN_M else np.round(np.asarray(subject, np.float64))
+
+
+def compact(points: Float[np.ndarray, "*P 3"]) -> Float[np.ndarray, "*P 3"]:
+    """Return points (m) as float32, or as float64 where float32 would lose micrometres."""
+    return np.asarray(points, np.float64 if (np.abs(points) > _FLOAT32_M).any() else np.float32)
 
 
 def opencv_intrinsics(intrinsics: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "3 3"]:

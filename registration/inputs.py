@@ -10,6 +10,7 @@ from jaxtyping import Float
 
 from registration.capture.ledger import Ledger
 from registration.capture.native import read_capture
+from registration.capture.origin import capture_origin
 from registration.capture.triangulation import triangulate
 from registration.capture.validation import validate_capture
 from registration.errors import InputError
@@ -41,7 +42,8 @@ class RegistrationInputs:
     ledger: Ledger  # of all views
     data: gnm_npz.GNMData
     schemes: Mapping[str, LandmarkScheme]
-    landmarks: Mapping[str, Float[np.ndarray, "L 3"]]  # triangulated, of the schemes that capture and model share
+    origin: Float[np.ndarray, "3"]  # world, m: the fit's own world has its origin here
+    landmarks: Mapping[str, Float[np.ndarray, "L 3"]]  # triangulated, world; of the shared schemes
     recipe: Recipe
     neutral: Registration | None
     digests: Mapping[str, str]  # input -> sha256
@@ -87,6 +89,7 @@ def read_inputs(
         ledger=ledger,
         data=data,
         schemes=schemes,
+        origin=capture_origin([view.camera for view in capture.views]),
         landmarks=landmarks,
         recipe=recipe if start is None else expression_recipe(recipe),
         neutral=start,

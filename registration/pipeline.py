@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from jaxtyping import Float
 
 from registration.evaluate.audit import audit_penetration
 from registration.evaluate.evaluation import RegistrationEvaluation, evaluate_registration, without_scan
@@ -120,7 +121,7 @@ def _fit(
     problem = FitProblem(context, initial)
     initial_time = time.perf_counter()
     seconds = {"targets": targets_time - start_time, "start": initial_time - targets_time}
-    snapshots = None if pictures is None else _Snapshots(problem, pictures)
+    snapshots = None if pictures is None else _Snapshots(problem, pictures, inputs.origin)
     steps = _StepProgress(inputs.recipe.stages, progress)
 
     def on_step(stage: Stage, step: int) -> None:
@@ -138,7 +139,7 @@ def _context(inputs: RegistrationInputs, seed: int, device: torch.device, progre
     """Decode the views and collect the inputs of the fit."""
     classes, recipe, count = class_map(inputs.capture.classes), inputs.recipe, len(inputs.capture.views)
     pyramid = build_pyramid(
-        inputs.capture,
+        inputs.capture.cameras_relative_to(inputs.origin),
         classes,
         finest_head_px=recipe.finest_head_px,
         levels=recipe.levels,
@@ -173,8 +174,8 @@ class _StepProgress:
 class _Snapshots:
     """Writes an image and the mesh of the fit after its initial guess and after each stage."""
 
-    def __init__(self, problem: FitProblem, folder: Path):
-        self._problem, self._folder = problem, folder
+    def __init__(self, problem: FitProblem, folder: Path, origin: Float[np.ndarray, "3"]):
+        self._problem, self._folder, self._origin = problem, folder, origin
         self._views = select_spread_views(problem.context.pyramid[0].pixels.cameras, _STAGE_VIEWS)
         self._states = ["start"]  # what the mesh is the result of, in order
 
@@ -182,9 +183,10 @@ class _Snapshots:
         """Write the state before stage `name`, once."""
         if name == self._states[-1]:
             return
-        views, vertices = report_views(*self._problem.render_views(self._views)), self._problem.vertices()
+        views = report_views(*self._problem.render_views(self._views))
+        vertices = _in_world(self._problem.vertices().cpu().numpy(), self._origin)
         label = f"{len(self._states) - 1:02d}_{self._states[-1]}"
-        write_stage(self._folder, label, views, vertices.cpu().numpy(), self._problem.context.data.triangles)
+        write_stage(self._folder, label, views, vertices, self._problem.context.data.triangles)
         self._states.append(name)
 
 
@@ -192,7 +194,7 @@ def _initial_guess(inputs: RegistrationInputs, context: FitContext, progress: Pr
     """From landmarks if model and capture share a scheme, else from the neutral's pose or from the masks."""
     neutral = None
     if inputs.neutral is not None:
-        parameters = _parameters(inputs.neutral)
+        parameters = _parameters(inputs.neutral, inputs.origin)
         neutral = initial_guess_from(parameters, inputs.neutral.offsets, context.model, inputs.data)
     unknown = {name for view in inputs.capture.views for name in view.landmarks} - set(inputs.schemes)
     if unknown:
@@ -200,7 +202,7 @@ def _initial_guess(inputs: RegistrationInputs, context: FitContext, progress: Pr
     counts = {name: int(np.isfinite(points).all(1).sum()) for name, points in inputs.landmarks.items()}
     best = max(counts, key=lambda name: counts[name], default=None)
     if best is not None and counts[best] >= MIN_LANDMARKS:
-        scheme, points, free_scale = inputs.schemes[best], inputs.landmarks[best], inputs.recipe.scale
+        scheme, points, free_scale = inputs.schemes[best], inputs.landmarks[best] - inputs.origin, inputs.recipe.scale
         return from_landmarks(inputs.data, scheme, points, free_scale=free_scale, neutral=neutral)
     if neutral is not None and assess(context, neutral).overlap >= MIN_OVERLAP:
         return replace(neutral, notes=("no landmarks: starting from the neutral's pose",))
@@ -208,9 +210,16 @@ def _initial_guess(inputs: RegistrationInputs, context: FitContext, progress: Pr
     return from_masks(inputs.data, context.pyramid[-1], partial(assess, context), partial(refine, context))
 
 
-def _parameters(registration: Registration) -> Parameters:
-    names = ("identity", "expression", "rotations", "translation", "scale")
-    return Parameters(**{name: torch.as_tensor(np.asarray(getattr(registration, name))) for name in names})
+def _parameters(registration: Registration, origin: Float[np.ndarray, "3"]) -> Parameters:
+    """A registration's parameters in the world around `origin`."""
+    names = ("identity", "expression", "rotations", "scale")
+    values = {name: torch.as_tensor(np.asarray(getattr(registration, name))) for name in names}
+    return Parameters(**values, translation=torch.as_tensor(np.asarray(registration.translation - origin, np.float32)))
+
+
+def _in_world(points: Float[np.ndarray, "*P 3"], origin: Float[np.ndarray, "3"]) -> Float[np.ndarray, "*P 3"]:
+    """Points of the fit in the capture's world: as they are, or in float64 where its origin is far."""
+    return points + origin if origin.any() else points
 
 
 def _collect(inputs: RegistrationInputs, fitted: _Fitted, comparison: Comparison) -> Registration:
@@ -218,7 +227,8 @@ def _collect(inputs: RegistrationInputs, fitted: _Fitted, comparison: Comparison
     problem, trace = fitted.problem, fitted.trace
     parameters, offsets = problem.variables.parameters()
     vertices, errors = problem.vertices().cpu().numpy(), problem.view_errors()
-    landmark_px = problem.landmark_residuals_px(inputs.landmarks)
+    local = {name: points - inputs.origin for name, points in inputs.landmarks.items()}
+    landmark_px = problem.landmark_residuals_px(local)
     skin = exterior(inputs.data)
     inside = [name for name, scheme in inputs.schemes.items() if not skin[scheme.indices].any()]
     status, reason = _status(trace, landmark_px, inside, errors)
@@ -232,15 +242,15 @@ def _collect(inputs: RegistrationInputs, fitted: _Fitted, comparison: Comparison
         identity=array(parameters.identity),
         expression=array(parameters.expression),
         rotations=array(parameters.rotations),
-        translation=array(parameters.translation),
+        translation=_in_world(array(parameters.translation), inputs.origin),
         scale=array(parameters.scale),
         offsets=array(offsets),
-        vertices=vertices,
+        vertices=_in_world(vertices, inputs.origin),
         triangles=inputs.data.triangles,
         confidence=comparison.confidence,
         texture=array(problem.appearance.texture),
         corner_uvs=problem.context.corner_uvs,
-        landmarks={name: scheme.points(vertices) for name, scheme in inputs.schemes.items()},
+        landmarks={name: _in_world(scheme.points(vertices), inputs.origin) for name, scheme in inputs.schemes.items()},
         seconds=fitted.seconds,
         history=trace.history,
         figures={
@@ -295,10 +305,13 @@ def _evaluate(
     finite = np.isfinite(registration.vertices).all()
     if finite:
         progress.message("auditing intersections between parts")
-        audit = audit_penetration(registration.vertices, inputs.data, scale=float(registration.scale))
+        vertices = registration.vertices - inputs.origin if inputs.origin.any() else registration.vertices
+        audit = audit_penetration(vertices, inputs.data, scale=float(registration.scale))
         shown = {view.name for view in comparison.views}
-        cameras = {view.name: view.camera for view in inputs.capture.views if view.name in shown}
-        intersections = intersection_figures(audit, registration.vertices, cameras)
+        cameras = {
+            view.name: view.camera.relative_to(inputs.origin) for view in inputs.capture.views if view.name in shown
+        }
+        intersections = intersection_figures(audit, vertices, cameras)
         registration = replace(registration, figures={**registration.figures, "intersections": intersections})
     if inputs.capture.scan is not None and finite:
         progress.message("measuring against the scan")

@@ -29,6 +29,14 @@ class Camera:
         """The camera's position in the world, metres."""
         return -self.T_cam_world[:3, :3].T @ self.T_cam_world[:3, 3]
 
+    def relative_to(self, origin: Float[np.ndarray, "3"]) -> "Camera":
+        """The same camera in a world whose origin is at `origin`, metres."""
+        if not origin.any():
+            return self
+        T = self.T_cam_world.copy()
+        T[:3, 3] += T[:3, :3] @ origin
+        return replace(self, T_cam_world=T)
+
     def scaled(self, width_px: int, height_px: int) -> "Camera":
         """The same camera for an image resampled to this size."""
         scale = np.diag([width_px / self.width_px, height_px / self.height_px, 1.0])
@@ -72,6 +80,11 @@ class Capture:
     tags: Mapping[str, Any] = field(default_factory=dict)
     scan: Path | None = None
     ground_truth: Path | None = None
+
+    def cameras_relative_to(self, origin: Float[np.ndarray, "3"]) -> "Capture":
+        """The same capture with cameras in a world whose origin is at `origin`, metres; files keep the old world."""
+        views = tuple(replace(view, camera=view.camera.relative_to(origin)) for view in self.views)
+        return replace(self, views=views)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -203,14 +216,17 @@ class Parameters:
 
 @dataclass(frozen=True, kw_only=True)
 class Registration:
-    """The registered mesh of one capture and how it was computed. Arrays are float32, in the model's vertex order."""
+    """The registered mesh of one capture and how it was computed. Arrays are in the model's vertex order.
+
+    They are float32, but `translation`, `vertices` and `landmarks` are float64 where the world's origin is far.
+    """
 
     status: Status
     reason: str
     identity: Float[np.ndarray, "I"]
     expression: Float[np.ndarray, "E"]
     rotations: Float[np.ndarray, "J 3"]
-    translation: Float[np.ndarray, "3"]
+    translation: Float[np.ndarray, "3"]  # capture world, metres
     scale: Float[np.ndarray, ""]
     offsets: Float[np.ndarray, "V 3"]  # bind space, metres
     vertices: Float[np.ndarray, "V 3"]  # capture world, metres

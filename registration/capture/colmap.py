@@ -30,7 +30,7 @@ _WRITTEN = {0: "PINHOLE", 4: "OPENCV", 5: "FULL_OPENCV", 8: "FULL_OPENCV"}  # by
 _READERS = {"bin": read_binary_model, "txt": read_text_model}
 _NEEDED = ("cameras", "images")  # files of a model; points, rigs and frames may be missing
 _GREY = 128  # colour of points that have none
-_SAME_POSE = 1e-6  # entries of two matrices of one pose, metres and cosines
+_SAME_POSE, _ROUNDING = 1e-6, 1e-11  # of entries of two matrices of one pose, metres and cosines; relative
 
 
 def read_cameras(sparse: Path) -> dict[str, Camera]:
@@ -228,7 +228,8 @@ def _check_frames(model: ColmapModel) -> None:
                 rig_from_world if sensor is None else _matrix(sensor, f"rig of image {image.name}") @ rig_from_world
             )
             pose = _matrix((image.quaternion_wxyz, image.translation), where)
-            if not np.allclose(pose, expected, rtol=_SAME_POSE, atol=_SAME_POSE):
+            tolerance = _SAME_POSE + _ROUNDING * np.abs(pose).max()  # of far worlds, whose translations are large
+            if not np.allclose(pose, expected, rtol=0, atol=tolerance):
                 raise InputError(
                     "An image's pose is not that of its frame",
                     where=where,

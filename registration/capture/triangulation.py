@@ -5,6 +5,7 @@ from itertools import combinations
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from registration.capture.origin import capture_origin
 from registration.capture.pixels import undistort_landmarks
 from registration.types import Camera, Capture, View
 
@@ -38,7 +39,8 @@ def triangulate(
     pixels = np.stack([undistort_landmarks(view, scheme) for view in views])  # N L 3
     observed = (pixels[..., 2] > MIN_CONFIDENCE) & np.isfinite(pixels).all(-1)
     rays = np.stack([_normalized(view.camera.intrinsics, xy) for view, xy in zip(views, pixels[..., :2], strict=True)])
-    poses = np.stack([view.camera.T_cam_world[:3] for view in views])
+    origin = capture_origin([view.camera for view in views])
+    poses = np.stack([view.camera.relative_to(origin).T_cam_world[:3] for view in views])
     focals = np.array([[view.camera.intrinsics[0, 0], view.camera.intrinsics[1, 1]] for view in views])
     limits = np.array([inlier_limit_px(view.camera) for view in views])
 
@@ -52,7 +54,7 @@ def triangulate(
         if solution is not None:
             points[landmark], inliers, residuals[landmark] = solution
             used[landmark] = inliers.sum()
-    return points, used, residuals
+    return points + origin, used, residuals
 
 
 def _normalized(intrinsics: Float[np.ndarray, "3 3"], xy: Float[np.ndarray, "L 2"]) -> Float[np.ndarray, "L 2"]:

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float
 
-from registration.frames import MM_PER_M, transform_points
+from registration.frames import MM_PER_M, compact, transform_points
 from registration.geometry.rigid import align
 from registration.stabilize.subject_meshes import SkullSkin, SubjectMeshes
 
@@ -83,7 +83,7 @@ def stabilize_subject(
     aligned = [transform_points(T, vertices) for T, vertices in zip(transforms, meshes.vertices, strict=True)]
     return AlignedExpressions(
         T_neutral_expression=transforms,
-        vertices=np.stack(aligned).astype(np.float32),
+        vertices=compact(np.stack(aligned)),
         confidence_map=confidence_map,
         residual_mm=np.stack([np.sqrt((weights * squared).sum(1) / weights.sum(1)) for squared in history], 1),
     )

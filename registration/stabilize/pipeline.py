@@ -157,7 +157,7 @@ def apply_corrections(subject: StabilizedSubject, corrections: Corrections, firs
         zip(subject.vertices, subject.T_neutral_expression, strict=True), first_sample
     ):
         points = corrections.apply(transform_points(T_head_world, expression.astype(np.float64)), sample)
-        vertices.append(transform_points(T_world_head, points).astype(np.float32))
+        vertices.append(transform_points(T_world_head, points).astype(expression.dtype))
         transforms.append(T_world_head @ corrections.T_corrected_head(sample) @ T_head_world @ T_neutral_expression)
     return StabilizedSubject(
         subject=subject.subject,
@@ -188,4 +188,4 @@ class Displacements:
         for subject in self._subjects():
             R_world_head = subject.T_head_world[:3, :3].T.astype(np.float32)
             for vertices in subject.vertices:
-                yield (vertices - subject.neutral) @ R_world_head  # row vectors
+                yield (vertices - subject.neutral).astype(np.float32) @ R_world_head  # row vectors

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from registration.frames import compact
 from registration.stabilize.components import RegionalComponents
 from registration.stabilize.pipeline import StabilizedSubject
 from registration.storage.files import atomic_directory, refuse_foreign
@@ -150,8 +151,10 @@ def write_subject(subject: StabilizedSubject, folder: Path, number: int) -> str:
         The content id of its arrays.
     """
     arrays = {name: getattr(subject, name) for name in _SUBJECT_ARRAYS}
-    for name in ("neutral", "vertices", "confidence_map", "residual_mm"):
+    for name in ("confidence_map", "residual_mm"):
         arrays[name] = arrays[name].astype(np.float32)
+    for name in ("neutral", "vertices"):
+        arrays[name] = compact(arrays[name])
     texts = {name: np.array(getattr(subject, name)) for name in ("subject", "names", "labels")}
     np.savez(folder / SUBJECTS / f"{number:04d}.npz", allow_pickle=False, **arrays, **texts)
     return hash_arrays(*arrays.values())

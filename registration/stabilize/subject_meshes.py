@@ -7,6 +7,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from registration.errors import InputError
+from registration.frames import compact
 from registration.geometry.topology import vertex_areas
 from registration.model import regions
 from registration.model.gnm_npz import GNMData, topology_hash
@@ -17,7 +18,10 @@ _MIN_OBSERVED = 0.2  # fraction of the skin on the skull that an alignment needs
 
 @dataclass(frozen=True, kw_only=True)
 class SubjectMeshes:
-    """A neutral and S expressions in the model's topology: vertices float32, metres; confidence in [0, 1]."""
+    """A neutral and S expressions in the model's topology, metres; confidence in [0, 1].
+
+    Vertices are float32, or float64 where the world's origin is far.
+    """
 
     subject: str
     neutral: Float[np.ndarray, "V 3"]  # in its capture's world
@@ -77,7 +81,7 @@ def subject_meshes(
         _check(f"{subject}, {name}", registration, skin)
         names.append(name)
         labels.append(label)
-        vertices.append(registration.vertices.astype(np.float32))
+        vertices.append(compact(registration.vertices))
         confidence.append(registration.confidence.astype(np.float32))
     if not names:
         raise InputError(
@@ -89,7 +93,7 @@ def subject_meshes(
         )
     return SubjectMeshes(
         subject=subject,
-        neutral=neutral.vertices.astype(np.float32),
+        neutral=compact(neutral.vertices),
         neutral_confidence=neutral.confidence.astype(np.float32),
         names=tuple(names),
         labels=tuple(labels),

@@ -5,17 +5,24 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, Int
 
+from registration.frames import compact
+
 
 def write_ply(file: Path, vertices: Float[np.ndarray, "V 3"], triangles: Int[np.ndarray, "F 3"]) -> None:
-    """Write a binary little-endian PLY with exactly these vertices, float32, in this order; without uvs."""
+    """Write a binary little-endian PLY with exactly these vertices in this order, without uvs.
+
+    Coordinates are float32, or float64 where float32 would lose micrometres.
+    """
+    vertices = compact(vertices)
+    kind, code = ("double", "<f8") if vertices.dtype == np.float64 else ("float", "<f4")
     header = (
         "ply\nformat binary_little_endian 1.0\n"
-        f"element vertex {len(vertices)}\nproperty float x\nproperty float y\nproperty float z\n"
+        f"element vertex {len(vertices)}\nproperty {kind} x\nproperty {kind} y\nproperty {kind} z\n"
         f"element face {len(triangles)}\nproperty list uchar int vertex_indices\nend_header\n"
     )
     faces = np.empty(len(triangles), [("count", "u1"), ("corners", "<i4", 3)])
     faces["count"], faces["corners"] = 3, triangles
-    file.write_bytes(header.encode("ascii") + vertices.astype("<f4").tobytes() + faces.tobytes())
+    file.write_bytes(header.encode("ascii") + vertices.astype(code).tobytes() + faces.tobytes())
 
 
 def write_obj(
@@ -38,7 +45,8 @@ def write_obj(
     corners = np.stack([triangles, index.reshape(-1, 3)], -1).reshape(-1, 6) + 1
     material = file.with_suffix(".mtl")
     lines = [f"mtllib {material.name}"]
-    lines += ["v {:.7g} {:.7g} {:.7g}".format(*row) for row in vertices.tolist()]
+    form = "v {:.7f} {:.7f} {:.7f}" if compact(vertices).dtype == np.float64 else "v {:.7g} {:.7g} {:.7g}"
+    lines += [form.format(*row) for row in vertices.tolist()]
     lines += ["vt {:.7g} {:.7g}".format(*row) for row in uvs.tolist()]
     lines += ["usemtl head"]
     lines += ["f {}/{} {}/{} {}/{}".format(*row) for row in corners.tolist()]

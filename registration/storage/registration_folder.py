@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from registration.errors import InputError
-from registration.frames import linear_to_srgb, srgb_to_linear
+from registration.frames import compact, linear_to_srgb, srgb_to_linear
 from registration.storage.files import atomic_directory, atomic_write_text, has_kind, write_json
 from registration.storage.hashing import content_id, input_hash, to_jsonable, versions
 from registration.storage.image_files import decode, image_size
@@ -112,7 +112,8 @@ def is_registration(path: Path) -> bool:
 def save_registration(registration: Registration, out: Path, report_html: str | None = None) -> Path:
     """Write the whole folder; one that we wrote before is replaced in one rename.
 
-    Arrays are stored as float32 (triangles as int32), the texture as 16 bit sRGB.
+    Arrays are stored as float32 (triangles as int32; translation, vertices and landmarks as float64 where the world's
+    origin is far), the texture as 16 bit sRGB.
 
     Args:
         registration: the result.
@@ -218,11 +219,11 @@ def read_manifest(path: Path) -> RegistrationManifest:
 
 
 def _arrays(registration: Registration) -> dict[str, np.ndarray]:
-    arrays = {
-        name: np.asarray(getattr(registration, name), np.int32 if name in _INTEGERS else np.float32) for name in AXES
-    }
+    world = compact(registration.vertices).dtype
+    types: dict[str, np.dtype] = {"triangles": np.dtype(np.int32), "vertices": world, "translation": world}
+    arrays = {name: np.asarray(getattr(registration, name), types.get(name, np.dtype(np.float32))) for name in AXES}
     for scheme, points in registration.landmarks.items():
-        arrays[LANDMARKS + scheme] = np.asarray(points, np.float32)
+        arrays[LANDMARKS + scheme] = np.asarray(points, world)
     return arrays
 
 

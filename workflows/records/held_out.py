@@ -16,6 +16,7 @@ from registration.errors import InputError
 from registration.evaluate.evaluation import CLOUD_TOLERANCE
 from registration.evaluate.face import face_sphere, visible_in_two_views
 from registration.evaluate.folder import is_capture_of
+from registration.frames import compact, local_origin
 from registration.stabilize import stabilized_folder as stabilized
 from registration.storage.hashing import hash_arrays, hash_capture
 from registration.storage.npz import NpzSchema
@@ -82,13 +83,26 @@ def read_held_out(source: Path, captures: Path | None = None) -> HeldOutSet:
                 warnings.append(f"{capture.root} is not the capture of {folder / neutral}, or it has changed")
             subject = _with_captures(subject, capture, registration)
             inputs[f"capture {subject.subject}"] = hash_capture(capture)
-        subjects.append(subject)
+        subjects.append(around_origin(subject))
         topologies.append(registration.triangles)
     if other := [s.subject for s, t in zip(subjects, topologies, strict=True) if not np.array_equal(t, topologies[0])]:
         got = f"another of {other[0]}"
         raise _input_error("The held-out subjects have different topologies", source, "one topology", got)
     inputs["held_out"] = _digest(subjects)
     return HeldOutSet(subjects=tuple(subjects), triangles=topologies[0], inputs=inputs, warnings=tuple(warnings))
+
+
+def around_origin(subject: HeldOutSubject) -> HeldOutSubject:
+    """Return the same subject in a frame whose origin is near: models are fitted in float32."""
+    origin = local_origin(subject.neutral.mean(0))
+    if not origin.any():
+        return subject
+    return replace(
+        subject,
+        neutral=compact(subject.neutral - origin),
+        expressions=compact(subject.expressions - origin),
+        scan=None if subject.scan is None else subject.scan - origin,
+    )
 
 
 def _digest(subjects: Sequence[HeldOutSubject]) -> str:
@@ -123,13 +137,14 @@ def _from_rows(
         raise _input_error("A held-out subject has not one neutral", file, expected, f"{len(neutral)} of {subject}")
     others = [int(row) for row in rows if row != neutral[0]]
     categories = arrays.get(CATEGORIES, labels).astype(str)
-    return HeldOutSubject(
+    held_out = HeldOutSubject(
         subject=subject,
         neutral=arrays["vertices"][neutral[0]],
         expressions=arrays["vertices"][others],
         categories=tuple(categories[others].tolist()),
         tags={n.removeprefix(TAG): v[neutral[0]].item() for n, v in arrays.items() if n.startswith(TAG)},
     )
+    return around_origin(held_out)
 
 
 def _from_folder(folder: Path) -> tuple[HeldOutSubject, Registration, str]:

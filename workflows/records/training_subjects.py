@@ -12,6 +12,7 @@ from jaxtyping import Float
 from coregister.evaluate.evaluation import HeldOutSubject
 from coregister.next_model.training_data import TrainingMesh, TrainingSubject, transfer_to_unposed, unpose
 from registration.capture.scan import read_truth
+from registration.frames import compact
 from registration.model.gnm import GNM
 from registration.model.gnm_npz import GNMData
 from registration.stabilize import stabilized_folder as stabilized
@@ -19,7 +20,7 @@ from registration.stabilize.automatic import stabilize_subject
 from registration.stabilize.subject_meshes import SkullSkin, SubjectMeshes, subject_meshes
 from registration.storage.files import atomic_file
 from registration.storage.registration_folder import load_registration, read_manifest
-from workflows.records.held_out import TAG
+from workflows.records.held_out import TAG, around_origin
 from workflows.records.subject import NEUTRAL, SubjectCaptures, UsableRegistrations, read_usable
 
 
@@ -113,7 +114,7 @@ def has_truths(captures: SubjectCaptures, model: GNMData) -> bool:
 
 def true_meshes(captures: SubjectCaptures, model: GNMData) -> SubjectMeshes:
     """Return a subject's true vertices, with full confidence. All captures must have a ground truth."""
-    truths = [read_truth(c.ground_truth).astype(np.float32) for c in captures.captures if c.ground_truth is not None]
+    truths = [compact(read_truth(c.ground_truth)) for c in captures.captures if c.ground_truth is not None]
     others = captures.captures[1:]
     return SubjectMeshes(
         subject=captures.subject,
@@ -121,7 +122,7 @@ def true_meshes(captures: SubjectCaptures, model: GNMData) -> SubjectMeshes:
         neutral_confidence=np.ones(len(truths[0]), np.float32),
         names=tuple(capture.root.name for capture in others),
         labels=tuple(capture.expression for capture in others),
-        vertices=np.array(truths[1:], np.float32).reshape(len(others), *truths[0].shape),
+        vertices=np.array(truths[1:], truths[0].dtype).reshape(len(others), *truths[0].shape),
         confidence=np.ones((len(others), len(truths[0])), np.float32),
     )
 
@@ -165,13 +166,14 @@ def held_out(
     vertices: Float[np.ndarray, "S V 3"] = meshes.vertices
     if meshes.names:
         vertices = stabilize_subject(meshes, skin).vertices
-    return HeldOutSubject(
+    subject = HeldOutSubject(
         subject=name,
         neutral=meshes.neutral,
         expressions=vertices,
         categories=tuple(categories.get(label, label) for label in meshes.labels),
         tags=tags,
     )
+    return around_origin(subject)
 
 
 def write_held_out(subjects: Sequence[HeldOutSubject], triangles: np.ndarray, file: Path) -> None:

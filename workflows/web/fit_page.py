@@ -16,6 +16,7 @@ from jaxtyping import Bool, Float
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
+from registration.capture.origin import capture_origin
 from registration.capture.pixels import read_view
 from registration.capture.scan import Scan, read_scan
 from registration.frames import MM_PER_M, linear_to_srgb
@@ -49,8 +50,10 @@ class FitPage(PageServer):
         Raises:
             InputError: the scan cannot be read, or the port is in use.
         """
-        self._folder, self._capture, self._outside = Path(stages), capture, outside
-        self._scan = None if capture.scan is None else read_scan(capture.scan)
+        self._origin = capture_origin([view.camera for view in capture.views])  # of the page: browsers use float32
+        self._folder, self._outside = Path(stages), outside
+        self._capture = capture.cameras_relative_to(self._origin)
+        self._scan = None if capture.scan is None else self._read_mesh(capture.scan)
         self._meshes: dict[str, Scan] = {}  # stage -> its mesh
         self._lock, self._closed = threading.RLock(), threading.Event()
         super().__init__(port, "Fit")
@@ -66,6 +69,10 @@ class FitPage(PageServer):
     def stages(self) -> list[str]:
         """Names of the stages read so far."""
         return list(self._meshes)
+
+    def _read_mesh(self, file: Path) -> Scan:
+        mesh = read_scan(file)
+        return replace(mesh, vertices=mesh.vertices - self._origin)
 
     def _build(self) -> None:
         """Create the scene and the controls."""
@@ -123,8 +130,8 @@ class FitPage(PageServer):
                 return
             follows = not self._meshes or self._stage.value == self.stages[-1]
             if not self._meshes:
-                self._look_at(read_scan(new[0]).vertices)
-            self._meshes |= {file.stem: read_scan(file) for file in new}
+                self._look_at(self._read_mesh(new[0]).vertices)
+            self._meshes |= {file.stem: self._read_mesh(file) for file in new}
             self._stage.options = tuple(self.stages)  # the selection is kept; the first stages replace "waiting"
             if follows:
                 self._stage.value = self.stages[-1]

@@ -117,6 +117,23 @@ def test_sliding_gives_no_distance_but_a_vertex_error(tmp_path):
     assert evaluation.metrics["vertex_error"]["face"]["points"] == evaluation.scan_face.sum()
 
 
+def test_figures_do_not_depend_on_the_worlds_origin(tmp_path):
+    shift = np.array([512345.25, 5403210.5, 412.125])
+    grown = (POINTS * (1 + 0.5e-3 / RADIUS)).astype(np.float32)
+    capture, near = a_capture(tmp_path / "near", truth=POINTS), a_registration(grown)
+    far = dataclasses.replace(near, vertices=grown + shift, landmarks={"68": landmarks() + shift})
+    np.savez(tmp_path / "near" / "ground_truth.npz", vertices=POINTS)
+    far_capture = a_capture(tmp_path / "far", scan=POINTS + shift).cameras_relative_to(-shift)
+    np.savez(tmp_path / "far" / "ground_truth.npz", vertices=POINTS + shift)
+    far_capture = dataclasses.replace(far_capture, ground_truth=tmp_path / "far" / "ground_truth.npz")
+    a, b = evaluate_registration(near, capture).metrics, evaluate_registration(far, far_capture).metrics
+    assert a.keys() == b.keys() and "vertex_error" in a
+    np.testing.assert_allclose(np.subtract(b["face_ball"]["centre"], shift), a["face_ball"]["centre"], atol=1e-7)
+    for figure in a.keys() - {"face_ball"}:
+        for where, row in a[figure].items():
+            assert b[figure][where] == pytest.approx(row, abs=1e-3), (figure, where)
+
+
 def test_a_hole_in_the_scan_shows_only_from_the_mesh(tmp_path):
     hole = np.linalg.norm(POINTS[FACES].mean(1) - [0, 0, RADIUS], axis=1) < 0.02
     whole = evaluate_registration(a_registration(), a_capture(tmp_path / "whole")).metrics

@@ -11,6 +11,7 @@ from registration.geometry.rigid import align
 from registration.model.regions import group
 from registration.stabilize.automatic import stabilize_subject
 from registration.stabilize.subject_meshes import subject_meshes
+from tests.fixtures.far_world import UTM
 from tests.registration.report.test_page import a_registration
 
 
@@ -55,6 +56,14 @@ def test_vertices_are_the_transformed_expressions(results, observations):
     for result, observed in zip(results, observations, strict=True):
         T = result.T_neutral_expression[3]
         np.testing.assert_allclose(result.vertices[3], observed.vertices[3] @ T[:3, :3].T + T[:3, 3], atol=1e-6)
+
+
+def test_a_far_world_is_stabilized_as_a_near_one(truths, observations, skin, results, tmp_path):
+    meshes = performances.observed_meshes(truths[0], observations[0])
+    far = replace(meshes, neutral=meshes.neutral + UTM, vertices=meshes.vertices + UTM)
+    result = stabilize_subject(far, skin)
+    np.testing.assert_allclose(result.vertices - UTM, results[0].vertices, atol=1e-6)
+    np.testing.assert_allclose(result.residual_mm, results[0].residual_mm, atol=1e-3)
 
 
 def test_rotation_on_the_neck_is_recovered(truths, observations, skin, model):

@@ -99,6 +99,28 @@ def test_meshes_keep_the_vertices(tmp_path):
     assert cv2.imread(str(tmp_path / "r" / "texture.png"), -1).dtype == np.uint16
 
 
+def test_a_far_world_is_stored_with_its_digits(tmp_path):
+    near = a_registration()
+    shift = np.array([512345.25, 5403210.5, 412.125])
+    far = replace(
+        near,
+        vertices=near.vertices + shift,
+        translation=near.translation + shift,
+        landmarks={"68": near.landmarks["68"] + shift},
+    )
+    got = load_registration(save_registration(far, tmp_path / "r"))
+    for name in registration_folder.AXES:
+        np.testing.assert_array_equal(getattr(got, name), getattr(far, name), err_msg=name)
+    np.testing.assert_array_equal(got.landmarks["68"], far.landmarks["68"])
+    assert got.offsets.dtype == np.float32 and got.vertices.dtype == np.float64
+    mesh = trimesh.load(tmp_path / "r" / "mesh.ply", process=False, maintain_order=True)
+    np.testing.assert_array_equal(mesh.vertices, far.vertices)
+    lines = (tmp_path / "r" / "mesh.obj").read_text().splitlines()
+    written = np.array([line.split()[1:] for line in lines if line.startswith("v ")], float)
+    np.testing.assert_allclose(written, far.vertices, atol=1e-7)
+    assert load_registration(save_registration(near, tmp_path / "n")).vertices.dtype == np.float32
+
+
 def test_an_existing_registration_is_replaced_completely(tmp_path):
     save_registration(a_registration(0), tmp_path / "r", report_html="old")
     save_registration(a_registration(1), tmp_path / "r")
