@@ -4,8 +4,8 @@ The page reads the files of `registration.report.stage_snapshots.write_stage` an
 """
 
 import threading
-from collections.abc import Callable
-from dataclasses import replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -33,6 +33,9 @@ _SKIN, _SCAN = (206, 176, 158), (96, 110, 128)
 _MAX_POINTS = 60_000  # of the scan, displayed
 _MAX_THUMBNAIL_PX = 200  # height of the images in the cameras' frusta
 _POLL_S = 0.5
+_FOV = float(np.radians(38))  # vertical, of the viewer
+_HEAD_DISTANCE_M = 0.8  # of the viewer, at first
+_FRUSTUM_M = 0.05  # size of a camera
 
 
 class FitPage(PageServer):
@@ -55,6 +58,7 @@ class FitPage(PageServer):
         self._capture = capture.cameras_relative_to(self._origin)
         self._scan = None if capture.scan is None else self._read_mesh(capture.scan)
         self._meshes: dict[str, Scan] = {}  # stage -> its mesh
+        self._viewpoint: _Viewpoint | None = None  # once there is a mesh
         self._lock, self._closed = threading.RLock(), threading.Event()
         super().__init__(port, "Fit")
         self._build()
@@ -96,7 +100,7 @@ class FitPage(PageServer):
         self._stage.on_update(lambda _: self._show())
         self._colours.on_update(lambda _: self._show())
         scan.on_update(lambda _: setattr(self._points, "visible", scan.value))
-        cameras.on_update(lambda _: setattr(self._frusta, "visible", cameras.value))
+        cameras.on_update(lambda _: self._show_cameras(cameras.value))
 
     def _live(self) -> None:
         """Read new stages, and the cameras' images, which take seconds."""
@@ -113,7 +117,7 @@ class FitPage(PageServer):
                 f"/cameras/{view.name}",
                 fov=2 * float(np.arctan(camera.height_px / 2 / camera.intrinsics[1, 1])),
                 aspect=camera.width_px / camera.height_px,
-                scale=0.05,
+                scale=_FRUSTUM_M,
                 thickness=1e-3,
                 image=image,
                 wxyz=rotation,
@@ -138,17 +142,27 @@ class FitPage(PageServer):
 
     def _look_at(self, head: Float[np.ndarray, "V 3"]) -> None:
         """Place the viewer at the mean direction of the cameras, with their mean up direction."""
-        cameras = [view.camera for view in self._capture.views]
-        up, center = -np.mean([c.T_cam_world[1, :3] for c in cameras], axis=0), head.mean(0)
-        front = np.mean([_direction(camera, center) for camera in cameras], axis=0)
-        front /= max(np.linalg.norm(front), 1e-9)
-        self._server.scene.set_up_direction(up / np.linalg.norm(up))
-        self._server.scene.add_light_directional("/key", intensity=1.6, position=front + up)
+        view = self._viewpoint = _Viewpoint.of([view.camera for view in self._capture.views], head.mean(0))
+        self._server.scene.set_up_direction(view.up)
+        self._server.scene.add_light_directional("/key", intensity=1.6, position=view.front + view.up)
+        self._view_from(view, _HEAD_DISTANCE_M)
+
+    def _show_cameras(self, shown: bool) -> None:
+        """Show the cameras and step back until all of them are in view; or hide them and return to the head."""
+        with self._lock:
+            self._frusta.visible = shown
+            if (view := self._viewpoint) is not None:
+                self._view_from(view, view.radius / np.sin(_FOV / 2) if shown else _HEAD_DISTANCE_M)
+
+    def _view_from(self, view: "_Viewpoint", distance: float) -> None:
+        """Look at the head from the front, in all browsers; in a window that is higher than wide from further away."""
         camera = self._server.initial_camera
-        camera.position, camera.look_at, camera.fov = center + 0.8 * front, center, float(np.radians(38))
+        camera.fov, camera.look_at, camera.position = _FOV, view.center, view.center + distance * view.front
         for client in self._server.get_clients().values():
-            client.camera.up_direction = up
-            client.camera.position, client.camera.look_at = center + 0.8 * front, center
+            narrow = max(1.0, 1.0 / max(client.camera.aspect, 0.2))
+            client.camera.fov, client.camera.up_direction = _FOV, view.up
+            client.camera.position = view.center + narrow * distance * view.front
+            client.camera.look_at = view.center
 
     def _show(self) -> None:
         """Show the selected stage in the selected colours."""
@@ -189,7 +203,21 @@ class FitPage(PageServer):
         return None
 
 
-def _direction(camera: Camera, point: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3"]:
-    """Return the unit vector from a point to a camera."""
-    offset = camera.centre - point
-    return np.asarray(offset / np.linalg.norm(offset))
+@dataclass(frozen=True)
+class _Viewpoint:
+    """Where a viewer looks at the head from: the capture's world, metres."""
+
+    center: Float[np.ndarray, "3"]  # of the head
+    front: Float[np.ndarray, "3"]  # unit vector towards the viewer
+    up: Float[np.ndarray, "3"]  # unit vector
+    radius: float  # of a ball around the center that contains the cameras
+
+    @classmethod
+    def of(cls, cameras: Sequence[Camera], center: Float[np.ndarray, "3"]) -> "_Viewpoint":
+        """Return the mean direction of the cameras from the head, with their mean up direction."""
+        offsets = np.array([camera.centre for camera in cameras]) - center
+        distances = np.linalg.norm(offsets, axis=1)
+        front = (offsets / np.maximum(distances, 1e-9)[:, None]).mean(0)
+        up = -np.mean([camera.T_cam_world[1, :3] for camera in cameras], axis=0)
+        front, up = (axis / max(np.linalg.norm(axis), 1e-9) for axis in (front, up))
+        return cls(center, front, up, float(distances.max()) + _FRUSTUM_M)

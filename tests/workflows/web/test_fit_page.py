@@ -3,9 +3,11 @@
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from registration.capture.native import read_capture
 from registration.errors import InputError
@@ -85,6 +87,13 @@ def test_a_port_in_use_is_refused(page: FitPage, capture: Capture, tmp_path: Pat
         FitPage(tmp_path / "stages", capture, OUTSIDE, page.port)
 
 
+def in_view(viewer: Any, point: np.ndarray) -> bool:
+    """Return whether a point is in front of a browser's camera and inside its image."""
+    x, y, z = Rotation.from_quat(viewer.wxyz, scalar_first=True).inv().apply(point - viewer.position)
+    high = np.tan(viewer.fov / 2) * z
+    return bool(z > 0 and abs(y) < high and abs(x) < viewer.aspect * high)
+
+
 @needs_browser
 def test_an_operator_watches_a_fit(page: FitPage, tmp_path: Path) -> None:
     sync_api = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
@@ -104,8 +113,14 @@ def test_an_operator_watches_a_fit(page: FitPage, tmp_path: Path) -> None:
         stage(tmp_path / "stages", "01_pose", 1.0)
         expect(choice).to_have_value("01_pose")
         expect(tab.locator("h4", has_text=TO_SCAN)).to_be_visible()
+        (client,) = page._server.get_clients().values()
         for name in ("Scan", "Cameras"):
             tab.get_by_label(name, exact=True).check()
+        tab.wait_for_timeout(500)
+        assert all(in_view(client.camera, view.camera.centre) for view in page._capture.views)
+        tab.get_by_label("Cameras", exact=True).uncheck()
+        tab.wait_for_timeout(500)
+        assert not all(in_view(client.camera, view.camera.centre) for view in page._capture.views)
         tab.wait_for_function("document.querySelectorAll('canvas').length > 0")
         image = tab.screenshot()
         browser.close()
