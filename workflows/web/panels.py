@@ -23,7 +23,7 @@ def work_list(items: Sequence[WorkItem], here: tuple[str, int]) -> str:
     flagged = [item for item in items if item.flagged]
     counts = (
         f"reviewed {sum(item.decided for item in items)} of {len(items)}",
-        f"flagged: {sum(item.decided for item in flagged)} of {len(flagged)}",
+        f"of the flagged {sum(item.decided for item in flagged)} of {len(flagged)}" if flagged else "none is flagged",
     )
     return _panel("work_list", items=items, counts=counts, here=here)
 
