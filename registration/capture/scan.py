@@ -16,11 +16,13 @@ from registration.storage.reading import open_file
 SCAN = "scan.ply"
 MAX_COORDINATE_M = 1e9  # beyond it, distances between vertices lose their meaning even in float64
 _MESH_SUFFIXES = frozenset(".ply .obj .stl .off .glb .gltf .fbx .dae .3ds .x3d .wrl .xyz .pts .pcd .las .e57".split())
+_FOLDERS = ("scan", "scans", "mesh", "meshes")
 _PACKED_SUFFIXES = frozenset(".gz .bz2 .xz .zst .zip .7z".split())
 _TRUTH = NpzSchema(
     title="ground truth",
     fix="np.savez(path, vertices=...) with float (N, 3) vertices in metres, capture world",
     fields={"vertices": ("float", "N 3")},
+    never_empty="N",
     max_bytes=2**30,  # 40 million vertices
 )
 
@@ -52,7 +54,7 @@ def read_scan(path: Path) -> Scan:
         raise _input_error(path, "a PLY file with vertices and faces", str(error) or type(error).__name__) from None
     vertices, triangles = mesh.vertices, mesh.triangles
     if len(vertices) < 3:
-        raise _input_error(path, "at least three vertices", f"vertices of shape {vertices.shape}")
+        raise _input_error(path, "at least three vertices", f"{len(vertices)} vertices")
     if len(triangles) and not (triangles.min() >= 0 and triangles.max() < len(vertices)):
         raise _input_error(path, f"face indices below {len(vertices)}", f"{triangles.min()} to {triangles.max()}")
     distinct = triangles[_distinct(triangles)]
@@ -87,14 +89,15 @@ def _distinct(triangles: Int[np.ndarray, "F 3"]) -> Int[np.ndarray, "D"]:
 
 
 def unread_scans(root: Path) -> list[str]:
-    """Return the names of files in a capture folder that look like a scan but are not read: only scan.ply is."""
+    """Return the paths, within a capture folder, of what looks like a scan but is not read: only scan.ply is."""
     names = []
-    for path in sorted(root.iterdir()) if root.is_dir() else []:
+    inside = [path for name in _FOLDERS if (root / name).is_dir() for path in (root / name).iterdir()]
+    for path in sorted([*root.iterdir(), *inside]) if root.is_dir() else []:
         name = path.name.lower()
         packed = Path(name).suffix in _PACKED_SUFFIXES
         suffix = Path(Path(name).stem).suffix if packed else Path(name).suffix
-        if path.name != SCAN and suffix in _MESH_SUFFIXES and path.is_file():
-            names.append(path.name)
+        if path != root / SCAN and suffix in _MESH_SUFFIXES and path.is_file():
+            names.append(path.relative_to(root).as_posix())
     return names
 
 

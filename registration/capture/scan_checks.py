@@ -28,7 +28,7 @@ from registration.types import Capture, View
 MIN_LANDMARKS = 6  # that locate a mesh
 MAX_DISTANCE_M = 0.01  # median of the landmarks' distances from a mesh of the skin that they lie on
 FAR_M = 0.1  # of all landmarks: the mesh shows something else, or lies elsewhere
-_UNITS = {1.0: "", 1e-3: "millimetres", 1e-2: "centimetres", 0.0254: "inches"}
+_UNITS = {1.0: "", 1e-3: "millimetres", 1e-2: "centimetres", 0.0254: "inches", 1e3: "kilometres"}
 _AXES = "xyz"
 _NEAR = 8  # vertices around a landmark whose faces are searched
 _CELL_M = 0.05  # pieces of a scan that are further apart than one to two cells float
@@ -37,6 +37,7 @@ _GRID = 32  # cells per side of the coarse images in which a scan without landma
 _MIN_OVERLAP = 0.1  # of a mesh with the masks; a scan of the whole body beside masks of the head has 0.2
 _FITS = 0.5
 _MANY = 0.01
+_SURFACES = ("tristrips", "tristrip", "range_grid", "face", "triangle", "polygon")  # elements of PLY that join vertices
 _CLEARLY = 1.15  # times the overlap
 _CLEARLY_M = 2.5e-4  # nearer to the landmarks
 _HEADS_M = (0.1, 3.0)  # sizes of a scan, from a face to a body
@@ -277,9 +278,9 @@ def _contents(scan: Scan) -> list[str]:
     total = scan.unused_vertices + len(scan.vertices)
     if scan.unused_vertices > _MANY * total:
         lines.append(f"{scan.unused_vertices} of the scan's {total} vertices are not measured: no face uses them")
-    unread = ", ".join(f"{count} {name}" for name, count in scan.unread.items() if count)
-    if not len(scan.triangles) and (unread or scan.unused_faces):
-        cause = f"{unread} cannot be read" if unread else "its faces have no area"
+    surfaces = [name for name, count in scan.unread.items() if count and name in _SURFACES]
+    if not len(scan.triangles) and (surfaces or scan.unused_faces):
+        cause = f"its {', '.join(surfaces)} cannot be read" if surfaces else "its faces have no area"
         lines.append(f"the scan counts as a point cloud: {cause}; export it with triangles")
     return lines
 
@@ -323,7 +324,8 @@ def _better_frame(scan: Scan, points: Float[np.ndarray, "L 3"], distance: float)
     medians = [float(np.median(tree.query(frame.to_file(points))[0])) for frame in frames]
     frame = frames[int(np.argmin(medians))]
     turned = _landmark_distance(scan, frame.to_file(points))
-    return frame if 2 * turned < distance and distance - turned > _CLEARLY_M else None
+    fits = turned <= MAX_DISTANCE_M / 2 and 2 * turned < distance and distance - turned > _CLEARLY_M
+    return frame if fits else None
 
 
 def _turned(capture: Capture, scan: Scan) -> list[str]:

@@ -10,6 +10,7 @@ from registration.capture.native import read_capture
 from registration.capture.scan_checks import require_frames
 from registration.evaluate.console_table import print_metrics
 from registration.evaluate.evaluation import RegistrationEvaluation, evaluate_registration
+from registration.evaluate.verdict import judge
 from registration.storage.hashing import hash_capture, hash_fields
 from registration.storage.registration_folder import load_registration, update_figures
 from registration.types import Capture, Registration
@@ -48,7 +49,9 @@ def evaluate_folder(
     if not foreign:
         # A figure that was stored before, such as the drift, is kept and so is not missing.
         unmeasured = {k: why for k, why in evaluation.metrics["unmeasured"].items() if k not in registration.figures}
-        update_figures(registration_dir, {**evaluation.metrics, "unmeasured": unmeasured})
+        figures = {**evaluation.metrics, "unmeasured": unmeasured}
+        verdict = judge(registration.status, {**registration.figures, **figures}).figure
+        update_figures(registration_dir, {**figures, "verdict": verdict})
     print_metrics(evaluation.metrics, title=f"{capture.subject} {capture.expression}: {registration.status}")
     console = Console()
     for line in foreign:

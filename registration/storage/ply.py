@@ -121,7 +121,7 @@ def _read_header(data: bytes) -> tuple[str, list[_Element], int]:
                     raise ValueError(f"an unknown format: {line!r}")
                 order = _FORMATS[name]
             case ["element", name, count]:
-                if not re.fullmatch(r"[0-9]{1,18}", count):
+                if not re.fullmatch(r"[0-9]{1,40}", count):
                     raise ValueError(f"no count of an element: {line!r}")
                 elements.append(_Element(name=name, count=int(count)))
             case ["property", *words]:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from registration.capture.scan import read_scan, unread_scans
+from registration.capture.scan import read_scan, read_truth, unread_scans
 from registration.errors import InputError
 from registration.storage.mesh import write_ply
 
@@ -69,4 +69,12 @@ def test_files_that_look_like_a_scan_but_are_not_read_are_named(tmp_path: Path) 
     for name in (*names, "scan.ply", "capture.toml", "ground_truth.npz", "scan.png", "notes.txt.gz"):
         (tmp_path / name).write_bytes(b"")
     (tmp_path / "meshes.obj").mkdir()
-    assert unread_scans(tmp_path) == names
+    (tmp_path / "scans").mkdir()
+    (tmp_path / "scans" / "scan.ply").write_bytes(b"")
+    assert unread_scans(tmp_path) == [*names, "scans/scan.ply"]
+
+
+def test_a_ground_truth_without_vertices_is_refused(tmp_path: Path) -> None:
+    np.savez(tmp_path / "ground_truth.npz", vertices=np.zeros((0, 3)))
+    with pytest.raises(InputError):
+        read_truth(tmp_path / "ground_truth.npz")

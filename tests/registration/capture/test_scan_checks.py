@@ -3,6 +3,7 @@
 The mesh is a bumpy ellipsoid without any symmetry, which lies to one side of the world's origin.
 """
 
+import os
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -13,6 +14,7 @@ import pytest
 import trimesh
 from jaxtyping import Float
 
+from registration.capture.doctor import check_capture
 from registration.capture.native import read_capture
 from registration.capture.scan import Scan, read_scan
 from registration.capture.scan_checks import require_frame, scan_facts, scan_warnings, surface_landmarks
@@ -58,6 +60,7 @@ def a_capture(root: Path, masks: bool = False) -> Capture:
 EXPORTS: dict[str, tuple[Callable[[Points], Points], str]] = {
     "millimetres": (lambda v: 1e3 * v, "it is in millimetres"),
     "centimetres": (lambda v: 1e2 * v, "it is in centimetres"),
+    "kilometres": (lambda v: 1e-3 * v, "it is in kilometres"),
     "inches": (lambda v: v / 0.0254, "it is in inches"),
     "z up": (lambda v: v[:, [0, 2, 1]] * [1, -1, 1], "it is turned: the world is its (x, z, -y)"),
     "z up in millimetres": (
@@ -126,6 +129,24 @@ def test_the_masks_tell_that_a_scan_is_turned(tmp_path: Path, export: str) -> No
     change, message = EXPORTS[export]
     (line,) = warnings(tmp_path, change(HEAD), landmarks=NONE)
     assert message in line
+
+
+def test_a_scan_that_was_only_moved_is_not_called_turned(tmp_path: Path) -> None:
+    (line,) = warnings(tmp_path, HEAD + [0.03, 0, 0])
+    assert line.startswith("the scan is") and line.endswith("mm from the landmarks; check its frame and unit")
+
+
+@pytest.mark.parametrize("kind", ["folder", "pipe", "broken link"])
+def test_a_scan_that_is_no_file_is_told(tmp_path: Path, kind: str) -> None:
+    root = make(tmp_path / "capture")
+    (root / "scan.ply").unlink()
+    if kind == "folder":
+        (root / "scan.ply").mkdir()
+    elif kind == "pipe":
+        os.mkfifo(root / "scan.ply")
+    else:
+        (root / "scan.ply").symlink_to(root / "nothing.ply")
+    assert any("scan.ply is not read" in line for line in check_capture(root).warnings)
 
 
 def test_a_mirrored_scan_is_told_whether_its_winding_was_mended_or_not(tmp_path: Path) -> None:

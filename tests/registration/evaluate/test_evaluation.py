@@ -284,6 +284,7 @@ def test_the_truth_has_no_error_and_metrics_are_stored(tmp_path, capsys):
     assert stored["vertex_error"]["face"]["mean_mm"] == 0 and stored["scan_to_mesh"]["face"]["p95_mm"] < 1e-6
     assert stored["face_ball"]["landmarks"] == "capture"
     assert 4000 < stored["scan_to_mesh"]["face"]["points"] < 7000
+    assert stored.pop("verdict")["level"] == "good"
     assert stored == evaluation.metrics and "Vertex error" in capsys.readouterr().out
     assert (tmp_path / "r" / "report.html").read_text() == "kept"
 

@@ -46,7 +46,9 @@ def contents(folder: Path) -> dict[str, bytes]:
 def test_the_figures_of_the_registered_capture_are_stored(capture: Path, tmp_path: Path) -> None:
     out = register(capture, tmp_path / "out")
     evaluation = evaluate_folder(out, capture)
-    assert load_registration(out).figures == evaluation.metrics
+    stored = load_registration(out).figures
+    assert stored == {**evaluation.metrics, "verdict": stored["verdict"]}
+    assert stored["verdict"]["level"] == "look"  # half a millimetre
     assert evaluation.metrics["scan_to_mesh"]["face"]["mean_mm"] == pytest.approx(0.45, rel=0.1)
 
 

@@ -173,7 +173,8 @@ BAD: dict[str, tuple[bytes, str]] = {
     "count that is no number": (header(LITTLE, "element vertex many\n" + XYZ), "count"),
     "2^60 vertices": (header(LITTLE, vertex(count=2**59)) + POINTS.tobytes(), "cut short"),
     "2^60 vertices, text": (header(TEXT, vertex(count=2**59)) + lines(POINTS), "cut short"),
-    "2^60 faces": (header(LITTLE, vertex(), face(count=2**59)) + PLAIN, "cut short"),
+    "2^60 faces": (header(LITTLE, vertex(), face(count=2**60)) + PLAIN, "cut short"),
+    "10^30 faces": (header(LITTLE, vertex(), face(count=10**30)) + PLAIN, "cut short"),
     "2^60 empty faces": (
         header(LITTLE, "element face 576460752303423488\n" + CORNERS, vertex()) + bytes(1000),
         "cut short",

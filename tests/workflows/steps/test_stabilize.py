@@ -176,7 +176,7 @@ def change_arrays(run: Path, change) -> None:
         (mark_failed, "registrations that failed"),
         (remove_expressions, "no expression"),
         (change_topology, "another topology"),
-        (write_nan, "not finite"),
+        (write_nan, "NaN or infinite"),
         (corrupt_file, "cannot be read"),
         (duplicate_subject, "same subject"),
         (leave_one_expression, "only one expression"),
