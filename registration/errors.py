@@ -1,5 +1,7 @@
 """The one error that users see for bad input."""
 
+from registration.terminal import printable
+
 MAX_PART = 800  # letters of a part of a message: what was found in a file may be megabytes
 MAX_SEED = 2**63 - 1  # of random number generators, and of integers in databases
 
@@ -13,7 +15,7 @@ class InputError(Exception):
 
     def __init__(self, what: str, *, where: object, expected: object, got: object, fix: str = "change it"):
         self.what = _shortened(what)
-        self.where = _shortened(str(where))
+        self.where = _shortened(str(where), kept="")  # names may hold anything, also lines that look like ours
         self.expected = _shortened(str(expected))
         self.got = _shortened(str(got))
         self.fix = _shortened(fix)
@@ -59,7 +61,8 @@ def check_seed(seed: int, where: str = "seed") -> None:
         )
 
 
-def _shortened(text: str) -> str:
+def _shortened(text: str, kept: str = "\n\t") -> str:
+    """A part of the message, which a terminal can show; `kept`: control characters that stay."""
     if len(text) > MAX_PART:
-        return f"{text[: MAX_PART // 2]} ... {text[-MAX_PART // 4 :]} ({len(text)} letters)"
-    return text or "nothing"
+        text = f"{text[: MAX_PART // 2]} ... {text[-MAX_PART // 4 :]} ({len(text)} letters)"
+    return printable(text, kept) or "nothing"

@@ -4,9 +4,10 @@ from collections.abc import Mapping
 from typing import Any
 
 from rich.console import Console
-from rich.markup import escape
 from rich.table import Table
+from rich.text import Text
 
+from registration import terminal
 from registration.evaluate.residuals import residual_rows
 from registration.evaluate.verdict import LEVEL_TITLES
 from registration.types import METRIC_TITLES
@@ -30,10 +31,10 @@ def print_metrics(metrics: Mapping[str, Any], title: str, console: Console | Non
             values = [row[field] for field in ("mean_mm", "median_mm", "std_mm", "p95_mm")]
             cells = ("-" if value is None else f"{value:.3f}" for value in values)
             table.add_row(metric_title, region, f"{row['points']:,}", *cells)
-    console = console or Console()
+    console = console or terminal.console()
     console.print(table)
     for key, reason in metrics.get("unmeasured", {}).items():
-        console.print(f"{METRIC_TITLES[key]}: not measured: {escape(reason)}", highlight=False, soft_wrap=True)
+        console.print(f"{METRIC_TITLES[key]}: not measured: {reason}", markup=False, highlight=False, soft_wrap=True)
 
 
 def print_assessment(figures: Mapping[str, Any], console: Console | None = None) -> None:
@@ -43,7 +44,7 @@ def print_assessment(figures: Mapping[str, Any], console: Console | None = None)
         figures: of a registration's manifest; what is missing is not printed.
         console: default: the terminal.
     """
-    console = console or Console()
+    console = console or terminal.console()
     rows = residual_rows(figures.get("residuals", {}))
     if rows:
         table = Table(title="residuals in the images", caption="pixels at a head height of 512 px")
@@ -51,8 +52,10 @@ def print_assessment(figures: Mapping[str, Any], console: Console | None = None)
             table.add_column(heading, justify="left" if heading == "" else "right")
         for kind, overall, worst, view in rows:
             unknown = "-" if overall is None else kind.text(overall)
-            table.add_row(kind.title, unknown, kind.text(worst), escape(view))
+            table.add_row(kind.title, unknown, kind.text(worst), Text(view))
         console.print(table)
     if verdict := figures.get("verdict"):
         reasons = "; ".join(verdict["reasons"])
-        console.print(f"verdict: {LEVEL_TITLES[verdict['level']]}: {escape(reasons)}", highlight=False, soft_wrap=True)
+        console.print(
+            f"verdict: {LEVEL_TITLES[verdict['level']]}: {reasons}", markup=False, highlight=False, soft_wrap=True
+        )

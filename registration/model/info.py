@@ -6,7 +6,9 @@ import numpy as np
 from jaxtyping import Float, Int
 from rich.console import Console
 from rich.table import Table
+from rich.text import Text
 
+from registration import terminal
 from registration.frames import MM_PER_M
 from registration.model import gnm_npz, landmarks, regions
 from registration.model.gnm_npz import GNMData
@@ -35,12 +37,13 @@ def describe(path: Path, picture: Path | None = None, console: Console | None = 
     Raises:
         InputError: the file is not a GNM model.
     """
-    console = console or Console()
+    console = console or terminal.console()
     if picture is not None:
         check_output_file(Path(picture))
     data = gnm_npz.read(path)
     schemes = landmarks.schemes_beside(path, len(data.template_vertex_positions))
-    console.print(f"[bold]{path}[/]  GNM {data.variant} {data.version}  sha256 {gnm_npz.content_hash(data)[:12]}")
+    title = f"  GNM {data.variant} {data.version}  sha256 {gnm_npz.content_hash(data)[:12]}"
+    console.print(Text.assemble((str(path), "bold"), title))
     for table in (_dimensions(data), _parts(data), _joints(data), _regions(data)):
         console.print(table)
     points = [f"{scheme.name} ({len(scheme.indices)} points)" for scheme in schemes.values()]

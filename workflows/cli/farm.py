@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 from tyro.conf import Positional, arg
 
 from registration.errors import InputError
+from registration.terminal import unescaped
 from workflows.cli.options import NOT_SET, FarmOptions, JobId, JobOptions, Port, RunName, RunOptions
 
 if TYPE_CHECKING:
@@ -209,7 +210,9 @@ def status(
     while True:
         lines = job_lines(reader, run, chosen, logs, limit) if listed.wanted else status_lines(reader, run, logs)
         text = "\n".join(lines)
-        print(f"\033[H\033[J{text}" if watch and sys.stdout.isatty() else text, flush=True)
+        if watch and sys.stdout.isatty():
+            print("\033[H\033[J", end="", file=unescaped(sys.stdout))  # clears the screen
+        print(text, flush=True)
         if not watch:
             return 0
         time.sleep(REFRESH_S)
