@@ -13,6 +13,7 @@ from registration.errors import InputError
 
 _ID = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,99}(/[A-Za-z0-9][A-Za-z0-9._-]{0,99}){0,7}")
 _BUCKET = re.compile(r"[A-Za-z0-9._-]{1,255}|arn:.+")
+SECRET_NAME = re.compile(r"\w*(?:passw|secret|token|credential|signature|access_?key)\w*", re.IGNORECASE)
 _URL = re.compile(r"([A-Za-z][A-Za-z0-9+.-]*)://|file:", re.IGNORECASE)
 
 
@@ -120,8 +121,9 @@ def nearest(name: str, known: Iterable[str], count: int = 3) -> list[str]:
 
 
 def redact(text: str) -> str:
-    """Return the text without the passwords of any URLs in it."""
-    return re.sub(r"(://[^:/@\s'\"]*):[^/@\s'\"]+@", r"\1:***@", text)
+    """Return the text without passwords and keys: of URLs, up to the last "@", of their queries, of settings."""
+    text = re.sub(r"(://[^:/@\s]*):(?:(?!://)\S)*@", r"\1:***@", text)
+    return re.sub(rf"({SECRET_NAME.pattern}=)('[^']*'|[^&#\s'\"]+)", r"\1***", text, flags=re.IGNORECASE)
 
 
 def job_refused(where: str, *, expected: str, got: str) -> InputError:

@@ -4,10 +4,12 @@ A process that is killed leaves at most a hidden sibling whose name ends in `.tm
 """
 
 import ctypes
+import errno
 import json
 import os
 import secrets
 import shutil
+import tempfile
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from functools import partial
@@ -18,7 +20,44 @@ from registration.errors import InputError
 from registration.storage.jsonable import to_jsonable
 from registration.storage.reading import read_json
 
+FULL = (errno.ENOSPC, errno.EDQUOT)  # numbers of the system's errors
 _AT_FDCWD, _RENAME_EXCHANGE = -100, 2  # linux/fcntl.h, linux/fs.h
+
+
+class DiskFull(OSError):
+    """A disk is full, or the user's share of it; names the file and the disk."""
+
+
+@contextmanager
+def naming_full_disk(file: Path) -> Iterator[None]:
+    """Raise `DiskFull` for an error of a full disk in the block, which is about to write a file or folder."""
+    try:
+        yield
+    except OSError as error:
+        if error.errno not in FULL or isinstance(error, DiskFull):
+            raise
+        raise disk_full(file, error) from error
+
+
+def disk_full(file: Path, error: OSError) -> DiskFull:
+    """Return the error of a full disk with the names of the file and the disk, which the system leaves out.
+
+    Args:
+        file: that was being written; if the folder of temporary files has less space, that is the full one.
+        error: as the system raised it.
+    """
+    places = [Path(error.filename)] if error.filename else [Path(file).absolute(), Path(tempfile.gettempdir())]
+    place = min(places, key=lambda path: shutil.disk_usage(_existing(path)).free)
+    disk = _existing(place)
+    usage = shutil.disk_usage(disk)
+    while not disk.is_mount() and disk != disk.parent:
+        disk = disk.parent
+    space = f"{usage.free / 1e9:.1f} of {usage.total / 1e9:.1f} GB free"
+    return DiskFull(error.errno, f"{os.strerror(error.errno or 0)}: the disk mounted at {disk}, {space}", str(place))
+
+
+def _existing(path: Path) -> Path:
+    return next(folder for folder in (path, *path.parents) if folder.exists())
 
 
 @contextmanager
@@ -30,8 +69,9 @@ def atomic_file(file: Path) -> Iterator[Path]:
     file = Path(file)
     temporary = file.with_name(f".{file.stem}.{secrets.token_hex(4)}.tmp{file.suffix}")
     try:
-        yield temporary
-        os.replace(temporary, file)
+        with naming_full_disk(file):
+            yield temporary
+            os.replace(temporary, file)
     finally:
         temporary.unlink(missing_ok=True)
 
@@ -64,12 +104,14 @@ def atomic_directory(out: Path) -> Iterator[Path]:
     After an error nothing is left of it and `out` is as before. Missing parents of `out` are created.
     """
     out = Path(out).resolve()
-    out.parent.mkdir(parents=True, exist_ok=True)
     temporary = out.with_name(f".{out.name}.{secrets.token_hex(4)}.tmp")
-    temporary.mkdir()
+    with naming_full_disk(out):
+        out.parent.mkdir(parents=True, exist_ok=True)
+        temporary.mkdir()
     try:
-        yield temporary
-        exchange(temporary, out)
+        with naming_full_disk(out):
+            yield temporary
+            exchange(temporary, out)
     finally:
         shutil.rmtree(temporary, ignore_errors=True)
 

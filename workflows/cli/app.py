@@ -5,6 +5,7 @@ Exit codes: 0 success; 1 a registration, or some of a subject's or a batch's, fa
 be used, or a subject without any usable registration; 130 interrupted; 141 nobody reads the output any more.
 """
 
+import functools
 import inspect
 import os
 import select
@@ -12,11 +13,13 @@ import shutil
 import sys
 import textwrap
 from collections.abc import Iterator, Mapping, Sequence
-from typing import NoReturn
+from typing import Any, NoReturn
 
 import tyro
 
 from registration.errors import InputError
+from registration.storage.files import DiskFull
+from registration.terminal import escaped_output, printable
 from workflows.cli import capture, coregister, farm, model, register, stabilize, store
 from workflows.cli.arguments import (
     PRINT_COMPLETION,
@@ -82,6 +85,10 @@ def main(args: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt:
         print("interrupted", file=sys.stderr)
         return 130
+    except DiskFull as error:
+        print(f"The disk is full\n  where:    {printable(str(error.filename))}", file=sys.stderr)
+        print(f"  got:      {error.strerror}\n  fix:      free space on it, then repeat the command", file=sys.stderr)
+        return 1
     except BrokenPipeError:
         if not _nobody_reads():
             raise
@@ -100,11 +107,22 @@ def _run(words: list[str]) -> int:
     if name is None:
         _explain(words)
     return tyro.cli(
-        COMMANDS[name],
+        _printing(COMMANDS[name]),
         prog=f"gnmreg {name}",
         args=merge_repeated_options(words[len(name.split()) :], COMMANDS[name]),
         config=(tyro.conf.FlagCreatePairsOff, tyro.conf.OmitArgPrefixes),
     )
+
+
+def _printing(command: Command) -> Command:
+    """The command with its output made printable: names from files may hold escape sequences of terminals."""
+
+    @functools.wraps(command)
+    def run(*arguments: Any, **options: Any) -> int:
+        with escaped_output():
+            return command(*arguments, **options)
+
+    return run
 
 
 def _nobody_reads() -> bool:

@@ -12,7 +12,7 @@ _FARM = FarmOptions()
 def verify(store: StoreUrl, /, tidy: bool = False) -> int:
     """Compare every file of a store with the manifests.
 
-    The exit code is 1 if a file is missing or altered.
+    The exit code is 1 if a file is missing or altered, 2 if there is no such store.
 
     Args:
         store: The folder or URL.
@@ -21,6 +21,7 @@ def verify(store: StoreUrl, /, tidy: bool = False) -> int:
     from workflows.records.store import Store
 
     opened = Store(store)
+    opened.require()
     report = opened.verify()
     for kind, names in (("missing", report.missing), ("altered", report.altered), ("orphaned", report.orphaned)):
         for name in names:
@@ -54,9 +55,11 @@ def retire(
     from workflows.engine.client import QueueClient
     from workflows.records.store import Store
 
+    kept = Store(store)
+    kept.require()
     opened = QueueClient(farm.url)
     try:
-        for part in Store(store).retire(run, keep):
+        for part in kept.retire(run, keep):
             print(f"{part}: {opened.forget(part)} rows deleted")
     finally:
         opened.close()

@@ -21,13 +21,14 @@ import traceback
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import Future
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
 from pebble import ProcessExpired, ProcessPool
 
 from registration.errors import InputError
+from registration.storage.files import FULL, DiskFull, disk_full
 from workflows.engine.jobs import MAX_BYTES, PermanentStepError
 from workflows.ids import redact
 from workflows.processes import start_pool
@@ -125,7 +126,7 @@ class JsonlProgress:
             self._line({"done": done, "total": total, "what": label})
 
     def _line(self, value: Mapping[str, Any]) -> None:
-        with self._file.open("a") as file:
+        with suppress(OSError), self._file.open("a") as file:  # no job fails because its progress cannot be written
             file.write(json.dumps({"time": round(time.time(), 3), **value}) + "\n")
 
 
@@ -156,7 +157,10 @@ def _call(dotted: str, arguments: dict[str, Any], log: str) -> StepOutcome:
             print(error, flush=True)
             return _outcome("unusable", str(error))
         except BaseException as error:  # also SystemExit: no exit of a step may look like success
-            print(redact(traceback.format_exc()), flush=True)
+            if isinstance(error, OSError) and error.errno in FULL and not isinstance(error, DiskFull):
+                error = disk_full(Path(log), error)
+            with suppress(OSError):  # the log may be on the disk that is full
+                print(redact(traceback.format_exc()), flush=True)
             first, *_ = str(error).splitlines() or [""]
             return _outcome("failed", f"{type(error).__name__}: {first}")
 

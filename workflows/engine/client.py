@@ -187,7 +187,7 @@ class QueueClient:
         status = table(self.url, "workflow_status")
 
         def execute(query: str, ids: Iterable[str], **values: Any) -> Any:
-            text = sa.text(query).bindparams(sa.bindparam("ids", expanding=True))
+            text = sa.text(query).bindparams(sa.bindparam("ids", expanding=True, type_=sa.Text()))
             return connection.execute(text, {"ids": list(ids), **values})
 
         execute(f"DELETE FROM {status} WHERE workflow_uuid IN :ids AND status NOT IN {ACTIVE}", known)
@@ -222,7 +222,7 @@ class QueueClient:
             f"FROM {table(self.url, 'workflow_status')} w "
             f"LEFT JOIN {table(self.url, 'workflow_input')} i ON i.workflow_uuid = w.workflow_uuid "
             "WHERE w.workflow_uuid IN :ids"
-        ).bindparams(sa.bindparam("ids", expanding=True))
+        ).bindparams(sa.bindparam("ids", expanding=True, type_=sa.Text()))
         rows = connection.execute(query, {"ids": list(ids)})
         return {identity: (version, _spec(inputs)) for identity, version, inputs in rows}
 
@@ -235,7 +235,7 @@ class QueueClient:
         query = sa.text(
             f"SELECT max(completed_at) FROM {table(self.url, 'workflow_status')} "
             "WHERE status = 'CANCELLED' AND workflow_uuid IN :ids"
-        ).bindparams(sa.bindparam("ids", expanding=True))
+        ).bindparams(sa.bindparam("ids", expanding=True, type_=sa.Text()))
         with self._engine.connect() as connection:
             last = max((connection.execute(query, {"ids": chunk}).scalar() or 0 for chunk in _chunks(ids)), default=0)
         time.sleep(min(SETTLE_S, max(0.0, float(last) / 1000 + SETTLE_S - time.time())))
@@ -273,7 +273,7 @@ class QueueClient:
             f"SELECT w.workflow_uuid, coalesce(i.inputs, w.inputs) FROM {table(self.url, 'workflow_status')} w "
             f"LEFT JOIN {table(self.url, 'workflow_input')} i ON i.workflow_uuid = w.workflow_uuid "
             "WHERE w.workflow_uuid IN :ids"
-        ).bindparams(sa.bindparam("ids", expanding=True))
+        ).bindparams(sa.bindparam("ids", expanding=True, type_=sa.Text()))
         with self._engine.connect() as connection:
             for chunk in _chunks(ids):
                 for identity, inputs in connection.execute(query, {"ids": chunk}):

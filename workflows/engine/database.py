@@ -4,15 +4,17 @@ Queries go directly to the drivers, because importing SQLAlchemy would double th
 that writes imports it.
 """
 
+import os
 import re
 import sqlite3
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
-from urllib.parse import urlsplit
+from urllib.parse import parse_qsl, quote, unquote
 
 from registration.errors import InputError
+from workflows.ids import SECRET_NAME, redact
 
 if TYPE_CHECKING:
     import sqlalchemy as sa
@@ -20,6 +22,13 @@ if TYPE_CHECKING:
 FILE = "queue.sqlite"
 SCHEMA = "dbos"  # on PostgreSQL
 ENVIRONMENT = "GNMREG_DB"  # for URLs with a password: every user can read command lines
+_DRIVER, _PASSWORD = "postgresql+psycopg", "PGPASSWORD"
+SECRETS = (ENVIRONMENT, _PASSWORD)  # environment variables that may hold a password
+_POSTGRES = re.compile(
+    r"postgresql(?:\+\w+)?://(?:(?P<user>[^:@/?#]*)(?::(?P<password>.*))?@)?"
+    r"(?P<host>[^@/?#]*)/(?P<database>[^@/?#]+)(?:\?(?P<query>.*))?",
+    re.DOTALL,
+)
 _NETWORK = ("nfs", "nfs4", "cifs", "smb3", "smbfs", "9p", "lustre", "ceph", "glusterfs", "fuse.sshfs", "beegfs", "gpfs")
 _BUSY_S, _CONNECT_S = 30.0, 30
 _READ_ONLY = "-c default_transaction_read_only=on"
@@ -41,15 +50,11 @@ def checked_url(url: str) -> str:
     Raises:
         InputError: neither sqlite:///FILE nor postgresql://..., a SQLite file on a network disk, or no database name.
     """
-    try:
-        parts = urlsplit(url)
-        kind, database = parts.scheme.partition("+")[0], parts.path[1:]
-    except ValueError:
-        raise _refused(url, got="no URL") from None
-    if kind not in ("sqlite", "postgresql") or not database or database == ":memory:":
+    if not is_sqlite(url):
+        return _postgres_url(url)
+    database = re.sub(r"^sqlite(\+\w+)?:///", "", url)
+    if database in (url, "", ":memory:") or "?" in database:
         raise _refused(url, got=redacted_url(url))
-    if kind == "postgresql":
-        return parts._replace(scheme="postgresql+psycopg").geturl()
     file = Path(database).resolve()
     if (system := _filesystem(file)) in _NETWORK:
         raise InputError(
@@ -62,17 +67,41 @@ def checked_url(url: str) -> str:
     return f"sqlite:///{file}"
 
 
+def with_environments_password(url: str) -> str:
+    """Return a URL with the password of the environment variable PGPASSWORD if it has none, as libpq would use it."""
+    password, parts = os.environ.get(_PASSWORD), _POSTGRES.fullmatch(url)
+    if not password or parts is None or parts["password"]:
+        return url
+    return f"{_DRIVER}://{parts['user'] or ''}:{quote(password, safe='')}@{url.partition('://')[2].rpartition('@')[2]}"
+
+
 def redacted_url(url: str) -> str:
-    """Return the URL without its password."""
-    try:
-        parts = urlsplit(url)
-    except ValueError:
-        return "(no URL)"
-    if not parts.scheme:
-        return "(no URL)"
-    name, at, host = parts.netloc.rpartition("@")
-    user, colon, _ = name.partition(":")
-    return parts._replace(netloc=f"{user}{colon and ':***'}{at}{host}").geturl()
+    """Return the URL without its passwords, for messages; of a URL that cannot be read only its scheme."""
+    if is_sqlite(url):
+        return redact(url)
+    parts = _POSTGRES.fullmatch(url)
+    if parts is None:
+        scheme, separator, _ = url.partition("://")
+        return f"{scheme}://..." if separator and scheme.replace("+", "").isalnum() else "(no URL)"
+    from sqlalchemy.engine import URL  # loaded for messages only: it would double the time of `gnmreg status`
+
+    shown = {key: "***" if SECRET_NAME.search(key) else value for key, value in parse_qsl(parts["query"] or "")}
+    host, _, port = parts["host"].rpartition(":") if parts["host"][-1:].isdigit() else (parts["host"], "", "")
+    host, number = (host, int(port)) if host and port.isdigit() else (parts["host"], None)
+    name = URL.create("postgresql", parts["user"], parts["password"], host, number, parts["database"], shown)
+    return name.render_as_string(hide_password=True).replace("%2A%2A%2A", "***")
+
+
+def without_secrets(text: str, url: str) -> str:
+    """Return a message about a database, such as a driver's, without the passwords of its URL."""
+    parts = _POSTGRES.fullmatch(url)
+    if parts is not None:
+        pairs = parse_qsl(parts["query"] or "")
+        secrets = [parts["password"], *(value for key, value in pairs if SECRET_NAME.search(key))]
+        for secret in filter(None, secrets):
+            for form in (secret, unquote(secret)):
+                text = text.replace(form, "***") if len(form) > 3 else text
+    return redact(text)
 
 
 def sqlite_file(url: str) -> Path:
@@ -105,7 +134,7 @@ def prepare(url: str) -> None:
             "The queue's database cannot be used",
             where=redacted_url(url),
             expected="a writable SQLite file, or a PostgreSQL server that answers",
-            got=first,
+            got=without_secrets(first, url),
             fix="check the URL, the server and its password",
         ) from None
 
@@ -126,7 +155,7 @@ def require_queue(url: str) -> None:
             "There is no queue",
             where=redacted_url(url),
             expected="a database that `gnmreg migrate` prepared",
-            got=got,
+            got=without_secrets(got, url),
             fix="check the URL, or run `gnmreg migrate`",
         )
 
@@ -219,6 +248,22 @@ def _filesystem(file: Path) -> str:
         if inside and len(point) >= len(longest):
             longest, filesystem = point, kind
     return filesystem
+
+
+def _postgres_url(url: str) -> str:
+    """The URL with the driver's name and an escaped password, which may hold any character.
+
+    The password ends at the last "@" that a host and a database follow.
+    """
+    parts = _POSTGRES.fullmatch(url)
+    if parts is None:
+        raise _refused(url, got=redacted_url(url))
+    pairs = parse_qsl(parts["query"] or "", keep_blank_values=True)
+    password = unquote(parts["password"] or "") or dict(pairs).get("password")
+    query = "&".join(item for item in (parts["query"] or "").split("&") if item.partition("=")[0] != "password")
+    user = quote(unquote(parts["user"] or ""), safe="") + (f":{quote(password, safe='')}" if password else "")
+    address = f"{user}{'@' if user else ''}{parts['host']}/{parts['database']}"
+    return f"{_DRIVER}://{address}{'?' if query else ''}{query}"
 
 
 def _refused(url: str, *, got: str) -> InputError:

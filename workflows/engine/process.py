@@ -18,8 +18,9 @@ from dbos import DBOS, DBOSConfig
 from dbos._error import DBOSAwaitedWorkflowCancelledError, DBOSWorkflowCancelledError
 
 from registration.errors import InputError
+from registration.terminal import printable
 from workflows.engine.child import RETRIED, StepOutcome, StepProcess
-from workflows.engine.database import ENVIRONMENT, checked_url, prepare
+from workflows.engine.database import SECRETS, checked_url, prepare, with_environments_password
 from workflows.engine.jobs import DRIVER, GPU, REBUILD, SUBJECTS, Step, validate_arguments
 from workflows.engine.liveness import Liveness, LivenessTimeouts
 from workflows.engine.row_check import refuse_unreadable_rows
@@ -76,8 +77,9 @@ def serve(process: EngineProcess) -> NoReturn:
     Raises:
         InputError: the database cannot be used, or another process has the executor id.
     """
-    url = checked_url(process.url)
-    os.environ.pop(ENVIRONMENT, None)  # children print their environment when they crash
+    url = with_environments_password(checked_url(process.url))
+    for name in SECRETS:
+        os.environ.pop(name, None)  # children print their environment when they crash
     _configure_logging()
     migrate(url)
     liveness = Liveness(url, process.timeouts)
@@ -166,7 +168,7 @@ class _Redacting(logging.Filter):
     def filter(self, record: logging.LogRecord) -> bool:
         if record.exc_info and isinstance(record.exc_info[1], _REPORTED):
             return False
-        record.msg, record.args = redact(record.getMessage()), None
+        record.msg, record.args = printable(redact(record.getMessage())), None
         if record.exc_info:
             record.exc_text = redact(logging.Formatter().formatException(record.exc_info))
             record.exc_info = None

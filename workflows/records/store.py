@@ -23,7 +23,7 @@ from pathlib import Path, PurePosixPath
 from typing import Any
 
 from registration.errors import InputError
-from registration.storage.files import atomic_write_text
+from registration.storage.files import atomic_write_text, naming_full_disk
 from registration.storage.reading import MAX_TEXT_BYTES, open_file, read_bytes
 from registration.storage.records import Record
 from workflows.ids import check_id, is_remote, redact, resolve_place
@@ -129,9 +129,10 @@ class Store:
         attempt = f"{ATTEMPT}{uuid.uuid4().hex}"
         if self.local is not None:
             folder = self.local / key / attempt
-            folder.mkdir(parents=True)
             try:
-                about = make(folder)
+                with naming_full_disk(folder):
+                    folder.mkdir(parents=True)
+                    about = make(folder)
             except BaseException:
                 shutil.rmtree(folder, ignore_errors=True)
                 raise
@@ -148,16 +149,29 @@ class Store:
             if posixpath.basename(name) == MANIFEST and not _in_attempt(name):
                 yield posixpath.dirname(name)
 
+    def require(self) -> None:
+        """Raise InputError if there is no such folder or nothing below the URL, or it cannot be read."""
+        try:
+            got = "" if self._fs.isdir(self._root) else "a file" if self._fs.exists(self._root) else "nothing"
+        except Exception as error:  # whatever the client of object storage raises
+            got = redact(f"{type(error).__name__}: {error}".splitlines()[0])
+        if got:
+            raise InputError(
+                "There is no store",
+                where=self.url,
+                expected="a folder, or a URL below which there are files",
+                got=got,
+                fix="correct the path or URL; keys of object storage come from the environment",
+            )
+
     def verify(self) -> VerificationReport:
         """Read every file of the store and compare it with the records.
 
         Raises:
             InputError: a local store that is no folder.
         """
-        if self.local is not None and not self.local.is_dir():
-            got = "a file" if self.local.exists() else "no such folder"
-            fix = "check the path: `gnmreg batch --out` names it"
-            raise InputError("There is no store", where=self.url, expected="a folder", got=got, fix=fix)
+        if self.local is not None:
+            self.require()
         names, missing, altered, unreadable = set(self._names()), [], [], {}
         manifests = {name for name in names if posixpath.basename(name) == MANIFEST and not _in_attempt(name)}
         known = set(manifests)

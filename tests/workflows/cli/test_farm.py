@@ -247,3 +247,29 @@ def set_rows(captures: Path, **columns: str) -> None:
     with closing(sqlite3.connect(captures / "queue.sqlite")) as database, database:
         text = ", ".join(f"{name} = :{name}" for name in columns)
         database.execute(f"UPDATE workflow_status SET {text} WHERE name = 'job'", columns)
+
+
+def test_store_verify_of_a_place_that_is_not_there_fails(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "file").write_text("x")
+    for place in (tmp_path / "none", tmp_path / "file"):
+        assert main(["store", "verify", str(place)]) == 2
+        assert "There is no store" in capsys.readouterr().err
+        assert main(["store", "retire", str(place), "run", "--keep", "1", "--folder", str(tmp_path)]) == 2
+    (tmp_path / "empty").mkdir()
+    assert main(["store", "verify", str(tmp_path / "empty")]) == 0
+
+
+def test_names_with_escape_sequences_are_shown_not_obeyed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    evil = "a\x1b[2J\u202eb"
+    (tmp_path / "store" / evil / "attempt-0").mkdir(parents=True)
+    (tmp_path / "store" / evil / "attempt-0" / "f").write_text("x")
+    (tmp_path / "logs" / "run").mkdir(parents=True)
+    main(["store", "verify", str(tmp_path / "store")])
+    main(["store", "verify", str(tmp_path / evil)])
+    main(["capture", "check", str(tmp_path / evil)])
+    main(["migrate", "--folder", str(tmp_path)])
+    main(["status", "--folder", str(tmp_path), "--run", evil])
+    main(["logs", evil, "--folder", str(tmp_path)])
+    out, err = capsys.readouterr()
+    assert r"a\x1b[2J\u202eb" in out and r"a\x1b[2J\u202eb" in err
+    assert "\x1b" not in out + err and "\u202e" not in out + err
