@@ -156,7 +156,7 @@ def _draw_landmarks(
     """Detected landmarks, their triangulated counterparts, and for outliers a line between the two."""
     landmarks = undistort_landmarks(view, scheme)
     detected = landmarks[:, :2] * np.diag(camera.intrinsics)[:2] / np.diag(view.camera.intrinsics)[:2]
-    projected, _ = camera.project(points)
+    projected, depth = camera.project(points)
     outlier = residuals(view, scheme, points) > inlier_limit_px(view.camera)
     jaw = [index for index in range(JAW if scheme == "68" else 0) if landmarks[index, 2] > MIN_CONFIDENCE]
     for first, second in zip(jaw, jaw[1:], strict=False):
@@ -168,7 +168,7 @@ def _draw_landmarks(
             for a, b in ((_subpixel(x - 4, y), _subpixel(x + 4, y)), (_subpixel(x, y - 4), _subpixel(x, y + 4))):
                 cv2.line(image, a, b, _TRIANGULATED, 1, cv2.LINE_AA, shift=4)
         colour = (_OUTLIER if outlier[index] else _USED) if used else _UNUSED
-        if outlier[index]:
+        if outlier[index] and depth[index] > 0:
             cv2.line(image, center, _subpixel(*projected[index]), _OUTLIER, 1, cv2.LINE_AA, shift=4)
         cv2.circle(image, center, 28, colour, -1 if used else 1, cv2.LINE_AA, shift=4)
 

@@ -192,7 +192,9 @@ def _warnings(
         if missing:
             warnings.append(f"{len(missing)} of {len(views)} views without {part}: {listed(missing)}")
     for view in views:
-        if view.outliers:
+        if view.outliers and np.isnan(view.residual_px):
+            warnings.append(f"{view.name}: the subject is behind the camera; check its pose")
+        elif view.outliers:
             warnings.append(f"{view.name}: landmarks that contradict the other views: {listed(view.outliers)}")
         if _folds(view.camera):
             warnings.append(f"{view.name}: the distortion folds the image over itself; check its coefficients")

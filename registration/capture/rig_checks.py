@@ -31,6 +31,7 @@ _MARGIN = 0.5  # around a mask's box, in sides of the box
 _TRIM = 0.005  # of a mask's pixels at each side, outside the box: specks
 _MAX_PAIRS = 400
 _SAME_PLACE_M = 1e-6
+_FAR_M = 1e4
 _UNITS_M = {"millimetres": 1e-3, "centimetres (0.0254: inches)": 1e-2, "kilometres": 1e3}
 
 
@@ -156,7 +157,26 @@ def check_landmark_rays(capture: Capture) -> bool:
         behind = all(view.camera.project(centre)[1][0] < 0 for view in capture.views)
         got = "the subject is behind all cameras" if behind else f"{100 * given:.0f} % of the landmarks agree"
         raise _wrong_poses(capture, expected, got, misreading)
+    _check_digits(capture, given)
     return given >= _CONFIRMED
+
+
+def _check_digits(capture: Capture, agreement: float) -> None:
+    """Refuse a far world whose poses do not agree: a rotation's rounding moves a camera by its part of the distance."""
+    far = _distance(capture)
+    if far > _FAR_M:
+        raise InputError(
+            "The poses have too few digits for a world so far from its origin",
+            where=capture.root / "sparse",
+            expected=f"landmarks that agree, of cameras {far:.3g} m from the world's origin",
+            got=f"{100 * agreement:.0f} % that agree",
+            fix="write all 17 digits of quaternions and translations, or move the world's origin near the subject",
+        )
+
+
+def _distance(capture: Capture) -> float:
+    """The farthest camera's distance (m) from the world's origin."""
+    return max(float(np.linalg.norm(view.camera.centre)) for view in capture.views)
 
 
 def _mended(capture: Capture, misreading: Misreading) -> Capture:
@@ -307,6 +327,7 @@ def _wrong_poses(capture: Capture, expected: str, got: str, misreading: Misreadi
         expected=expected,
         got=got + hint,
         fix="check the poses: COLMAP's are world to camera, x right, y down, z forward, quaternions w x y z"
+        f"{', with 17 digits in a world so far from its origin' if _distance(capture) > _FAR_M else ''}"
         if misreading is None
         else f"{misreading.edit}; COLMAP's poses are world to camera, x right, y down, z forward",
     )

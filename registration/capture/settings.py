@@ -12,6 +12,7 @@ from registration.capture.class_names import canonical
 from registration.errors import InputError
 from registration.storage.reading import parse_toml, read_bytes
 
+_UNITS_M = {"mm": 1e-3, "cm": 1e-2, "dm": 0.1, "km": 1e3, "in": 0.0254, "inch": 0.0254, "ft": 0.3048}
 _RESERVED = ("subject", "expression", "units", "segmentation")
 
 
@@ -46,7 +47,12 @@ def read_settings(path: Path) -> CaptureSettings:
             got = settings.get(key, _misspelt(key, settings))
             raise refuse(f'capture.toml lacks "{key}"', f'{key} = "..."', got)
     if settings.get("units") != "m":
-        raise refuse("The units are not metres", 'units = "m"', settings.get("units", _misspelt("units", settings)))
+        got = settings.get("units", _misspelt("units", settings))
+        factor = _UNITS_M.get(str(got).lower())
+        scale = (
+            f"scale the COLMAP model, the scan and the ground truth by {factor:g}, and write " if factor else "write "
+        )
+        raise refuse("The units are not metres", 'units = "m"', got, f'{scale}units = "m"; see docs/formats.md')
     if "segmentation" not in settings:
         near = _nearest("segmentation", [key for key, value in settings.items() if isinstance(value, dict)])
         if near is not None:

@@ -126,11 +126,15 @@ def _widest_angle(point: Float[np.ndarray, "3"], poses: Float[np.ndarray, "N 3 4
 
 
 def residuals(view: View, scheme: str, points: Float[np.ndarray, "L 3"]) -> Float[np.ndarray, "L"]:
-    """Return the distances (px, full image) of a view's landmarks from projected points (m, world); NaN if unused."""
+    """Return the distances (px, full image) of a view's landmarks from projected points (m, world).
+
+    NaN where a landmark is not used or a point is NaN, infinite where the point is behind the camera.
+    """
     landmarks = undistort_landmarks(view, scheme)
     projected, depth = view.camera.project(points)
     distance = np.linalg.norm(projected - landmarks[:, :2], axis=-1)
-    return np.where((landmarks[:, 2] > MIN_CONFIDENCE) & (depth > 0), distance, np.nan)
+    distance = np.where(depth > 0, distance, np.where(np.isfinite(depth), np.inf, np.nan))
+    return np.where(landmarks[:, 2] > MIN_CONFIDENCE, distance, np.nan)
 
 
 def inlier_limit_px(camera: Camera) -> float:

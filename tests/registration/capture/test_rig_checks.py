@@ -11,12 +11,15 @@ from scipy.spatial.transform import Rotation
 
 from registration.capture import native
 from registration.capture.colmap import write_model
-from registration.capture.rig_checks import check_landmark_rays, mask_box
+from registration.capture.doctor import check_capture
+from registration.capture.pixels import read_mask
+from registration.capture.rig_checks import check_landmark_rays, check_landmark_size, check_mask_rays, mask_box
 from registration.capture.validation import validate_capture
 from registration.errors import InputError
 from registration.types import Capture
 from tests.conftest import SHARED, needs_shared
-from tests.registration.capture.small import make
+from tests.fixtures.far_world import moved
+from tests.registration.capture.small import landmarks_68, make
 
 FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
 FAR = np.array([0.02, 0.3, -0.4])  # of the subject from the origin, or transposed poses of a ring would look at it
@@ -72,11 +75,14 @@ def test_good_poses_pass(good: Path, tmp_path: Path) -> None:
     capture = with_poses(good, tmp_path / "capture", lambda T: T)
     assert check_landmark_rays(capture)
     validate_capture(capture)
-    validate_capture(without_landmarks(capture))
+    validate_capture(without(capture, "landmarks"))
 
 
-def without_landmarks(capture: Capture) -> Capture:
-    return replace(capture, views=tuple(replace(view, landmarks={}) for view in capture.views))
+def without(capture: Capture, *folders: str) -> Capture:
+    """The capture after folders were removed."""
+    for folder in folders:
+        shutil.rmtree(capture.root / folder)
+    return native.read_capture(capture.root)
 
 
 @pytest.mark.parametrize("convention", WRITTEN)
@@ -89,7 +95,7 @@ def test_the_convention_of_the_poses_is_named(good: Path, tmp_path: Path, conven
 
 @pytest.mark.parametrize("convention", ["OpenGL", "inverted", "nerfstudio", "centre", "x y z w"])
 def test_masks_alone_show_that_cameras_look_elsewhere(good: Path, tmp_path: Path, convention: str) -> None:
-    capture = without_landmarks(with_poses(good, tmp_path / "capture", WRITTEN[convention][0]))
+    capture = without(with_poses(good, tmp_path / "capture", WRITTEN[convention][0]), "landmarks")
     with pytest.raises(InputError, match="do not look at one subject") as caught:
         validate_capture(capture)
     if convention == "OpenGL":
@@ -104,11 +110,40 @@ def test_other_units_are_refused_without_landmarks_too(good: Path, tmp_path: Pat
     if factor in (0.1, 10.0):
         return  # a ball of 1.8 cm or 1.8 m may be a part of a subject or a whole one
     with pytest.raises(InputError, match="not in metres") as caught:
-        validate_capture(without_landmarks(capture))
+        validate_capture(without(capture, "landmarks"))
     assert f"by {0.01 if factor == 39.37 else 1 / factor:g} " in caught.value.fix
-    dense = tuple(replace(view, landmarks={"dense": view.landmarks["68"][:50]}, mask=None) for view in capture.views)
     with pytest.raises(InputError, match="not in metres"):
-        validate_capture(replace(capture, views=dense))
+        check_landmark_size(capture, "dense", factor * landmarks_68())
+
+
+def test_a_far_world_needs_all_digits(good: Path, tmp_path: Path) -> None:
+    root = moved(good, tmp_path / "far")
+    validate_capture(native.read_capture(root))
+    listing = root / "sparse" / "images.txt"
+    rounded = [" ".join(_rounded(line.split())) if line else "" for line in listing.read_text().splitlines()]
+    listing.write_text("\n".join(rounded) + "\n")
+    with pytest.raises(InputError, match="too few digits") as caught:
+        validate_capture(native.read_capture(root))
+    assert "17 digits" in caught.value.fix and "origin near the subject" in caught.value.fix
+
+
+def _rounded(words: list[str]) -> list[str]:
+    """The words of an image's line with numbers of eight digits."""
+    return (
+        [f"{float(word):.8g}" if 1 <= i <= 7 else word for i, word in enumerate(words)]
+        if words[0].isdecimal()
+        else words
+    )
+
+
+def test_a_single_camera_that_looks_away_is_named(good: Path, tmp_path: Path) -> None:
+    root = tmp_path / "capture"
+    shutil.copytree(good, root)
+    cameras = {view.image.name: view.camera for view in native.read_capture(good).views}
+    shutil.rmtree(root / "sparse")
+    turned = replace(cameras["cam3.png"], T_cam_world=FLIP @ cameras["cam3.png"].T_cam_world)
+    write_model(root / "sparse", {**cameras, "cam3.png": turned}, np.zeros((0, 3)))
+    assert any("cam3: the subject is behind the camera" in warning for warning in check_capture(root).warnings)
 
 
 def test_cameras_in_one_place_are_refused(good: Path, tmp_path: Path) -> None:
@@ -133,4 +168,5 @@ def test_a_masks_box_has_no_specks() -> None:
 def test_shared_captures_pass(name: str) -> None:
     capture = native.read_capture(SHARED / "data" / "captures" / name)
     validate_capture(capture)
-    validate_capture(without_landmarks(capture))
+    masks = {view.name: read_mask(view.mask, view.camera) > 127 for view in capture.views if view.mask is not None}
+    check_mask_rays(capture, {name: mask_box(mask) for name, mask in masks.items()}, poses=True, size=True)
