@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float
 
-from registration.capture.class_names import BACKGROUND
+from registration.capture.class_names import BACKGROUND, KNOWN
 from registration.capture.samples import ViewSample
 from registration.capture.text import listed
 from registration.capture.triangulation import MIN_CONFIDENCE
@@ -16,6 +16,7 @@ from registration.types import Capture, View
 _MIN_POINTS, _MIN_SAMPLES = 6, 3
 _MOST, _FEW = 0.7, 0.3
 _TOLERANCE = 0.02  # of the image's height: distance from the mask at which a landmark still lies in it
+_FAR = 0.35  # times the distance of two landmarks: not there
 _NEARER = 0.5  # times the distance as named: exchanged
 _DARK, _FLAT = 0.01, 0.004  # mean and deviation of an image's grey values, of 1
 # Two classes, and points of the 68 scheme on each.
@@ -32,58 +33,86 @@ def check_views(capture: Capture, samples: Sequence[ViewSample]) -> list[str]:
         Warnings.
 
     Raises:
-        InputError: a mask is inverted, or the labels of eyes or lips are exchanged in most views.
+        InputError: a mask is inverted, the labels' classes are in another order, or those of eyes or lips are exchanged
+            in most views.
     """
-    warnings = []
+    found: dict[str, list[str]] = {}  # what -> views
     for view, sample in zip(capture.views, samples, strict=True):
         if sample.mask is not None:
-            warnings += _mask_warnings(capture, view, sample)
-        if sample.grey is not None:
-            warnings += _image_warnings(sample)
+            _refuse_inverted(capture, view, sample)
+        for what in [*_mask_warnings(capture, view, sample), *_image_warnings(sample)]:
+            found.setdefault(what, []).append(view.name)
+    _check_label_order(capture, samples)
+    warnings = [f"{what}: {listed(names)}" for what, names in found.items()]
     return warnings + _exchanged_classes(capture, samples)
 
 
-def _mask_warnings(capture: Capture, view: View, sample: ViewSample) -> list[str]:
+def _refuse_inverted(capture: Capture, view: View, sample: ViewSample) -> None:
     assert sample.mask is not None
     inside, hits = sample.mask > 127, landmarks_inside(view, sample)
-    overlap = None
-    if sample.labels is not None and BACKGROUND in capture.classes:
-        labelled = sample.labels != capture.classes.index(BACKGROUND)
-        overlap = float((labelled == inside).mean())
     border = float(np.concatenate([inside[0], inside[:, 0], inside[:, -1]]).mean())  # a bust touches the lower one
     height, width = inside.shape
     centre = float(inside[height // 4 : -height // 4, width // 4 : -width // 4].mean())
-    if overlap is not None:
-        inverted = overlap < _FEW
-    elif hits is not None:
-        inverted = hits < _FEW and border > 0.5
+    got = f"{100 * border:.0f} % of the border and {100 * centre:.0f} % of the centre in the mask"
+    if hits is not None:
+        inverted = hits < _FEW and border > _MOST
+        got += f"; {100 * hits:.0f} % of the landmarks lie in it"
+    elif sample.labels is not None and BACKGROUND in capture.classes:
+        agreement = float((inside == (sample.labels != capture.classes.index(BACKGROUND))).mean())
+        inverted = agreement < _FEW and border > _MOST
+        got += f"; {100 * agreement:.0f} % of the pixels agree with the labels"
     else:
         inverted = border > 0.8 and centre < 0.2
     if inverted:
-        evidence = (
-            f"{overlap:.0%} of the pixels agree with the labels"
-            if overlap is not None
-            else f"{border:.0%} of the border and {centre:.0%} of the centre in the mask"
-        )
         raise InputError(
             "The mask is inverted",
             where=view.mask,
             expected="255 where the subject is, 0 elsewhere",
-            got=evidence if hits is None else f"{evidence}; {hits:.0%} of the landmarks lie in it",
+            got=got,
             fix="invert the mask",
         )
-    warnings = []
-    if overlap is not None and overlap < _MOST:
-        warnings.append(
-            f"{sample.name}: mask and labels show the subject in different places, {overlap:.0%} of the pixels agree"
-        )
+
+
+def _mask_warnings(capture: Capture, view: View, sample: ViewSample) -> Iterator[str]:
+    if sample.mask is None:
+        return
+    if (sample.mask > 127).all():
+        yield "the mask covers the whole image; check that it is a mask"
+        return
+    hits, outlines = landmarks_inside(view, sample), silhouettes(capture, sample)
+    if "segmentation" in outlines and overlap(outlines["masks"], outlines["segmentation"]) < _MOST:
+        yield "mask and labels show the subject in different places; check which is another image's"
+    if "normals" in outlines and (outlines["normals"] & ~outlines["masks"]).sum() > 0.5 * outlines["normals"].sum():
+        if not outlines["normals"].all():
+            yield "most normals lie outside the mask; check which is another image's"
     if hits is not None and hits < 0.5:
-        warnings.append(
-            f"{sample.name}: only {hits:.0%} of its landmarks lie in its mask; check which is another image's"
+        yield "most landmarks lie outside the mask; check which is another image's"
+
+
+def _check_label_order(capture: Capture, samples: Sequence[ViewSample]) -> None:
+    """Compare the classes inside and outside all masks. Raises InputError if they are clearly others' names."""
+    counts = np.zeros((2, len(capture.classes)), int)
+    for sample in samples:
+        if sample.mask is not None and sample.labels is not None and not (sample.mask > 127).all():
+            for row, where in enumerate((sample.mask <= 127, sample.mask > 127)):
+                counts[row] += np.bincount(sample.labels[where], minlength=len(capture.classes))
+    if not counts.sum(1).all():
+        return
+    outside = capture.classes[int(counts[0].argmax())]
+    share = counts[0].max() / counts[0].sum()
+    moved = BACKGROUND in capture.classes and outside != BACKGROUND
+    if moved:
+        behind = counts[:, capture.classes.index(BACKGROUND)]
+        moved = behind[1] > _MOST * behind.sum() > 0
+    named = outside in KNOWN and outside != BACKGROUND and counts[0, counts[0].argmax()] > counts[1, counts[0].argmax()]
+    if share > _MOST and (moved or named):
+        raise InputError(
+            "The labels' classes are in another order, or the background has no name",
+            where=capture.root / "capture.toml",
+            expected="background outside the masks",
+            got=f"{outside} at {100 * share:.0f} % of the pixels outside the masks",
+            fix="check that classes[k] of [segmentation] is the name of index k, from 0 on",
         )
-    if inside.all():
-        warnings.append(f"{sample.name}: the mask covers the whole image; check that it is a mask")
-    return warnings
 
 
 def landmarks_inside(view: View, sample: ViewSample) -> float | None:
@@ -97,18 +126,19 @@ def landmarks_inside(view: View, sample: ViewSample) -> float | None:
     return float(near[sample.at(points)].mean())
 
 
-def _image_warnings(sample: ViewSample) -> list[str]:
-    assert sample.grey is not None
+def _image_warnings(sample: ViewSample) -> Iterator[str]:
+    if sample.grey is None:
+        return
     values = sample.grey[sample.subject] if sample.subject.any() else sample.grey
     if values.mean() < _DARK:
-        return [f"{sample.name}: the image is black where the subject is"]
-    if sample.grey.std() < _FLAT:
-        return [f"{sample.name}: the image shows nothing, it has one brightness"]
-    return []
+        yield "the image is black where the subject is"
+    elif sample.grey.std() < _FLAT:
+        yield "the image shows nothing, it has one brightness"
 
 
 def _exchanged_classes(capture: Capture, samples: Sequence[ViewSample]) -> list[str]:
-    warnings = []
+    warnings: list[str] = []
+    apart: list[str] = []
     for first, first_points, second, second_points in _PAIRS:
         if first not in capture.classes or second not in capture.classes:
             continue
@@ -119,6 +149,8 @@ def _exchanged_classes(capture: Capture, samples: Sequence[ViewSample]) -> list[
             if len(centres) < 2:
                 continue
             verdict = _crossed(centres, marks) if len(marks) == 2 else None
+            if len(marks) == 2 and first == "left_eye" and _apart(centres, marks):
+                apart.append(view.name)
             if verdict is None and first == "left_eye":
                 verdict = _mirrored(centres, list(_lips(capture, sample)))
             if verdict is not None:
@@ -132,7 +164,10 @@ def _exchanged_classes(capture: Capture, samples: Sequence[ViewSample]) -> list[
                 got=f"it lies at the {second} in {len(exchanged)} of {len(verdicts)} views: {listed(exchanged, 5)}",
                 fix=f"exchange {first} and {second} in [segmentation] classes of capture.toml",
             )
-        warnings += [f"{name}: the labels {first} and {second} are exchanged" for name in exchanged]
+        if exchanged:
+            warnings.append(f"{first} and {second} are exchanged in labels or landmarks: {listed(exchanged)}")
+    if apart:
+        warnings.append(f"labels and landmarks show the eyes in different places: {listed(apart)}")
     return warnings
 
 
@@ -146,6 +181,12 @@ def _crossed(centres: Sequence[Float[np.ndarray, "2"]], marks: Sequence[Float[np
     if min(straight, crossed) > _NEARER * max(straight, crossed):
         return None
     return crossed < straight
+
+
+def _apart(centres: Sequence[Float[np.ndarray, "2"]], marks: Sequence[Float[np.ndarray, "2"]]) -> bool:
+    """Whether both labels lie far from both landmarks, in any order."""
+    reach = _FAR * np.linalg.norm(marks[0] - marks[1])
+    return all(min(np.linalg.norm(centre - mark) for mark in marks) > reach for centre in centres)
 
 
 def _mirrored(eyes: Sequence[Float[np.ndarray, "2"]], lips: Sequence[Float[np.ndarray, "2"]]) -> bool | None:
@@ -193,3 +234,10 @@ def silhouettes(capture: Capture, sample: ViewSample) -> dict[str, Bool[np.ndarr
     if sample.normals is not None:
         found["normals"] = (sample.normals != 0).any(-1)
     return found
+
+
+def overlap(a: Bool[np.ndarray, "h w"], b: Bool[np.ndarray, "h2 w2"]) -> float:
+    """Intersection over union of two regions; 0 for images of different size."""
+    if a.shape != b.shape:
+        return 0.0
+    return float((a & b).sum() / max((a | b).sum(), 1))

@@ -1,6 +1,7 @@
 """Views whose files are another view's: found by landmarks and the poses, outlines, and edges of the images."""
 
-from collections.abc import Mapping, Sequence
+from collections import Counter
+from collections.abc import Sequence
 from itertools import combinations
 
 import cv2
@@ -8,7 +9,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from registration.capture import triangulation
-from registration.capture.contradictions import silhouettes
+from registration.capture.contradictions import overlap, silhouettes
 from registration.capture.landmark_checks import misread_view
 from registration.capture.samples import ViewSample
 from registration.types import Capture, View
@@ -30,15 +31,17 @@ def exchanged_views(capture: Capture, samples: Sequence[ViewSample], points: Flo
     Returns:
         Warnings.
     """
-    return [
-        *_by_landmarks(capture, points),
-        *_by_outlines([silhouettes(capture, sample) for sample in samples], samples),
-        *_by_edges(samples),
-        *_same_images(samples),
-    ]
+    pairs = {**_by_edges(samples), **_by_outlines(capture, samples)}  # outlines say more
+    return [*views_that_contradict(capture, points), *pairs.values(), *_same_images(samples)]
 
 
-def _by_landmarks(capture: Capture, points: Float[np.ndarray, "L 3"]) -> list[str]:
+def views_that_contradict(capture: Capture, points: Float[np.ndarray, "L 3"]) -> list[str]:
+    """Name views most of whose landmarks contradict the others, with what would make them agree.
+
+    Args:
+        capture: the capture.
+        points: triangulated landmarks of scheme 68, metres, world; L = 0 without.
+    """
     if len(points) != 68:
         return []
     bad = [view for view in capture.views if (fit := _fit(view, view, points)) is not None and fit < 1 - _CONTRADICTS]
@@ -75,29 +78,29 @@ def _fit(view: View, other: View, points: Float[np.ndarray, "68 3"]) -> float | 
     return float(np.mean(valid < 2 * triangulation.inlier_limit_px(other.camera)))
 
 
-def _by_outlines(outlines: Sequence[Mapping[str, Bool[np.ndarray, "h w"]]], samples: Sequence[ViewSample]) -> list[str]:
-    warnings = []
+def _by_outlines(capture: Capture, samples: Sequence[ViewSample]) -> dict[tuple[str, str], str]:
+    """Pairs of views in which one kind of file fits the other view -> the warning."""
+    outlines = [silhouettes(capture, sample) for sample in samples]
+    misfits: dict[tuple[str, str], list[str]] = {}
     for first, second in combinations(("masks", "segmentation", "normals"), 2):
         usable = [i for i, outline in enumerate(outlines) if first in outline and second in outline]
-        doubtful = [i for i in usable if _overlap(outlines[i][first], outlines[i][second]) < _OWN]
+        doubtful = [i for i in usable if overlap(outlines[i][first], outlines[i][second]) < _OWN]
         for i, k in combinations(doubtful, 2):
-            crossed = [_overlap(outlines[a][first], outlines[b][second]) for a, b in ((i, k), (k, i))]
+            crossed = [overlap(outlines[a][first], outlines[b][second]) for a, b in ((i, k), (k, i))]
             if min(crossed) > _OTHER:
-                warnings.append(
-                    f"{samples[i].name} and {samples[k].name}: {first}/ and {second}/ fit each other if the files of"
-                    f" the two views in one of the folders are exchanged"
-                )
+                misfits.setdefault((samples[i].name, samples[k].name), []).extend((first, second))
+    warnings = {}
+    for pair, folders in misfits.items():
+        (most, _), *_ = Counter(folders).most_common(1)
+        where = f"in {most}/" if folders.count(most) > 1 else f"in {' or '.join(dict.fromkeys(folders))}/"
+        warnings[pair] = (
+            f"the files of {pair[0]} and {pair[1]} seem exchanged {where}: each fits the other view's outline"
+        )
     return warnings
 
 
-def _overlap(a: Bool[np.ndarray, "h w"], b: Bool[np.ndarray, "h2 w2"]) -> float:
-    if a.shape != b.shape:
-        return 0.0
-    return float((a & b).sum() / max((a | b).sum(), 1))
-
-
-def _by_edges(samples: Sequence[ViewSample]) -> list[str]:
-    """Pairs of views whose images have edges at each other's outlines, but not at their own."""
+def _by_edges(samples: Sequence[ViewSample]) -> dict[tuple[str, str], str]:
+    """Pairs of views whose images have edges at each other's outlines, but not at their own -> the warning."""
     used = [sample for sample in samples if sample.grey is not None and 0 < sample.subject.mean() < 1]
     edges = [_edges(sample) for sample in used]
     rims = [_rim(sample.subject) for sample in used]
@@ -105,13 +108,14 @@ def _by_edges(samples: Sequence[ViewSample]) -> list[str]:
         [[float(e[r].mean()) if e.shape == r.shape and r.any() else np.nan for r in rims] for e in edges]
     ).reshape(len(used), len(used))
     own = np.diag(table)
-    warnings = []
+    warnings = {}
     for i, k in combinations(range(len(used)), 2):
         better = min(table[i, k] / max(own[i], 1e-6), table[k, i] / max(own[k], 1e-6))
         if better > _EDGES and max(own[i], own[k]) < 0.7 * np.nanmedian(own):
-            warnings.append(
-                f"{used[i].name} and {used[k].name} seem exchanged: the outlines of each lie at edges of the "
-                "other's image; exchange the two images, or their masks"
+            pair = used[i].name, used[k].name
+            warnings[pair] = (
+                f"the images of {pair[0]} and {pair[1]} seem exchanged: each has edges at the other view's outline; "
+                "exchange the two images"
             )
     return warnings
 

@@ -116,6 +116,15 @@ def check_chirality(capture: Capture, points: Points) -> None:
     )
 
 
+def unnamed_schemes(capture: Capture) -> list[str]:
+    """Warn of schemes of 68 points that have another name than 68, if none is named so."""
+    schemes = {name: points for view in capture.views for name, points in view.landmarks.items()}
+    alike = [name for name, points in schemes.items() if len(points) == 68]
+    if "68" in schemes or not alike:
+        return []
+    return [f"the landmarks of scheme {alike[0]} are 68 points, as those of scheme 68; if they are the same, rename it"]
+
+
 def misread_view(capture: Capture, view: View, points: Points) -> Reading | None:
     """Return the reading with which one view's landmarks of scheme 68 fit the other views, if one does.
 
@@ -161,6 +170,7 @@ def _readings(views: Sequence[View], scheme: str) -> Iterator[Reading]:
             fix="exchange the points of both sides",
             read=lambda points, _: points[MIRRORED_68],
         )
+    yield _resized("100 x 100: percent", lambda camera: 100 / np.array([camera.width_px, camera.height_px]))
     for scale in _SCALES:
         yield Reading(
             name=f"in pixels of images of {scale:.3g} times the size",

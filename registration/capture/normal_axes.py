@@ -14,6 +14,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float
 
+from registration.capture.contradictions import overlap
 from registration.capture.samples import ViewSample
 from registration.errors import InputError
 from registration.types import Camera
@@ -22,6 +23,9 @@ _MARGIN = 0.15  # by which other axes must agree better, of 2: 1 for facing and 
 _RIM = 2  # samples, width of the outline
 _MIN_RIM, _MIN_PIXELS = 40, 200
 _MIN_LENGTH = 0.5
+_SAME = 0.85  # overlap of mask and normals that belong together
+_LENGTHS = (0.75, 1.3)  # the median of unit normals with noise
+_VARIATION = 0.02  # mean deviation of normals from their mean, below which all are equal
 _NAMES: dict[tuple[int, ...], str] = {
     (1, 2, 3): "in the camera's frame",
     (1, -2, -3): "in OpenGL's or Blender's camera axes (y up, z towards the camera)",
@@ -55,6 +59,7 @@ def check_normal_axes(folder: Path, samples: Sequence[ViewSample], cameras: Sequ
     Raises:
         InputError: other axes agree better in all views together.
     """
+    _check_encoding(folder, samples)
     moments = {
         sample.name: found
         for sample, camera in zip(samples, cameras, strict=True)
@@ -85,13 +90,42 @@ def check_normal_axes(folder: Path, samples: Sequence[ViewSample], cameras: Sequ
     return warnings
 
 
+def _check_encoding(folder: Path, samples: Sequence[ViewSample]) -> None:
+    """Refuse normals that are not of unit length, or all equal. Raises InputError."""
+    found = [sample.normals[sample.subject] for sample in samples if sample.normals is not None]
+    normals = np.concatenate([np.zeros((0, 3)), *found])
+    lengths = np.linalg.norm(normals, axis=-1)
+    normals, lengths = normals[lengths > 0.01], lengths[lengths > 0.01]
+    if len(normals) < _MIN_PIXELS:
+        return
+    median, spread = float(np.median(lengths)), float(np.linalg.norm(normals - normals.mean(0), axis=-1).mean())
+    small = bool((normals < 2 / 256 - 1).all())
+    if not _LENGTHS[0] <= median <= _LENGTHS[1]:
+        got = f"a length of {median:.2f} in the median"
+        raise _wrong_encoding(folder, got + (": no value above 255 of 65535" if small else ""))
+    if spread < _VARIATION:
+        raise _wrong_encoding(folder, "the same normal everywhere")
+
+
+def _wrong_encoding(folder: Path, got: str) -> InputError:
+    return InputError(
+        "The normal maps are encoded otherwise",
+        where=folder,
+        expected="16 bit RGB, n = 2 v / 65535 - 1 with unit normals n",
+        got=got,
+        fix="encode them again from normals as floating-point numbers",
+    )
+
+
 def _moments(sample: ViewSample, camera: Camera) -> _Moments | None:
     if sample.normals is None:
         return None
     length = np.linalg.norm(sample.normals, axis=-1)
     has_normal = (length > _MIN_LENGTH) & sample.subject
     normals = sample.normals / np.maximum(length, 1e-6)[..., None]
-    silhouette = sample.subject if not sample.subject.all() else has_normal
+    # A mask that is another image's says nothing about these normals.
+    shown = (sample.normals != 0).any(-1)
+    silhouette = sample.subject if overlap(sample.subject, shown) > _SAME else shown
     outward, rim = _outline(silhouette)
     rim &= has_normal
     if rim.sum() < _MIN_RIM or has_normal.sum() < _MIN_PIXELS:

@@ -67,6 +67,7 @@ def validate_capture(capture: Capture) -> Ledger:
     warnings += normal_axes.check_normal_axes(capture.root / "normals", samples, cameras)
     warnings += require_weight(capture, channels)
     warnings += exchanged.exchanged_views(capture, samples, points)
+    warnings += landmark_checks.unnamed_schemes(capture)
     warnings += leftovers.warnings(capture, files)
     return Ledger(
         channels=(*channels, _scan_channel(scan)),
@@ -156,6 +157,14 @@ def _check_landmarks(capture: Capture) -> tuple[Float[np.ndarray, "L 3"], bool, 
     if distance is not None and not EYE_DISTANCE_M[0] <= distance <= EYE_DISTANCE_M[1]:
         factor = 10.0 ** round(np.log10(0.09 / max(distance, 1e-12)))
         hint = f"scale the COLMAP model and the scan by about {factor:g}" if factor != 1 else "check the calibration"
+        if contradict := exchanged.views_that_contradict(capture, points):
+            raise InputError(
+                "The landmarks of some views contradict the others",
+                where=capture.root / "landmarks",
+                expected="landmarks of one face in all views",
+                got="; ".join(contradict),
+                fix="mend these views, or remove their landmarks",
+            )
         raise InputError(
             "The outer eye corners are too close or too far apart: check that the units are metres",
             where=capture.root / "sparse",
