@@ -162,7 +162,7 @@ def batch(
         print(line, file=sys.stderr)
     if len(jobs.remarks) > MAX_IDS:
         print(f"and {len(jobs.remarks) - MAX_IDS} more", file=sys.stderr)
-    page = BatchPage(url, jobs.run, out)
+    page = BatchPage(url, jobs.run, out, jobs.left_out)
     if not farm.local:
         _say_page(page)
         return 1 if jobs.remarks else 0
@@ -191,6 +191,7 @@ def status(
     farm: FarmOptions = _FARM,
     run: Annotated[str | None, arg(metavar="RUN", help_behavior_hint="(default: all runs)")] = None,
     watch: bool = False,
+    page: Annotated[str | None, arg(metavar="DIR|URL", help_behavior_hint=NOT_SET)] = None,
     listed: ListOptions = _LIST,
 ) -> int:
     """Show queue progress: counts, throughput, expected end, workers, failures.
@@ -199,20 +200,26 @@ def status(
         farm: Which farm; its folder must be that of the workers' logs to show the stages of their jobs.
         run: Only this run, or part of a run such as RUN/it00.
         watch: Refresh every two seconds until Ctrl-C.
+        page: Also write the page and the table of the batch RUN into the store of its results.
         listed: A list of jobs.
     """
     from workflows.engine.reader import QueueReader
+    from workflows.farm.batch_page import batch_page
     from workflows.farm.status import JobFilter, job_lines, status_lines
 
     reader, logs = QueueReader(farm.url), farm.directory / "logs"
     chosen = JobFilter(state=listed.state, subject=listed.subject, text=listed.text)
     limit = MAX_JOBS if listed.limit is None else listed.limit
+    written = None if page is None else batch_page(farm.url, run, page)
     while True:
         lines = job_lines(reader, run, chosen, logs, limit) if listed.wanted else status_lines(reader, run, logs)
         text = "\n".join(lines)
         if watch and sys.stdout.isatty():
             print("\033[H\033[J", end="", file=unescaped(sys.stdout))  # clears the screen
         print(text, flush=True)
+        if written is not None:
+            written.update()
+            print(written.problem or written.location, flush=True)
         if not watch:
             return 0
         time.sleep(REFRESH_S)

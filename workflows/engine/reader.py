@@ -103,11 +103,6 @@ class QueueReader:
                 rows |= {row[0]: _row(row) for row in ask(query, {"ids": list(ids[start : start + 1000])})}
         return rows
 
-    def jobs(self, run: str) -> list[JobRow]:
-        """Return the jobs of a run, or of a part of it, without its flows."""
-        among = BELOW.replace("workflow_uuid", "w.workflow_uuid")
-        return [_row(row) for row in self._rows(self._select(f"w.name = 'job' AND {among}"), below(check_id(run)))]
-
     def listing(self, run: str | None = None) -> list[JobRow]:
         """Return the jobs and flows of a run, or of the whole queue; interrupted ones have that state."""
         where, parameters = _among(run)

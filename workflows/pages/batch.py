@@ -1,6 +1,7 @@
 """The HTML page of a batch: its captures, ranked by what needs a look; the images and reports are files beside it."""
 
 from collections.abc import Sequence
+from pathlib import PurePosixPath
 from urllib.parse import quote
 
 from workflows.pages.base import render
@@ -35,8 +36,10 @@ def render_batch_page(table: BatchTable, *, csv_file: str) -> str:
 
 
 def _line(row: BatchRow, headlines: Sequence[Headline]) -> RegistrationLine:
+    folders = "/".join(PurePosixPath(row.source).parts[-2:])  # a key has other characters than those of ids replaced
     return RegistrationLine(
         name=row.name,
+        label="" if row.source.endswith(f"/{row.name}") else folders,
         status=row.status,
         failed=row.state == FAILED,
         level=verdict_level(row.figures),

@@ -9,6 +9,7 @@ import pytest
 
 from registration.errors import InputError
 from tests.workflows.farm.harness import open_farm
+from workflows.cli.app import main
 from workflows.engine.client import QueueClient
 from workflows.engine.database import default_url
 from workflows.engine.jobs import Job
@@ -41,7 +42,7 @@ def test_the_page_of_a_batch_is_true_at_all_times(tmp_path: Path, monkeypatch: p
         page = BatchPage(farm.url, "june", str(store))
         farm.queue.submit([job("ann/rest", 0.0), Job(id="june/bob/rest", step="refuse")])
         page.update(farm.reader.counts("june", kind="job"))
-        table = store / "captures.csv"
+        table, html = store / "captures.csv", store / "index.html"
         assert statuses(table) == {"ann/rest": "waiting", "bob/rest": "waiting"} and not page.problem
         farm.start("w0")
         farm.wait_for_end("june/ann/rest", "june/bob/rest")
@@ -54,6 +55,8 @@ def test_the_page_of_a_batch_is_true_at_all_times(tmp_path: Path, monkeypatch: p
         running = {"ann/rest": "converged", "bob/rest": "bad input", "cyd/rest": "running", "dan/rest": "waiting"}
         assert statuses(table) == running
         farm.kill("w0")
+        page.write()  # the worker's lock tells
+        assert statuses(table) == {**running, "cyd/rest": "interrupted"} and "is written again" in html.read_text()
         page.write(live=False)
         assert statuses(table) == {**running, "cyd/rest": "interrupted"}
     rows = read_rows(table)
@@ -61,7 +64,7 @@ def test_the_page_of_a_batch_is_true_at_all_times(tmp_path: Path, monkeypatch: p
     assert "mend it" in rows["bob/rest"]["reason"] and rows["bob/rest"]["report"] == ""
     attempt = Store(store).find("ann/rest").attempt  # type: ignore[union-attr]
     assert rows["ann/rest"]["report"] == f"ann/rest/{attempt}/registration/report.html"
-    text = (store / "index.html").read_text()
+    text = html.read_text()
     assert f'href="ann/rest/{attempt}/registration/report.html"' in text and "interrupted, 1" in text
     report = Store(store).verify()
     assert report.is_sound and not [name for name in report.orphaned if name.endswith((".html", ".csv"))]
@@ -118,6 +121,29 @@ def test_a_run_of_another_name_has_a_page_of_its_own(tmp_path: Path) -> None:
     assert {path.name for path in (tmp_path / "store").iterdir()} == {"part_2.html", "part_2.csv"}
     with pytest.raises(InputError):
         BatchPage(url, "../x", str(tmp_path / "store"))
+
+
+def test_captures_without_a_job_are_shown(tmp_path: Path) -> None:
+    migrate(url := default_url(tmp_path))
+    page = BatchPage(url, "r", str(tmp_path / "r"), {"/data/2/ann/rest": "its key is that of /data/1/ann/rest"})
+    page.write()
+    row = read_rows(tmp_path / "r" / "captures.csv")["/data/2/ann/rest"]
+    assert (row["state"], row["status"]) == ("failed", "bad input") and "its key is" in row["reason"]
+
+
+def test_status_writes_the_page_of_a_batch(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    migrate(url := default_url(tmp_path))
+    queue, store = QueueClient(url), tmp_path / "results" / "june"
+    queue.submit([Job(id="june/a/b", step="register stored", arguments={"store": str(store), "capture": "/c"})])
+    queue.close()
+    folder = ["--folder", str(tmp_path)]
+    assert main(["status", *folder, "--run", "june", "--page", str(store)]) == 0
+    assert str(store / "index.html") in capsys.readouterr().out
+    assert statuses(store / "captures.csv") == {"a/b": "waiting"}
+    for words in (["--page", str(store)], ["--run", "june", "--page", str(tmp_path / "elsewhere")]):
+        assert main(["status", *folder, *words]) == 2
+        assert "no batch to write a page of" in capsys.readouterr().err
+    assert not (tmp_path / "elsewhere").exists()
 
 
 def test_a_store_that_cannot_be_written_does_not_end_a_batch(tmp_path: Path) -> None:

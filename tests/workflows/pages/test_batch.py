@@ -1,6 +1,7 @@
 """The page of a batch: escaped, self-contained, and sorted and filtered in a browser."""
 
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -33,6 +34,11 @@ def test_the_page_is_escaped_and_links_files_beside_it() -> None:
     assert "bad input, 1" in page and "needs a look, 1" in page
     assert "the page is written again" in page
     assert "ended or was stopped" in render(live=False)
+
+
+def test_the_names_of_folders_that_a_key_cannot_have_are_shown() -> None:
+    page = render(replace(a_row("_nn_b/rest"), source="/data/ünn b/rest"), a_row("x/rest"))
+    assert "<small>ünn b/rest</small>" in page and page.count("<small>") == 1
 
 
 def test_a_page_of_thousands_of_captures_is_small() -> None:
