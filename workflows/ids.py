@@ -14,6 +14,7 @@ from registration.errors import InputError
 _ID = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,99}(/[A-Za-z0-9][A-Za-z0-9._-]{0,99}){0,7}")
 _BUCKET = re.compile(r"[A-Za-z0-9._-]{1,255}|arn:.+")
 SECRET_NAME = re.compile(r"\w*(?:passw|secret|token|credential|signature|access_?key)\w*", re.IGNORECASE)
+_REFUSED_FIX = "jobs are made by gnmreg; allow a location with `gnmreg worker --root`"
 _URL = re.compile(r"([A-Za-z][A-Za-z0-9+.-]*)://|file:", re.IGNORECASE)
 
 
@@ -94,12 +95,13 @@ def check_location(location: Any, roots: Sequence[str], where: str) -> str:
         where: the name of the argument, for the message.
 
     Raises:
-        InputError: as `resolve_place`, or the place is outside the roots.
+        OutsideRoots: the place is outside the roots.
+        InputError: as `resolve_place`.
     """
     place = resolve_place(location, where)
     if not any(place == root or place.startswith(root.rstrip("/") + "/") for root in roots):
         allowed = ", ".join(roots) or "a root"
-        raise job_refused(where, expected=f"a path or URL below {allowed}", got=shortened(location))
+        raise OutsideRoots(where, expected=f"a path or URL below {allowed}", got=shortened(location))
     return place
 
 
@@ -126,15 +128,16 @@ def redact(text: str) -> str:
     return re.sub(rf"({SECRET_NAME.pattern}=)('[^']*'|[^&#\s'\"]+)", r"\1***", text, flags=re.IGNORECASE)
 
 
+class OutsideRoots(InputError):
+    """A job's place is not below the roots of this worker: another one may take the job."""
+
+    def __init__(self, where: str, *, expected: str, got: str) -> None:
+        super().__init__("The job is refused", where=where, expected=expected, got=got, fix=_REFUSED_FIX)
+
+
 def job_refused(where: str, *, expected: str, got: str) -> InputError:
     """The error of a job that is not run."""
-    return InputError(
-        "The job is refused",
-        where=where,
-        expected=expected,
-        got=got,
-        fix="jobs are made by gnmreg; allow a location with `gnmreg worker --root`",
-    )
+    return InputError("The job is refused", where=where, expected=expected, got=got, fix=_REFUSED_FIX)
 
 
 def shortened(value: Any) -> str:

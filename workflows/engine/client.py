@@ -14,8 +14,8 @@ from dbos import DBOSClient, EnqueueOptions
 from registration.errors import InputError
 from workflows.engine.alive import ended_processes
 from workflows.engine.database import BELOW, below, checked_url, engine, require_queue, table
-from workflows.engine.jobs import MAX_BYTES, FlowJob, Job
-from workflows.engine.serialization import APPLICATION, VERSION, JsonSerializer, UnreadableRow
+from workflows.engine.jobs import MAX_BYTES, VERSION, FlowJob, Job
+from workflows.engine.serialization import APPLICATION, JsonSerializer, UnreadableRow
 from workflows.ids import check_id
 
 CHUNK = 1000  # jobs submitted in one transaction

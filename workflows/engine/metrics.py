@@ -6,6 +6,8 @@ from dataclasses import dataclass
 
 from workflows.engine.alive import ended_processes, lock_names
 from workflows.engine.failures import FailureKind, failure_kinds
+from workflows.engine.jobs import VERSION
+from workflows.engine.presence import living_processes, uncovered
 from workflows.engine.reader import DONE, INTERRUPTED, RUNNING, WAITING, JobRow, JobTimes, QueueReader
 
 DAY_S = 24 * 3600.0
@@ -24,8 +26,10 @@ class QueueMetrics:
     left: int  # that wait, run or are interrupted, of those that the throughput counts
     failures: tuple[FailureKind, ...]
     running: tuple[JobRow, ...]
-    processes: tuple[str, ...]  # executor ids of the processes that live, as far as the queue knows them
-    waiting: tuple[JobTimes, ...]
+    processes: tuple[str, ...]  # executor ids of the processes that live
+    uncovered: tuple[str, ...]  # waiting jobs that every worker of their queue leaves: they lie outside its roots
+    unserved: tuple[str, ...]  # queues with waiting jobs that no process serves
+    foreign: tuple[str, ...]  # versions of waiting jobs that processes of this release do not take
 
     @property
     def left_s(self) -> float | None:
@@ -40,6 +44,9 @@ def queue_metrics(reader: QueueReader, run: str | None = None) -> QueueMetrics:
     registrations = [row for row in jobs if row.captures]
     counted = registrations or jobs
     known = {row.executor for row in rows if row.executor} | lock_names(reader.url)
+    living = living_processes(reader.url)
+    waiting = {row.id: row.queue for row in rows if row.state == WAITING}
+    served = {queue for process in living for queue in process.queues}
     running = [row.id for row in jobs if row.state == RUNNING]
     return QueueMetrics(
         counts=_counts(jobs),
@@ -50,8 +57,10 @@ def queue_metrics(reader: QueueReader, run: str | None = None) -> QueueMetrics:
         left=sum(row.state in (WAITING, RUNNING, INTERRUPTED) for row in counted),
         failures=tuple(failure_kinds(jobs)),
         running=tuple(reader.rows(running).values()),
-        processes=tuple(sorted(known - ended_processes(reader.url, known))),
-        waiting=tuple(row for row in jobs if row.state == WAITING),
+        processes=tuple(sorted({p.name for p in living} | (known - ended_processes(reader.url, known)))),
+        uncovered=tuple(uncovered(living, waiting)),
+        unserved=tuple(sorted({queue for queue in waiting.values() if served and queue and queue not in served})),
+        foreign=tuple(sorted({row.version for row in rows if row.state == WAITING and row.version} - {VERSION})),
     )
 
 

@@ -9,6 +9,7 @@ import os
 import signal
 import socket
 import threading
+import time
 from collections.abc import Awaitable, Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -20,17 +21,19 @@ from dbos._error import DBOSAwaitedWorkflowCancelledError, DBOSWorkflowCancelled
 from registration.errors import InputError
 from registration.terminal import printable
 from workflows.engine.child import RETRIED, StepOutcome, StepProcess
+from workflows.engine.coverage import Coverage, create_workers_table, publish_worker, take_covered_jobs_only
 from workflows.engine.database import SECRETS, checked_url, prepare, with_environments_password
-from workflows.engine.jobs import DRIVER, GPU, REBUILD, SUBJECTS, Step, validate_arguments
+from workflows.engine.jobs import DRIVER, GPU, REBUILD, SUBJECTS, VERSION, Step, validate_arguments
 from workflows.engine.liveness import Liveness, LivenessTimeouts
 from workflows.engine.row_check import refuse_unreadable_rows
 from workflows.engine.scope import FlowScope
-from workflows.engine.serialization import APPLICATION, VERSION, JobFailed, JsonSerializer
+from workflows.engine.serialization import APPLICATION, JobFailed, JsonSerializer
 from workflows.ids import check_id, redact, resolve_roots
 
 log = logging.getLogger("gnmreg")
 
 POLL_S = 0.25  # between two queries of a process for work
+PRESENCE_S = 2.0  # between two looks at what this process says of itself
 QUEUES = {GPU: 1, REBUILD: 1, SUBJECTS: 64, DRIVER: 1}  # jobs of a queue that one process runs at a time
 ATTEMPTS, BACK_OFF_S, BACK_OFF_FACTOR = 3, 10.0, 3.0
 RECOVERIES = 5  # a job that killed more workers than this is dead: it is not run again
@@ -69,6 +72,7 @@ def migrate(url: str) -> None:
     url = checked_url(url)
     prepare(url)
     DBOS.migrate(url)
+    create_workers_table(url)
 
 
 def serve(process: EngineProcess) -> NoReturn:
@@ -89,12 +93,17 @@ def serve(process: EngineProcess) -> NoReturn:
         child.warm()
     _register_workflows(process, url, child, name)
     refuse_unreadable_rows()
+    coverage = Coverage(url, process.steps, resolve_roots(process.roots)) if process.steps else None
+    if coverage is not None:
+        take_covered_jobs_only(coverage, url)
     DBOS(config=_config(url, name))
     DBOS.listen_queues(list(process.queues))
     DBOS.launch()
     for queue, at_a_time in QUEUES.items():
         DBOS.register_queue(queue, worker_concurrency=at_a_time, polling_interval_sec=POLL_S)
     liveness.watch(VERSION, _recover)
+    presence = threading.Thread(target=_say_presence, args=(url, name, process.queues, coverage), daemon=True)
+    presence.start()
     print(f"{name} takes jobs from {', '.join(process.queues)}", flush=True)
     ended = threading.Event()
     for number in (signal.SIGTERM, signal.SIGINT):
@@ -104,6 +113,21 @@ def serve(process: EngineProcess) -> NoReturn:
         child.kill()
     print(f"{name} ends", flush=True)
     os._exit(0)
+
+
+def _say_presence(url: str, name: str, queues: tuple[str, ...], coverage: Coverage | None) -> None:
+    """Keep what `gnmreg status` says of this process up to date."""
+    said: dict[str, Any] | None = None
+    while True:
+        about = {"queues": list(queues), "left": coverage.left if coverage is not None else []}
+        if about != said:
+            try:
+                publish_worker(url, name, about)
+                said = about
+            except Exception as error:  # the server may be restarting
+                first, *_ = str(error).splitlines() or [repr(error)]
+                log.warning("cannot tell the queue about this process now: %s", first)
+        time.sleep(PRESENCE_S)
 
 
 def _recover(name: str) -> None:

@@ -59,6 +59,7 @@ class JobTimes:
     ended: float | None
     started: float | None
     version: str | None
+    queue: str | None
     captures: bool  # whether it registers a capture
     made: bool  # whether it computed something, or found the result of the same inputs
     failure: dict[str, Any] | None
@@ -117,7 +118,7 @@ class QueueReader:
         where, parameters = _among(run)
         rows = self._rows(
             "SELECT w.workflow_uuid, w.name, w.status, w.executor_id, w.completed_at, w.started_at_epoch_ms, "
-            "w.application_version, "
+            "w.application_version, w.queue_name, "
             "CASE WHEN coalesce(i.inputs, w.inputs) LIKE :capture THEN 1 ELSE 0 END, "
             "CASE WHEN coalesce(o.output, w.output) LIKE :kept THEN 0 ELSE 1 END, "
             f"CASE WHEN w.status IN {_FAILED} THEN coalesce(o.error, w.error) END "
@@ -190,7 +191,7 @@ def _row(row: Any) -> JobRow:
 
 
 def _times(row: Any, ended_processes: set[str]) -> JobTimes:
-    identity, kind, status, executor, ended_ms, started, version, captures, made, error = row
+    identity, kind, status, executor, ended_ms, started, version, queue, captures, made, error = row
     state = STATES.get(status, status)
     dead = DEAD if status == "MAX_RECOVERY_ATTEMPTS_EXCEEDED" else ""
     return JobTimes(
@@ -201,6 +202,7 @@ def _times(row: Any, ended_processes: set[str]) -> JobTimes:
         ended=_number(ended_ms) / 1000 if ended_ms else None,
         started=_number(started) / 1000 if started else None,
         version=version,
+        queue=queue,
         captures=bool(captures),
         made=bool(made),
         failure=_failure(error, dead) if state == FAILED else None,

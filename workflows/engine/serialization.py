@@ -11,7 +11,6 @@ from dbos import Serializer
 from dbos._serialization import DBOSPortableJSONSerializer, DefaultSerializer, deserialize_value
 
 APPLICATION = "gnmreg"
-VERSION = "wf-3"  # change it only with the structure of a workflow: workers take jobs of their own version only
 _ERROR = "error"
 
 

@@ -13,10 +13,12 @@ from pathlib import Path
 from registration.errors import InputError
 from registration.progress import Progress
 from workflows.engine.database import ENVIRONMENT
+from workflows.engine.presence import living_processes, uncovered
 from workflows.engine.reader import CANCELLED, DONE, FAILED, RUNNING, WAITING, QueueReader, ended
 from workflows.processes import cores_per_worker, terminate_with_parent
 
 POLL_S = 1.0
+STUCK_S = 10.0  # after which jobs that nobody takes end a command
 RETRY_S = 2.0  # before a process that died is restarted
 REFUSED = 2  # exit code of a command with unusable arguments
 
@@ -66,6 +68,7 @@ def run_until_done(
         )
     processes = _Processes(farm)
     reader = QueueReader(farm.url)
+    stuck_s = 0.0  # for which all jobs that are left lie outside the roots
     try:
         while True:
             processes.restart()
@@ -76,9 +79,21 @@ def run_until_done(
             if row is not None and row.state in (DONE, FAILED, CANCELLED):
                 reason = f"{row.failure['status']}: {row.failure['reason']}" if row.failure else ""
                 return LocalRunResult(counts=counts, reason=reason)
+            stuck_s = stuck_s + POLL_S if _nobody_takes(reader, run, counts) else 0.0
+            if stuck_s > STUCK_S:
+                reason = f"{counts[WAITING]} jobs of an earlier command wait: they lie outside the folders of this one"
+                return LocalRunResult(counts=counts, reason=f"{reason}; name all captures, or `gnmreg cancel {run}`")
             time.sleep(POLL_S)
     finally:
         processes.terminate()
+
+
+def _nobody_takes(reader: QueueReader, run: str, counts: Mapping[str, int]) -> bool:
+    """Whether nothing runs, and every job that waits lies outside the roots of all workers."""
+    if counts.get(RUNNING) or not counts.get(WAITING):
+        return False
+    waiting = {row.id: row.queue for row in reader.times(run) if row.kind == "job" and row.state == WAITING}
+    return 0 < len(waiting) == len(uncovered(living_processes(reader.url), waiting))
 
 
 def _summary(counts: Mapping[str, int]) -> str:

@@ -11,6 +11,7 @@ from typing import Any
 
 from registration.errors import InputError
 from workflows.engine.database import is_sqlite, redacted_url, sqlite_file
+from workflows.engine.jobs import GPU, REBUILD, VERSION
 from workflows.engine.metrics import QueueMetrics, queue_metrics
 from workflows.engine.reader import CANCELLED, DONE, FAILED, INTERRUPTED, RUNNING, WAITING, JobRow, QueueReader
 from workflows.ids import nearest
@@ -188,6 +189,15 @@ def _remarks(figures: QueueMetrics) -> Iterator[str]:
         yield "no worker runs: jobs wait until one starts (gnmreg worker, or the command with --local again)"
     elif figures.left and not any(map(_is_coordinator, figures.processes)) and _active(figures.flows):
         yield "no coordinator runs: flows wait until one starts (gnmreg coordinator)"
+    for name in figures.unserved if workers else ():
+        if name in (GPU, REBUILD):
+            yield f"no worker takes jobs of the queue {name}: start one with --queue {name}"
+    if figures.uncovered:
+        some = ", ".join(figures.uncovered[:MAX_EXAMPLES])
+        text = f"{len(figures.uncovered)} jobs lie outside the roots of all workers, e.g. {some}"
+        yield f"{text}: start a worker with --root and the folders of their captures, model and results"
+    for version in figures.foreign:
+        yield f"jobs of the version {version} wait: processes of this release take those of {VERSION} only"
 
 
 def _active(counts: dict[str, int]) -> int:

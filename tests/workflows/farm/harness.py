@@ -30,7 +30,7 @@ class Farm:
 
     def __init__(self, folder: Path, url: str, timeouts: dict[str, float] | None = None) -> None:
         self.folder, self.url = folder, url
-        self.settings = {"timeouts": timeouts or QUICK}
+        self.settings: dict[str, Any] = {"timeouts": timeouts or QUICK}
         self.processes: dict[str, subprocess.Popen[bytes]] = {}
         self.trace = folder / "trace.txt"
         migrate(url)

@@ -19,7 +19,7 @@ if __name__ == "__main__":
             queues=(GPU, REBUILD) if kind == "worker" else (DRIVER, SUBJECTS),
             logs=Path(folder) / "logs",
             names=(name,),
-            roots=(folder,),
+            roots=tuple(config.get("roots", {}).get(name, (folder,))),
             steps=STEPS if kind == "worker" else {},
             flows=FLOWS if kind == "coordinator" else {},
             timeouts=LivenessTimeouts(**config["timeouts"]) if config.get("timeouts") else None,

@@ -18,6 +18,7 @@ from tests.workflows.farm.harness import QUICK, Farm, alive, children_of, open_f
 from workflows.engine.alive import lock_key
 from workflows.engine.database import checked_url, engine
 from workflows.engine.jobs import FlowJob, Job
+from workflows.engine.metrics import queue_metrics
 from workflows.records.store import Store
 
 pytestmark = pytest.mark.durability
@@ -222,3 +223,18 @@ def test_a_graph_survives_killed_workers_and_coordinators(farm: Farm) -> None:
     assert farm.job("run")["result"] == {"subjects": subjects, "rebuilt": 1}
     assert lost == 0 and repeated <= 1
     assert report.is_sound and report.artifacts == total
+
+
+def test_a_job_outside_a_workers_roots_is_left_to_another(farm: Farm) -> None:
+    elsewhere = farm.folder.parent / f"{farm.folder.name}-elsewhere"
+    elsewhere.mkdir()
+    farm.settings["roots"] = {"w1": [str(elsewhere)]}
+    farm.start("w0")
+    farm.queue.submit([Job(id="run/b", step="work", arguments={"store": str(elsewhere), "key": "b"}, priority=1)])
+    farm.queue.submit([work(farm, "run/a")])
+    farm.wait_for_end("run/a")
+    farm.wait_until(lambda: queue_metrics(farm.reader).uncovered == ("run/b",))
+    assert farm.job("run/b")["state"] == "waiting"
+    farm.start("w1")
+    farm.wait_for_end("run/b")
+    assert farm.job("run/b")["state"] == "done" and executor(farm, "run/b") == "w1"

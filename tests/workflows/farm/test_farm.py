@@ -8,7 +8,8 @@ import pytest
 from registration.errors import InputError
 from tests.workflows.farm.harness import Farm, open_farm
 from workflows.engine.jobs import FlowJob, Job
-from workflows.engine.metrics import queue_metrics
+from workflows.engine.metrics import QueueMetrics, queue_metrics
+from workflows.farm.status import status_lines
 
 
 @pytest.fixture(scope="module")
@@ -25,7 +26,7 @@ def work(farm: Farm, identity: str, seconds: float = 0.0, **settings: object) ->
 
 
 def test_jobs_that_fail_leave_workers_alive(farm: Farm) -> None:
-    foreign = {"store": "/etc", "key": "k"}
+    foreign = {"store": "file:///etc?x", "key": "k"}
     farm.queue.submit(
         [
             Job(id="bad/input", step="refuse"),
@@ -128,3 +129,30 @@ def test_an_executor_id_is_exclusive_and_sigterm_ends_a_worker(farm: Farm) -> No
     process.send_signal(signal.SIGTERM)
     assert process.wait(timeout=20) == 0
     del farm.processes["w2"]
+
+
+def test_a_worker_leaves_jobs_outside_its_roots_to_others(farm: Farm) -> None:
+    """More of them than a page, before those that it takes; nobody's are reported, until a worker takes them."""
+    elsewhere = farm.folder.parent / f"{farm.folder.name}-elsewhere"
+    elsewhere.mkdir()
+    arguments = {"store": str(elsewhere), "key": "k"}
+    ids = [f"roots/{n:03d}" for n in range(120)]
+    farm.queue.submit([Job(id=i, step="work", arguments={**arguments, "key": i}, priority=1) for i in ids])
+    farm.queue.submit([work(farm, "roots/own")])
+    farm.wait_for_end("roots/own")
+    assert farm.reader.counts("roots") == {"waiting": 120, "done": 1}
+
+    def metrics() -> QueueMetrics:
+        return queue_metrics(farm.reader, "roots")
+
+    farm.wait_until(lambda: len(metrics().uncovered) == 120)
+    assert "120 jobs lie outside the roots of all workers, e.g. roots/000" in "\n".join(
+        status_lines(farm.reader, "roots", farm.folder / "logs")
+    )
+    farm.settings["roots"] = {"w3": [str(elsewhere)]}
+    farm.start("w3")
+    farm.wait_until(lambda: not metrics().uncovered)
+    farm.wait_for_end(*ids[:2])
+    assert {farm.reader.rows([i])[i].executor for i in ids[:2]} == {"w3"}
+    assert farm.queue.cancel("roots") > 0
+    farm.kill("w3")

@@ -19,8 +19,8 @@ from tests.workflows.farm.harness import Farm, open_farm
 from tests.workflows.farm.test_hostile import Trap
 from workflows.cli.app import main
 from workflows.engine.database import checked_url, engine, table
-from workflows.engine.jobs import Job
-from workflows.engine.serialization import APPLICATION, VERSION, JsonSerializer, UnreadableRow
+from workflows.engine.jobs import VERSION, Job
+from workflows.engine.serialization import APPLICATION, JsonSerializer, UnreadableRow
 
 OURS = JsonSerializer().name()
 TALK = {"step": "talk", "arguments": {"text": "x"}}

@@ -101,7 +101,7 @@ def test_each_worker_is_shown_with_its_job_and_stage(queue: Queue) -> None:
     for locks, name in zip(held, ("host-cpu0", "host-cpu1", "host-coordinator0"), strict=True):
         assert locks.take(name)
     queue.submit("r/a/x", "r/b/x")
-    queue.run("r/a/x", "host-cpu0", NOW - 200)
+    queue.run("r/a/x", "host-cpu0", time.time() - 200)
     (queue.logs / "r" / "a").mkdir(parents=True)
     lines = [{"time": NOW, "what": "offsets", "done": 41, "total": 90}, {"time": NOW, "note": "hello"}]
     (queue.logs / "r" / "a" / "x.jsonl").write_text("\n".join(map(json.dumps, lines)))
