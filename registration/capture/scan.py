@@ -14,6 +14,7 @@ from registration.storage.ply import read_ply
 from registration.storage.reading import open_file
 
 SCAN = "scan.ply"
+_FAR_M, _COARSE_M, _MANY_VERTICES = 1e3, 2e-3, 2000
 MAX_COORDINATE_M = 1e9  # beyond it, distances between vertices lose their meaning even in float64
 _MESH_SUFFIXES = frozenset(".ply .obj .stl .off .glb .gltf .fbx .dae .3ds .x3d .wrl .xyz .pts .pcd .las .e57".split())
 _FOLDERS = ("scan", "scans", "mesh", "meshes")
@@ -45,7 +46,8 @@ def read_scan(path: Path) -> Scan:
     area and repeated faces. A file whose faces are all unusable is a point cloud.
 
     Raises:
-        InputError: the file cannot be read, has fewer than three vertices, non-finite vertices or wrong indices.
+        InputError: the file cannot be read, has fewer than three vertices, non-finite vertices or wrong indices, or
+            too few digits for a world so far from its origin.
     """
     open_file(path, partial(_input_error, path)).close()  # it is a regular file
     try:
@@ -66,12 +68,32 @@ def read_scan(path: Path) -> Scan:
     if broken.any():
         got = f"vertex {int(np.flatnonzero(broken)[0])} is not, and {int(broken.sum()) - 1} more"
         raise _input_error(path, "finite vertices", got)
+    if (step := _coarse_step_m(vertices[used])) is not None:
+        raise _too_few_digits("scan", path, step, "PLY with double coordinates")
     return Scan(
         vertices=vertices[used],
         triangles=(np.cumsum(used) - 1)[distinct],
         unused_vertices=int((~used).sum()),
         unused_faces=len(triangles) - len(distinct),
         unread=mesh.unread,
+    )
+
+
+def _coarse_step_m(vertices: Float[np.ndarray, "V 3"]) -> float | None:
+    """The step (m) to which coordinates of many vertices in a far world are rounded, if it is coarse; else None."""
+    if len(vertices) < _MANY_VERTICES or np.abs(vertices).max() < _FAR_M:
+        return None
+    steps = [float(np.ptp(axis)) / max(len(np.unique(axis)) - 1, 1) for axis in vertices.T]
+    return max(steps) if max(steps) > _COARSE_M else None
+
+
+def _too_few_digits(what: str, path: Path, step_m: float, form: str) -> InputError:
+    return InputError(
+        f"The {what} has too few digits for a world so far from its origin",
+        where=path,
+        expected=f"coordinates with steps below {_COARSE_M:g} m",
+        got=f"steps of about {step_m:.2g} m",
+        fix=f"export {form}, or move the world's origin near the subject, cameras included",
     )
 
 
@@ -105,9 +127,13 @@ def read_truth(path: Path) -> Float[np.ndarray, "N 3"]:
     """Read the vertices (m, capture world) of a `ground_truth.npz`. Other fields are ignored.
 
     Raises:
-        InputError: the file cannot be read, or has no finite float (N, 3) field `vertices`.
+        InputError: the file cannot be read, has no finite float (N, 3) field `vertices`, or too few digits for a world
+            so far from its origin.
     """
-    return _TRUTH.read(path)["vertices"]
+    vertices = _TRUTH.read(path)["vertices"]
+    if (step := _coarse_step_m(vertices)) is not None:
+        raise _too_few_digits("ground truth", path, step, "float64 vertices")
+    return vertices
 
 
 def _input_error(path: Path, expected: object, got: object) -> InputError:

@@ -8,10 +8,13 @@ import pytest
 from registration.capture import native
 from registration.capture.doctor import check_capture
 from registration.capture.origin import capture_origin
+from registration.capture.scan import read_scan, read_truth
 from registration.capture.triangulation import triangulate
+from registration.errors import InputError
+from registration.storage.mesh import write_ply
 from tests.conftest import SHARED, needs_shared
 from tests.fixtures.far_world import UTM, moved
-from tests.registration.capture.small import make
+from tests.registration.capture.small import ball, make
 
 
 @pytest.mark.parametrize("shift", [UTM, UTM + [0.25, 0.5, 0.125], [70.5, 70.25, 10.125], [-6.4e6, 1e5, 2.0]])
@@ -42,3 +45,22 @@ def test_near_captures_are_computed_in_their_own_world() -> None:
     for capture in sorted((SHARED / "data" / "captures").glob("*/*")):
         if (capture / "capture.toml").is_file():
             assert not capture_origin([view.camera for view in native.read_capture(capture).views]).any(), capture
+
+
+def test_far_scans_and_truths_in_float32_are_refused(tmp_path: Path) -> None:
+    vertices = ball().vertices + UTM
+    assert len(vertices) > 5000
+    write_ply(tmp_path / "scan.ply", vertices, ball().triangles)
+    np.testing.assert_array_equal(read_scan(tmp_path / "scan.ply").vertices, vertices)
+    write_ply(tmp_path / "scan.ply", vertices.astype(np.float32).astype(np.float64), ball().triangles)
+    with pytest.raises(InputError, match="scan has too few digits") as caught:
+        read_scan(tmp_path / "scan.ply")
+    assert "double" in caught.value.fix
+    np.savez(tmp_path / "ground_truth.npz", vertices=vertices)
+    np.testing.assert_array_equal(read_truth(tmp_path / "ground_truth.npz"), vertices)
+    np.savez(tmp_path / "ground_truth.npz", vertices=vertices.astype(np.float32))
+    with pytest.raises(InputError, match="ground truth has too few digits"):
+        read_truth(tmp_path / "ground_truth.npz")
+    near = (ball().vertices + [70.5, 70.25, 10.125]).astype(np.float32)
+    np.savez(tmp_path / "ground_truth.npz", vertices=near)
+    assert len(read_truth(tmp_path / "ground_truth.npz")) == len(near)
