@@ -11,6 +11,7 @@ def main(args: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt:
         print("interrupted", file=sys.stderr)
         return 130
+    sys.excepthook = app.print_unexpected
     return app.main(args)
 
 

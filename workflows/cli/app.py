@@ -13,6 +13,7 @@ import shutil
 import sys
 import textwrap
 from collections.abc import Iterator, Mapping, Sequence
+from types import TracebackType
 from typing import Any, NoReturn
 
 import tyro
@@ -30,7 +31,7 @@ from workflows.cli.arguments import (
     unusable_path,
 )
 from workflows.cli.options import Command
-from workflows.ids import nearest
+from workflows.ids import nearest, redact
 
 DESCRIPTION = "Register multi-view captures of human heads as meshes of one topology, and build head models from them."
 HELP = ("-h", "--help")
@@ -99,6 +100,13 @@ def main(args: Sequence[str] | None = None) -> int:
             raise
         print(unusable_path(error), file=sys.stderr)
         return 2
+
+
+def print_unexpected(kind: type[BaseException], error: BaseException, trace: TracebackType | None) -> None:
+    """Print the traceback of an error that is a bug, without passwords and control characters."""
+    from traceback import format_exception
+
+    print(printable(redact("".join(format_exception(kind, error, trace)))), end="", file=sys.stderr)
 
 
 def _run(words: list[str]) -> int:

@@ -194,7 +194,7 @@ class _Redacting(logging.Filter):
             return False
         record.msg, record.args = printable(redact(record.getMessage())), None
         if record.exc_info:
-            record.exc_text = redact(logging.Formatter().formatException(record.exc_info))
+            record.exc_text = printable(redact(logging.Formatter().formatException(record.exc_info)))
             record.exc_info = None
         return True
 

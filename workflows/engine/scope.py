@@ -1,7 +1,6 @@
 """Operations of a flow. All are durable: a restarted flow gets the stored results of what it did before."""
 
 import asyncio
-import json
 import logging
 import random
 import sqlite3
@@ -14,6 +13,8 @@ import psycopg
 import sqlalchemy as sa
 from dbos import DBOS
 
+from registration.errors import InputError
+from registration.storage.reading import read_json
 from workflows.engine.client import CHUNK, QueueClient
 from workflows.engine.jobs import FlowJob, Job
 from workflows.engine.reader import CANCELLED, DONE, FAILED, JobRow, QueueReader, ended
@@ -122,7 +123,8 @@ async def _failures(url: str, ids: list[str]) -> dict[str, str]:
 
 
 async def _read(file: str) -> Any:
-    return json.loads(await asyncio.to_thread(Path(file).read_text, "utf-8"))
+    refuse = partial(InputError, "The flow's file cannot be read", where=file, fix="submit the run again")
+    return await asyncio.to_thread(read_json, Path(file), refuse)
 
 
 async def _rows(url: str, ids: list[str]) -> dict[str, JobRow]:

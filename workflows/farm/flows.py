@@ -7,6 +7,7 @@ its data come from steps, so that it is deterministic when it is restarted.
 import hashlib
 import json
 from collections.abc import Mapping, Sequence
+from pathlib import PurePosixPath
 from typing import TYPE_CHECKING, Any
 
 from coregister.stopping_rule import StoppingVerdict
@@ -21,7 +22,7 @@ from workflows.engine.jobs import (
     Job,
 )
 from workflows.ids import id_part
-from workflows.records.coregistration import FIRST_MODEL, CoregistrationPlan, RoundProducts, model_name
+from workflows.records.coregistration import FIRST_MODEL, PLAN, CoregistrationPlan, RoundProducts, model_name
 from workflows.records.step_results import BuildResult, EvaluateResult, HoldOutResult, StabilizeResult
 from workflows.steps import table
 
@@ -96,7 +97,9 @@ async def coregister(scope: "FlowScope", *, plan: str) -> dict[str, Any]:
     Returns:
         The number of rounds, the last model's file and the reason of the end.
     """
-    record = CoregistrationPlan.from_json(await scope.read(plan), where=plan)
+    record = CoregistrationPlan.from_json(await scope.read(_checked_plan(scope, plan)), where=plan)
+    if PurePosixPath(plan).parent != PurePosixPath(record.out):
+        raise scope.park(f"the plan is that of another folder than {PurePosixPath(plan).parent}")
     training, model = list(record.split.training), str(record.model)
     held_out = await _hold_out(scope, record)
     models, rounds = {FIRST_MODEL: model}, list[RoundProducts]()
@@ -153,6 +156,13 @@ async def coregister(scope: "FlowScope", *, plan: str) -> dict[str, Any]:
         if not verdict.proceed:
             break
     return {"rounds": len(rounds), "model": model, "reason": verdict.reason}
+
+
+def _checked_plan(scope: "FlowScope", plan: str) -> str:
+    """The path of a plan, from a row that others can write: no other file of this machine is read."""
+    if PurePosixPath(plan).name != PLAN or not PurePosixPath(plan).is_absolute():
+        raise scope.park(f"no path of a {PLAN}")
+    return plan
 
 
 async def _end_round(

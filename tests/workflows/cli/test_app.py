@@ -10,6 +10,7 @@ from registration import pipeline
 from registration.options import RegisterOptions
 from tests.conftest import FIXTURES
 from tests.registration.capture.small import make
+from workflows.cli import app
 from workflows.cli.app import main
 from workflows.records.subject import CaptureRow, SubjectRecord
 
@@ -264,3 +265,12 @@ def test_an_interrupt_is_reported_without_a_traceback(
     monkeypatch.setattr(workflows.steps.subject, "register_subject", interrupt)
     assert main(["subject", "S", "--model", "M", "--out", "O"]) == 130
     assert capsys.readouterr().err == "interrupted\n"
+
+
+def test_the_traceback_of_a_bug_shows_no_password_and_no_escape_sequence(capsys: pytest.CaptureFixture[str]) -> None:
+    try:
+        raise RuntimeError("no \x1b[2J at postgresql://me:a/canary@h/d or s3://AKIA:canary@b")
+    except RuntimeError as error:
+        app.print_unexpected(type(error), error, error.__traceback__)
+    text = capsys.readouterr().err
+    assert "Traceback" in text and r"\x1b[2J" in text and "canary" not in text and "\x1b" not in text

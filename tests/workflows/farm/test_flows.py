@@ -1,6 +1,7 @@
 """The order of jobs in flows; a stand-in returns fixed results for the steps."""
 
 import asyncio
+import json
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -9,9 +10,11 @@ import pytest
 
 from coregister.next_model.recipes import few_registrations
 from coregister.stopping_rule import StoppingRule
+from registration.errors import InputError
 from registration.options import RegisterOptions
 from tests.workflows.farm.inline import Inline
 from workflows.engine.jobs import Job
+from workflows.engine.scope import _read as read_plan
 from workflows.engine.serialization import JobFailed
 from workflows.farm.flows import coregister, subject
 from workflows.records.coregistration import CoregistrationPlan
@@ -116,9 +119,21 @@ def plan(tmp_path: Path) -> Path:
     return tmp_path / "plan.json"
 
 
-def run_loop(plan: Path, rounds: Rounds) -> tuple[dict[str, Any], list[Job]]:
+def run_loop(plan: Path, rounds: Rounds, name: str = "/o/plan.json") -> tuple[dict[str, Any], list[Job]]:
+    """Run the flow with the plan's content at another path, that of its output folder."""
     scope = Inline("r", rounds, [])
-    return asyncio.run(coregister(scope, plan=str(plan))), scope.log  # type: ignore[arg-type]
+
+    async def read(_: str) -> Any:
+        return json.loads(plan.read_text())
+
+    scope.read = read  # type: ignore[method-assign]
+    return asyncio.run(coregister(scope, plan=name)), scope.log  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("name", ["/etc/passwd", "plan.json", "/other/plan.json", "/o/x/plan.json"])
+def test_a_plan_of_another_place_is_refused(plan: Path, name: str) -> None:
+    with pytest.raises(JobFailed, match="parked: (no path of a plan.json|the plan is that of another folder)"):
+        run_loop(plan, Rounds([True]), name)
 
 
 def test_each_round_uses_the_previous_model_until_the_verdict_stops(plan: Path) -> None:
@@ -153,3 +168,9 @@ def test_different_arguments_give_a_different_job_id(plan: Path) -> None:
     _, second = run_loop(plan, Rounds([False], broken=("it00/s00001-p1/e001",)))
     ids = [{job.id for job in log if "/collect" in job.id} for log in (first, second)]
     assert len(ids[0] - ids[1]) == 1 and len(ids[0] & ids[1]) == 4
+
+
+@pytest.mark.parametrize("file", ["/dev/zero", "/proc/self", "/none"])
+def test_a_flow_reads_ordinary_files_only(file: str) -> None:
+    with pytest.raises(InputError, match="cannot be read"):
+        asyncio.run(read_plan(file))

@@ -112,7 +112,7 @@ def test_no_forged_row_runs_and_each_ends_with_its_reason(farm: Farm) -> None:
     }
     farm.start("w0", "c0")
     farm.queue.submit([Job(id="run/z", step="talk", arguments={"text": "still here"})])
-    farm.wait_for_end(*rows, "run/z", within_s=60.0)
+    farm.wait_for_end(*rows, "run/z")
     for identity, words in rows.items():
         job = farm.job(identity)
         assert job["state"] == "failed" and words in job["failure"]["reason"], (identity, job)
@@ -136,7 +136,7 @@ def test_forged_results_of_steps_fail_their_job(farm: Farm) -> None:
         forger.row(f"run/{name}")
         forger.insert("operation_outputs", workflow_uuid=f"run/{name}", **step, **columns)
     farm.start("w0")
-    farm.wait_for_end(*(f"run/{name}" for name in forged), within_s=60.0)
+    farm.wait_for_end(*(f"run/{name}" for name in forged))
     assert {name: farm.job(f"run/{name}")["state"] for name in forged} == dict.fromkeys(forged, "failed")
     assert not forger.sprung.exists()
 
