@@ -83,7 +83,7 @@ def register(
     out = Path(out)
     check_output_folder(out)
     inputs = read_inputs(Path(capture), Path(model), options, None if neutral is None else Path(neutral))
-    for warning in inputs.ledger.warnings:
+    for warning in (*inputs.ledger.warnings, *inputs.ledger.unread):
         progress.message(f"warning: {warning}")
     if not force and (same := find_existing(out, inputs.input_hash)) is not None:
         progress.message(f"{out} already holds the registration of these inputs")
@@ -261,7 +261,7 @@ def _collect(inputs: RegistrationInputs, fitted: _Fitted, comparison: Comparison
             "camera_gains": problem.appearance.gains.cpu().numpy().round(4).tolist(),
             "views_not_trusted": dict(problem.view_weights.notes),
             "notes": list(fitted.initial.notes),
-            "capture_warnings": list(inputs.ledger.warnings),
+            **({"warnings": list(inputs.ledger.warnings)} if inputs.ledger.warnings else {}),
             "residuals": comparison.residuals,
         },
         config=inputs.config,

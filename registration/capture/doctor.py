@@ -150,7 +150,7 @@ def check_capture(path: Path, sheet: Path | None = None) -> CaptureReport:
         eye_distance_mm=None if distance is None else MM_PER_M * distance,
         scan=scan,
         channels=ledger.channels,
-        warnings=(*_warnings(capture, views, triangulated, scan), *ledger.warnings),
+        warnings=(*_warnings(capture, views, triangulated, scan), *ledger.warnings, *ledger.unread),
         sheet=sheet,
     )
 

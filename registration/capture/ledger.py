@@ -62,6 +62,7 @@ class Ledger:
 
     channels: tuple[Channel, ...]
     warnings: tuple[str, ...]
+    unread: tuple[str, ...]  # files and folders that nothing reads, a line each
     coverage: Mapping[str, float | None]  # view's name -> fraction of the image that its mask covers; None: no mask
     head_rows: Mapping[str, int]  # view's name -> height of its head, px of the stored image
 

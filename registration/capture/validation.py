@@ -68,10 +68,10 @@ def validate_capture(capture: Capture) -> Ledger:
     warnings += require_weight(capture, channels)
     warnings += exchanged.exchanged_views(capture, samples, points)
     warnings += landmark_checks.unnamed_schemes(capture)
-    warnings += leftovers.warnings(capture, files)
     return Ledger(
         channels=(*channels, _scan_channel(scan)),
         warnings=tuple(warnings),
+        unread=tuple(leftovers.warnings(capture, files)),
         coverage={sample.name: sample.coverage for sample in samples},
         head_rows={sample.name: sample.head_rows for sample in samples},
     )

@@ -24,7 +24,8 @@ def copy(tmp_path: Path) -> Path:
 
 def warnings(root: Path) -> str:
     """The warnings of a capture's checks, one a line. Raises InputError."""
-    return "\n".join(validate_capture(native.read_capture(root)).warnings)
+    ledger = validate_capture(native.read_capture(root))
+    return "\n".join([*ledger.warnings, *ledger.unread])
 
 
 def images(root: Path, folder: str, change: Change, views: Collection[str] = ()) -> None:
