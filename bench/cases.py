@@ -54,7 +54,6 @@ _WORDS = {  # what a refusal or a warning must say
     "labels_rgb": "grey|gray|colou?r|channel|RGB",
     "landmarks_conf_percent": "confidence",
     "landmarks_flipped": "left and right|mirror",
-    "landmarks_null": "null|None|finite|number",
     "landmarks_suffix": "landmarks/",
     "landmarks_unit": "normali[sz]ed|0 to 1|0\\.\\.1|fractions",
     "landmarks_xy_swapped": "x and y|exchanged|swapped",

@@ -4,9 +4,11 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from registration.capture.native import read_capture
 from registration.capture.pixels import read_view
+from registration.capture.scan import read_scan
 from registration.capture.triangulation import MIN_CONFIDENCE
 from registration.errors import InputError
 from registration.evaluate.evaluation import evaluate_registration
@@ -74,8 +76,12 @@ def _pixel_differences(a: ViewPixels, b: ViewPixels) -> list[str]:
 
 
 def _scan_difference(first: Capture, second: Capture, registration: Registration) -> list[str]:
-    if first.scan is None:
-        return []
+    if first.scan is None or second.scan is None:
+        return [] if first.scan is None else ["no scan"]
+    scans = read_scan(first.scan), read_scan(second.scan)
+    if bool(len(scans[0].triangles)) != bool(len(scans[1].triangles)):  # visibility, and so the figure, is another
+        apart_mm = 1000 * float(cKDTree(scans[0].vertices).query(scans[1].vertices)[0].max())
+        return [f"scan's points up to {apart_mm:.3f} mm apart"] if apart_mm > _MAX_SCAN_MM else []
     shift = moved_by(first, second)
     moved = replace(
         registration,
