@@ -177,7 +177,7 @@ def batch(
     lines = status_lines(QueueReader(url), jobs.run, folder / "logs")
     print("\n".join((*lines, *filter(None, [result.reason]))))
     made, kept = made_and_kept(url, jobs)
-    print(f"{made} registered, {kept} kept: their inputs did not change")
+    print(f"{made} registered, {kept} kept, as their inputs did not change")
     return 0 if not jobs.remarks and result.counts.get("done", 0) == sum(result.counts.values()) else 1
 
 

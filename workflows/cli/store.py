@@ -4,7 +4,9 @@ from typing import Annotated
 
 from tyro.conf import arg
 
+from registration.errors import InputError
 from workflows.cli.options import FarmOptions, RunName, StoreUrl
+from workflows.ids import nearest, redact
 
 _FARM = FarmOptions()
 
@@ -59,8 +61,21 @@ def retire(
     kept.require()
     opened = QueueClient(farm.url)
     try:
-        for part in kept.retire(run, keep):
+        retired = kept.retire(run, keep)
+        for part in retired:
             print(f"{part}: {opened.forget(part)} rows deleted")
     finally:
         opened.close()
+    runs = {key.partition("/")[0] for key in kept.keys()} if not retired else {run}
+    if run not in runs:
+        near = nearest(run, runs) or sorted(runs)[:10]
+        raise InputError(
+            "There is no such run in the store",
+            where=redact(store),
+            expected=f"one of {', '.join(near)}" if near else "a store with results of runs",
+            got=run,
+            fix="correct the name",
+        )
+    if not retired:
+        print(f"nothing to delete: {run} has no more than {keep} rounds here")
     return 0

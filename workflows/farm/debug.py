@@ -51,7 +51,9 @@ def debug(row: JobRow, out: Path, progress: Progress, *, port: int | None = None
     if port is not None:
         raise _input_error(row.id, expected="a registration", got=f"the step {name!r}, which --view cannot show")
     step = STEPS[name]
-    changed = {"out": str(out / "product")} if "out" in step.path_arguments else {}
+    if "out" not in step.path_arguments:
+        raise _input_error(row.id, expected="a step with a product of its own", got=f"{name!r}, which writes elsewhere")
+    changed = {"out": str(out / "product")}
     return DebugResult(summary=str(function_of(step.function)(**{**arguments, **changed}, progress=progress)))
 
 

@@ -276,13 +276,14 @@ def _plain(identity: str) -> str:
 
 
 def _parts(ids: Iterable[str], typed: str) -> set[str]:
-    """What could have been meant: ids and their beginnings; of very many, runs and what is below the typed run."""
+    """What could have been meant: ids and their beginnings; of very many, runs and what is beside the typed id."""
     split = [identity.split("/") for identity in ids]
     parts = {"/".join(words[:count]) for words in split for count in range(1, len(words) + 1)}
-    if len(parts) > _MAX_NAMES:
-        run = typed.partition("/")[0]
-        parts = {part for part in parts if "/" not in part or part.startswith(f"{run}/")}
-    return parts if len(parts) <= _MAX_NAMES else {part for part in parts if "/" not in part}
+    if len(parts) <= _MAX_NAMES:
+        return parts
+    beside = f"{typed.rpartition('/')[0]}/"
+    near = {part for part in parts if "/" not in part or part.startswith(beside)}
+    return near if len(near) <= _MAX_NAMES else {part for part in parts if "/" not in part}
 
 
 def _unknown(kind: str, typed: str, known: Iterable[str]) -> InputError:

@@ -104,6 +104,49 @@ def test_store_verify_fails_on_altered_files(tmp_path: Path, capsys: pytest.Capt
     assert f"altered: a/{artifact.attempt}/f" in capsys.readouterr().out
 
 
+def test_retiring_an_unknown_run_fails(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    Store(tmp_path).produce("june/it00/x", input_hash="w", make=lambda folder: {"n": (folder / "f").write_text("x")})
+    folder = ["--keep", "1", "--folder", str(tmp_path / "farm")]
+    main(["migrate", "--folder", str(tmp_path / "farm")])
+    assert main(["store", "retire", str(tmp_path), "jun", *folder]) == 2
+    assert "one of june" in capsys.readouterr().err
+    assert main(["store", "retire", str(tmp_path), "june", *folder]) == 0
+    assert "nothing to delete" in capsys.readouterr().out
+
+
+def test_names_that_are_not_in_the_queue_fail(captures: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    folder = ["--folder", str(captures)]
+    main(["migrate", *folder])
+    batch(captures)
+    commands = (
+        ["status", "--run", "otu"],
+        ["status", "--jobs", "--subject", "anm"],
+        ["cancel", "otu"],
+        ["retry", "otu"],
+    )
+    for words in (*commands, ["logs", "otu"], ["debug", "out/anm/rest", "--out", str(captures / "d")]):
+        assert main([*words, *folder]) == 2
+        assert "did you mean" in capsys.readouterr().err
+    assert QueueReader(default_url(captures)).counts("out", kind="job") == {"waiting": 2}
+
+
+def test_jobs_are_listed_and_found(captures: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    folder = ["--folder", str(captures)]
+    main(["migrate", *folder])
+    batch(captures)
+    capsys.readouterr()
+    assert main(["status", "--jobs", "--state", "waiting", "--text", "BOB", *folder]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[0].split() == ["id", "state", "since", "stage", "capture"]
+    assert lines[1].split()[:2] == ["out/bob/rest", "waiting"] and lines[1].endswith(str(captures / "bob" / "rest"))
+    assert lines[2:] == ["1 of 1 jobs"]
+    assert main(["logs", "bob/rest", *folder]) == 0 and main(["logs", "out", *folder]) == 0
+    text = capsys.readouterr().out
+    assert "out/bob/rest: waiting" in text and "out: waiting; jobs: 2 (2 waiting)" in text
+    assert main(["debug", "out", "--out", str(captures / "d"), *folder]) == 2
+    assert "name one of out/" in capsys.readouterr().err
+
+
 def test_jobs_are_named_by_the_last_two_folders(captures: Path) -> None:
     locations = [f"{captures}/ann/rest", f"{captures}/bob/rest", "s3://bucket/c/cyd/rest"]
     jobs = batch_jobs(locations, model=str(synthetic.MODEL), out="s3://bucket/results/june")

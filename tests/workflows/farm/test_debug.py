@@ -107,4 +107,6 @@ def test_jobs_that_cannot_be_debugged_are_refused(calls: list[dict[str, Any]], t
             debug(bad_row, out, NullProgress())
     with pytest.raises(InputError, match="--view cannot show"):
         debug(row(step="stabilize", run="/r", model="/m.npz", out="/o"), tmp_path / "out", NullProgress(), port=0)
+    with pytest.raises(InputError, match="cannot be debugged"):  # it would write into the coregistration's folder
+        debug(row(step="end round", plan="/p/plan.json", held_out={}, rounds=[]), tmp_path / "out", NullProgress())
     assert not calls and not (tmp_path / "out").exists()
