@@ -380,3 +380,12 @@ def test_the_command_resumes_and_reports_failures(dataset, true_register, tmp_pa
     true_register.outcomes["p0/neutral"] = true_register.outcomes["p1/neutral"] = ValueError("odd")
     assert main([*local, "--seed", "1"]) == 1
     assert "captures failed; inspect them" in capsys.readouterr().out
+    assert "captures failed; inspect them" in read_record(out)["stopped"]
+    assert "Stopped: parked: it00: " in (out / "index.html").read_text()
+
+    def interrupted(*_: object) -> LocalRunResult:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(workflows.farm.coregistration, "run_until_done", interrupted)
+    assert main(local) == 130
+    assert "Stopped: the command ended before the run" in (out / "index.html").read_text()

@@ -204,13 +204,16 @@ def status(
         listed: A list of jobs.
     """
     from workflows.engine.reader import QueueReader
-    from workflows.farm.batch_page import batch_page
     from workflows.farm.status import JobFilter, job_lines, status_lines
 
     reader, logs = QueueReader(farm.url), farm.directory / "logs"
     chosen = JobFilter(state=listed.state, subject=listed.subject, text=listed.text)
     limit = MAX_JOBS if listed.limit is None else listed.limit
-    written = None if page is None else batch_page(farm.url, run, page)
+    written = None
+    if page is not None:
+        from workflows.farm.batch_page import batch_page  # slow: it imports the steps
+
+        written = batch_page(farm.url, run, page)
     while True:
         lines = job_lines(reader, run, chosen, logs, limit) if listed.wanted else status_lines(reader, run, logs)
         text = "\n".join(lines)

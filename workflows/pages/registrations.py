@@ -4,7 +4,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from workflows.records.headline import VERDICTS, Headline, headline_value
+from registration.evaluate.verdict import LEVEL_TITLES, Level
+from workflows.records.headline import Headline, headline_value
 
 MISSING = "–"
 
@@ -17,7 +18,7 @@ class RegistrationLine:
     label: str = ""  # a second name, such as the expression's
     status: str
     failed: bool
-    level: str = ""  # of the verdict; empty: there is none
+    level: Level | None = None  # of the verdict; None: there is none
     look: str = ""  # why it should be looked at
     reason: str
     report: str | None  # path relative to the page, not quoted
@@ -28,7 +29,7 @@ class RegistrationLine:
 
     @property
     def verdict(self) -> str:
-        return VERDICTS.get(self.level, "")
+        return "" if self.level is None else LEVEL_TITLES[self.level]
 
 
 def figure_texts(figures: Mapping[str, Any], headlines: Sequence[Headline]) -> list[str]:

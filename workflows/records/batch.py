@@ -9,13 +9,13 @@ from typing import Any
 
 from workflows.records.headline import (
     HEADLINES,
-    VERDICTS,
     WRONG,
     Headline,
     headline_value,
     present,
     verdict_level,
     verdict_reasons,
+    verdict_title,
 )
 
 DONE, FAILED, INTERRUPTED, CANCELLED = "done", "failed", "interrupted", "cancelled"  # states of jobs
@@ -73,7 +73,7 @@ class BatchTable:
         writer.writerow((*_COLUMNS, *(headline.column for headline in headlines), *_MORE_COLUMNS))
         for row in self.rows:
             values = [headline_value(row.figures, headline) for headline in headlines]
-            verdict = VERDICTS.get(verdict_level(row.figures), "")
+            verdict = verdict_title(row.figures)
             words = [_cell(word) for word in (row.name, row.state, row.status, verdict, row.look, row.reason)]
             numbers = ["" if value is None else f"{value:.6g}" for value in (*values, row.seconds)]
             writer.writerow((*words, *numbers, *map(_cell, (row.report or "", row.source, row.job))))

@@ -5,6 +5,9 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
+from registration.evaluate.residuals import RESIDUALS
+from registration.evaluate.verdict import LEVEL_TITLES, Level
+
 
 @dataclass(frozen=True, kw_only=True)
 class Headline:
@@ -23,14 +26,13 @@ HEADLINES = (
     Headline(path=(*_SCAN, "median_mm"), column="scan_to_mesh_face_median_mm", title="scan to mesh, median", unit="mm"),
     Headline(path=(*_SCAN, "p95_mm"), column="scan_to_mesh_face_p95_mm", title="scan to mesh, 95 %", unit="mm"),
     Headline(path=("drift", "face", "mean_mm"), column="drift_face_mean_mm", title="drift, mean", unit="mm"),
-    Headline(path=(*_IMAGES, "silhouette_px"), column="silhouette_px", title="silhouette", unit="px", digits=1),
-    Headline(path=(*_IMAGES, "normals_deg"), column="normals_deg", title="normals", unit="°", digits=1),
-    Headline(path=(*_IMAGES, "colour_levels"), column="colour_levels", title="colour", unit="levels", digits=1),
-    Headline(path=(*_IMAGES, "labels_percent"), column="labels_percent", title="labels", unit="%", digits=1),
-    Headline(path=(*_IMAGES, "landmarks_px"), column="landmarks_px", title="landmarks", unit="px", digits=1),
+    *(
+        Headline(path=(*_IMAGES, name), column=name, title=kind.title, unit=kind.unit, digits=1)
+        for name, kind in RESIDUALS.items()
+    ),
 )
-GOOD, LOOK, WRONG = "good", "look", "wrong"  # levels of a verdict
-VERDICTS = {GOOD: "good", LOOK: "look at it", WRONG: "wrong"}
+LOOK: Level = "look"
+WRONG: Level = "wrong"
 
 
 def brief(figures: Mapping[str, Any]) -> dict[str, Any]:
@@ -55,11 +57,17 @@ def headline_value(figures: Mapping[str, Any], headline: Headline) -> float | No
     return float(value) if number else None
 
 
-def verdict_level(figures: Mapping[str, Any]) -> str:
-    """Return "good", "look" or "wrong"; empty for a registration without a verdict."""
+def verdict_level(figures: Mapping[str, Any]) -> Level | None:
+    """Return the level of the verdict; None for a registration without one."""
     verdict = figures.get("verdict")
     level = verdict.get("level") if isinstance(verdict, Mapping) else None
-    return level if level in VERDICTS else ""
+    return next((known for known in LEVEL_TITLES if known == level), None)
+
+
+def verdict_title(figures: Mapping[str, Any]) -> str:
+    """Return the verdict in words; empty for a registration without one."""
+    level = verdict_level(figures)
+    return "" if level is None else LEVEL_TITLES[level]
 
 
 def verdict_reasons(figures: Mapping[str, Any]) -> list[str]:

@@ -2,13 +2,15 @@
 
 import csv
 import io
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 from registration.errors import InputError
-from tests.workflows.farm.harness import open_farm
+from tests.workflows.farm.harness import ROOT, open_farm
 from workflows.cli.app import main
 from workflows.engine.client import QueueClient
 from workflows.engine.database import default_url
@@ -144,6 +146,13 @@ def test_status_writes_the_page_of_a_batch(tmp_path: Path, capsys: pytest.Captur
         assert main(["status", *folder, *words]) == 2
         assert "no batch to write a page of" in capsys.readouterr().err
     assert not (tmp_path / "elsewhere").exists()
+
+
+def test_status_without_a_page_imports_nothing_slow(tmp_path: Path) -> None:
+    migrate(default_url(tmp_path))
+    code = "import sys; from workflows.cli.app import main; main(sys.argv[1:]); print('torch' in sys.modules)"
+    command = [sys.executable, "-c", code, "status", "--folder", str(tmp_path)]
+    assert subprocess.check_output(command, cwd=ROOT, text=True).splitlines()[-1] == "False"
 
 
 def test_a_store_that_cannot_be_written_does_not_end_a_batch(tmp_path: Path) -> None:
