@@ -4,6 +4,7 @@ Our own reader, since pycolmap's wheel contains GPL code (docs/adr/0006-no-gpl-b
 """
 
 import math
+import os
 from collections.abc import Callable, Mapping
 from pathlib import Path
 
@@ -80,9 +81,9 @@ def read_points(sparse: Path) -> tuple[Float[np.ndarray, "P 3"], UInt8[np.ndarra
         InputError: the file of points is malformed.
     """
     folder = _model_folder(sparse)
-    if (folder / "points3D.bin").is_file():
+    if os.path.lexists(folder / "points3D.bin"):
         return read_binary_points(folder / "points3D.bin")
-    if (folder / "points3D.txt").is_file():
+    if os.path.lexists(folder / "points3D.txt"):
         return read_text_points(folder / "points3D.txt")
     return np.zeros((0, 3)), np.zeros((0, 3), np.uint8)
 

@@ -1,5 +1,6 @@
 """What a capture needs of a COLMAP model, as its files hold it: https://colmap.github.io/format.html."""
 
+import os
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -74,4 +75,4 @@ def malformed(where: object, expected: object, got: object) -> InputError:
 def rig_files(folder: Path, suffix: str) -> tuple[Path | None, Path | None]:
     """Return the files of rigs and of frames, None for one that is missing; COLMAP before 3.12 wrote neither."""
     rigs, frames = folder / f"rigs.{suffix}", folder / f"frames.{suffix}"
-    return rigs if rigs.is_file() else None, frames if frames.is_file() else None
+    return rigs if os.path.lexists(rigs) else None, frames if os.path.lexists(frames) else None

@@ -4,7 +4,7 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 from jaxtyping import Float
@@ -15,7 +15,7 @@ from registration.stabilize.pipeline import StabilizedSubject
 from registration.storage.files import atomic_directory, refuse_foreign
 from registration.storage.hashing import hash_arrays
 from registration.storage.npz import Kind, NpzSchema
-from registration.storage.records import Record
+from registration.storage.records import Record, structure
 
 KIND = "gnm-stabilized"
 MANIFEST, PAGE, COMPONENTS, SUBJECTS = "manifest.json", "index.html", "components.npz", "subjects"
@@ -61,6 +61,21 @@ _MEAN_DISPLACEMENT: tuple[str, Kind, str] = ("along", "float", "K V 3")  # of ea
 
 
 @dataclass(frozen=True, kw_only=True)
+class StabilizationFigures:
+    """The figures of a stabilized set."""
+
+    samples: int
+    residual_first_median_mm: float | None
+    residual_median_mm: float
+    residual_p95_mm: float
+    components: Mapping[str, int]  # region -> number
+    flagged: Mapping[str, tuple[int, ...]]  # region -> numbers of components
+    regional_rms_mm: float
+    regional_most_mm: float
+    regional_turn_deg: float
+
+
+@dataclass(frozen=True, kw_only=True)
 class StabilizedManifest(Record, kind=KIND, schema=1, title=_TITLE, fix=_FIX):
     """`manifest.json` of a stabilized set."""
 
@@ -70,10 +85,17 @@ class StabilizedManifest(Record, kind=KIND, schema=1, title=_TITLE, fix=_FIX):
     subjects: tuple[str, ...]  # in the order of their files
     left_out: Mapping[str, tuple[str, ...]]  # subject -> excluded registrations
     decisions: tuple[Mapping[str, Any], ...]  # as `to_jsonable` returns them
-    figures: Mapping[str, Any]
+    figures: Mapping[str, Any]  # of `StabilizationFigures`
     config: Mapping[str, Any]  # the settings, as `to_jsonable` returns them
     inputs: Mapping[str, str]  # name -> sha256
     versions: Mapping[str, str]
+
+    @classmethod
+    def from_json(cls, value: Any, *, where: object) -> Self:
+        """Read a manifest from a JSON value. Raises InputError as `Record.read`, and for other figures than ours."""
+        manifest = super().from_json(value, where=where)
+        structure(manifest.figures, StabilizationFigures, where=f"{where}, figures", title=_TITLE, fix=_FIX)
+        return manifest
 
 
 @dataclass(frozen=True, kw_only=True)

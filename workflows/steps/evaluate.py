@@ -3,13 +3,13 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 
 from coregister.evaluate.evaluation import EvaluationSettings, ModelEvaluation, check, evaluate
 from coregister.evaluate.linear_fit import identity_part
-from registration.errors import InputError
+from registration.errors import InputError, check_seed
 from registration.model import gnm_npz
 from registration.model.gnm_npz import GNMData
 from registration.progress import NullProgress, Progress
@@ -40,6 +40,18 @@ class EvaluationManifest(
     inputs: Mapping[str, str]  # input -> sha256
     versions: Mapping[str, str]
 
+    @classmethod
+    def from_json(cls, value: Any, *, where: object) -> Self:
+        """Read a manifest from a JSON value. Raises InputError as `Record.read`, and for other figures than ours."""
+        manifest = super().from_json(value, where=where)
+        try:
+            lines(manifest)
+            _means(manifest.figures["models"], "identity")
+        except (AttributeError, KeyError, IndexError, TypeError, ValueError):
+            expected = "figures as `gnmreg model evaluate` writes them"
+            raise cls.invalid(f"{where}, field 'figures'", expected=expected, got="others") from None
+        return manifest
+
 
 def evaluate_models(
     model_paths: Sequence[Path] | Mapping[str, Path],
@@ -66,6 +78,7 @@ def evaluate_models(
         InputError: as `read_held_out`, `evaluation.check` and `check_out`, before anything is computed.
     """
     settings = settings or EvaluationSettings()
+    check_seed(settings.seed)
     check_out(out)
     named = model_paths if isinstance(model_paths, Mapping) else _named(model_paths)
     models = {name: gnm_npz.read(path) for name, path in named.items()}
