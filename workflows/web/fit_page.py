@@ -26,7 +26,7 @@ from registration.report.pictures import scale_colours
 from registration.types import Camera, Capture
 from workflows.web import panels
 from workflows.web.glb import static_glb
-from workflows.web.server import PageServer
+from workflows.web.server import PageServer, literal
 
 TO_SCAN, MOTION, PLAIN = "distance to the scan", "motion in this stage", "nothing"
 _SKIN, _SCAN = (206, 176, 158), (96, 110, 128)
@@ -81,7 +81,7 @@ class FitPage(PageServer):
     def _build(self) -> None:
         """Create the scene and the controls."""
         gui, scene, capture = self._server.gui, self._server.scene, self._capture
-        gui.add_markdown(f"### {capture.subject}, {capture.expression}\n{len(capture.views)} views")
+        gui.add_markdown(f"### {literal(capture.subject)}, {literal(capture.expression)}\n{len(capture.views)} views")
         # viser's setters have types of their own that type checkers take for read-only properties.
         self._stage: Any = gui.add_dropdown("Stage", ("waiting",))
         self._colours: Any = gui.add_dropdown("Colours show", (*([TO_SCAN] if self._scan else []), MOTION, PLAIN))

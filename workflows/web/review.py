@@ -21,7 +21,7 @@ from workflows.steps.stabilize import LOG, stabilize_run
 from workflows.web import panels
 from workflows.web.glb import AMPLITUDE_SIGMAS, animated_glb
 from workflows.web.review_state import ReviewState
-from workflows.web.server import PageServer
+from workflows.web.server import PageServer, literal
 
 _OFFSET_M = 0.15  # of each head from the centre
 _TORN = (220, 20, 40)  # colour of torn edges
@@ -178,9 +178,9 @@ class ReviewPage(PageServer):
                 count = self.review.save()
                 tearing = len(self.review.tearing)
                 warning = f" **{tearing} of all decisions tear the mesh.**" if tearing else ""
-                self._message.content = f"{count} decisions saved in `{self.review.log}`.{warning}"
+                self._message.content = f"{count} decisions saved in {literal(str(self.review.log))}.{warning}"
             except (InputError, OSError) as error:
-                self._message.content = f"Not saved: {error}"
+                self._message.content = f"Not saved: {literal(str(error))}"
         self._show()
 
     def _show(self) -> None:

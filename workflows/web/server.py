@@ -1,6 +1,7 @@
 """Pages that viser serves on the loopback interface, over one port, to those who know their token."""
 
 import io
+import re
 import socket
 import time
 from contextlib import redirect_stdout
@@ -8,9 +9,15 @@ from contextlib import redirect_stdout
 import viser
 
 from registration.errors import InputError
+from registration.terminal import printable
 from workflows.web.gate import PARAMETER, Gate, guarded_servers
 
 _HOST = "127.0.0.1"
+
+
+def literal(text: str) -> str:
+    """Return any text as Markdown that shows it as it is: a name must not load a picture from another host."""
+    return re.sub(r"([!-/:-@\[-`{-~])", r"\\\1", printable(text))
 
 
 class PageServer:

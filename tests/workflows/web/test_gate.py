@@ -13,7 +13,9 @@ from websockets.typing import Subprotocol
 
 from tests.workflows.browser import CHROMIUM, FLAGS, needs_browser
 from workflows.web.gate import Gate, guarded_servers
-from workflows.web.server import PageServer
+from workflows.web.server import PageServer, literal
+
+NAME = "![x](http://127.0.0.1:1/x.png) <img src=http://127.0.0.1:1/y.png> `a` *b* {c}"
 
 
 @pytest.fixture(scope="module")
@@ -118,14 +120,19 @@ def test_a_release_of_viser_without_the_check_does_not_start() -> None:
 @needs_browser
 def test_only_the_printed_url_works_in_a_browser(page: PageServer) -> None:
     sync_api = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
+    page._server.gui.add_markdown(f"### {literal(NAME)}")
     with sync_api.sync_playwright() as playwright:
         browser = playwright.chromium.launch(executable_path=CHROMIUM, args=list(FLAGS))
         tab = browser.new_page()
         tab.goto(f"http://127.0.0.1:{page.port}/")
         assert "Refused" in tab.inner_text("body")
+        requests = []
+        tab.on("request", lambda request: requests.append(request.url))
         with tab.expect_websocket() as socket:
             tab.goto(page.url)
         socket.value.wait_for_event("framereceived", timeout=30_000)
+        sync_api.expect(tab.get_by_text(NAME)).to_be_visible(timeout=30_000)
+        assert all("//127.0.0.1:1/" not in url for url in requests)
         tab.goto("about:blank")
         opened = tab.evaluate(
             """url => new Promise(done => { const s = new WebSocket(url);
