@@ -46,7 +46,9 @@ def is_free(folder: Path, name: str) -> bool:
     """Return whether no process holds the lock file of an executor id."""
     try:
         descriptor = os.open(folder / os.path.basename(name), os.O_RDONLY)
-    except FileNotFoundError:
+    except PermissionError:
+        raise
+    except (OSError, ValueError):  # there is none, or the name, which others may have written, is no file's
         return True
     try:
         fcntl.flock(descriptor, fcntl.LOCK_SH | fcntl.LOCK_NB)

@@ -15,6 +15,7 @@ from registration.errors import InputError
 from workflows.engine.alive import ended_processes
 from workflows.engine.database import BELOW, below, checked_url, engine, require_queue, table
 from workflows.engine.jobs import MAX_BYTES, VERSION, FlowJob, Job
+from workflows.engine.reader import number
 from workflows.engine.serialization import APPLICATION, JsonSerializer, UnreadableRow
 from workflows.ids import check_id
 
@@ -237,8 +238,8 @@ class QueueClient:
             "WHERE status = 'CANCELLED' AND workflow_uuid IN :ids"
         ).bindparams(sa.bindparam("ids", expanding=True, type_=sa.Text()))
         with self._engine.connect() as connection:
-            last = max((connection.execute(query, {"ids": chunk}).scalar() or 0 for chunk in _chunks(ids)), default=0)
-        time.sleep(min(SETTLE_S, max(0.0, float(last) / 1000 + SETTLE_S - time.time())))
+            times = [number(connection.execute(query, {"ids": chunk}).scalar()) for chunk in _chunks(ids)]
+        time.sleep(min(SETTLE_S, max(0.0, max(times, default=0.0) / 1000 + SETTLE_S - time.time())))
 
     def _ids(self, run: str, statuses: Sequence[str]) -> list[str]:
         """Ids of a run in the given states (none given: in any), the shortest first."""
@@ -256,8 +257,8 @@ class QueueClient:
                 identity: {
                     "name": name,
                     "status": status,
-                    "created": created,
-                    "ended": ended,
+                    "created": number(created),
+                    "ended": number(ended),
                     "iteration": match[0] if (match := _ITERATION.findall(identity)) else "",
                 }
                 for identity, name, status, created, ended in connection.execute(query, below(run))

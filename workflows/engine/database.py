@@ -182,13 +182,21 @@ def reading(url: str) -> Iterator[Ask]:
     if is_sqlite(url):
         with closing(sqlite3.connect(sqlite_file(url), timeout=_BUSY_S)) as file:
             file.execute("PRAGMA query_only=ON")
-            yield lambda query, values: file.execute(*_bind(query, values, ":{}")).fetchall()
+            file.text_factory = _text  # SQLite keeps bytes in any column
+            yield lambda query, values: [
+                tuple(_text(value) if isinstance(value, bytes) else value for value in row)
+                for row in file.execute(*_bind(query, values, ":{}"))
+            ]
     else:
         import psycopg
 
         plain = url.replace("+psycopg", "", 1)
         with closing(psycopg.connect(plain, connect_timeout=_CONNECT_S, options=_READ_ONLY)) as server:
             yield lambda query, values: server.execute(*_bind(query.replace("%", "%%"), values, "%({})s")).fetchall()
+
+
+def _text(value: bytes) -> str:
+    return value.decode("utf-8", "replace")
 
 
 def driver_errors(url: str) -> type[Exception]:

@@ -22,6 +22,7 @@ STATES = {
     "CANCELLED": CANCELLED,
 }
 _FAILED = "('ERROR', 'MAX_RECOVERY_ATTEMPTS_EXCEEDED')"
+MAX_TIME_MS = 2.5e14  # in the year 9892
 DEAD = "killed its worker every time"
 
 
@@ -126,7 +127,7 @@ class QueueReader:
             f"LEFT JOIN {self._input} i ON i.workflow_uuid = w.workflow_uuid WHERE {where}",
             {**parameters, "capture": '%"capture": "%', "kept": '%"made": false%'},
         )
-        ended = ended_processes(self.url, {row[3] for row in rows if STATES.get(row[2]) == RUNNING and row[3]})
+        ended = ended_processes(self.url, {row[3] for row in rows if _state(row[2]) == RUNNING and row[3]})
         return [_times(row, ended) for row in rows]
 
     def ids(self, run: str | None = None) -> list[str]:
@@ -165,14 +166,14 @@ def _among(run: str | None) -> tuple[str, dict[str, str]]:
 def _by_state(rows: Sequence[Any]) -> dict[str, int]:
     counts: dict[str, int] = {}
     for status, count in rows:
-        state = STATES.get(status, status)
+        state = _state(status)
         counts[state] = counts.get(state, 0) + int(count)
     return counts
 
 
 def _row(row: Any) -> JobRow:
     identity, kind, status, executor, inputs, output, error, created, ended_ms, started, queue, version = row
-    state = STATES.get(status, status)
+    state = _state(status)
     dead = DEAD if status == "MAX_RECOVERY_ATTEMPTS_EXCEEDED" else ""
     return JobRow(
         id=identity,
@@ -182,9 +183,9 @@ def _row(row: Any) -> JobRow:
         spec=_spec(inputs),
         result=_object(output),
         failure=_failure(error, dead) if state == FAILED else None,
-        created=_number(created) / 1000,
-        ended=_number(ended_ms) / 1000 if ended_ms else None,
-        started=_number(started) / 1000 if started else None,
+        created=number(created) / 1000,
+        ended=number(ended_ms) / 1000 if ended_ms else None,
+        started=number(started) / 1000 if started else None,
         queue=queue,
         version=version,
     )
@@ -192,15 +193,15 @@ def _row(row: Any) -> JobRow:
 
 def _times(row: Any, ended_processes: set[str]) -> JobTimes:
     identity, kind, status, executor, ended_ms, started, version, queue, captures, made, error = row
-    state = STATES.get(status, status)
+    state = _state(status)
     dead = DEAD if status == "MAX_RECOVERY_ATTEMPTS_EXCEEDED" else ""
     return JobTimes(
         id=str(identity),
         kind=kind,
         state=INTERRUPTED if state == RUNNING and executor in ended_processes else state,
         executor=executor,
-        ended=_number(ended_ms) / 1000 if ended_ms else None,
-        started=_number(started) / 1000 if started else None,
+        ended=number(ended_ms) / 1000 if ended_ms else None,
+        started=number(started) / 1000 if started else None,
         version=version,
         queue=queue,
         captures=bool(captures),
@@ -231,6 +232,12 @@ def _object(text: Any) -> dict[str, Any] | None:
     return value if isinstance(value, dict) else None
 
 
-def _number(value: Any) -> float:
-    """A time in a column; 0 for anything else, which SQLite allows in any column."""
-    return float(value) if isinstance(value, (int, float, Decimal)) else 0.0
+def _state(status: Any) -> str:
+    """The state of a row; one with a status that DBOS does not write will not run."""
+    return STATES.get(status, FAILED) if isinstance(status, str) else FAILED
+
+
+def number(value: Any) -> float:
+    """Return a time in a column, milliseconds; 0 for anything that is none, which SQLite allows in any column."""
+    time_ms = float(value) if isinstance(value, (int, float, Decimal)) else 0.0
+    return time_ms if 0.0 <= time_ms < MAX_TIME_MS else 0.0

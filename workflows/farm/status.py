@@ -14,7 +14,7 @@ from workflows.engine.database import is_sqlite, redacted_url, sqlite_file
 from workflows.engine.jobs import GPU, REBUILD, VERSION
 from workflows.engine.metrics import QueueMetrics, queue_metrics
 from workflows.engine.reader import CANCELLED, DONE, FAILED, INTERRUPTED, RUNNING, WAITING, JobRow, QueueReader
-from workflows.ids import nearest
+from workflows.ids import check_id, nearest
 
 CAPTURES_PER_DAY = 10_000  # the throughput that status compares with
 MAX_KINDS = 20  # of failures that are listed
@@ -214,7 +214,8 @@ def _failure_lines(kind: Any) -> Iterator[str]:
 
 
 def _job_row(row: JobRow, logs: Path) -> tuple[str, str, str, str, str]:
-    arguments = row.spec.get("arguments", {})
+    arguments = row.spec.get("arguments")
+    arguments = arguments if isinstance(arguments, dict) else {}
     place = arguments.get("capture") or arguments.get("subject_dir") or arguments.get("out") or ""
     since = datetime.fromtimestamp(row.since).strftime("%Y-%m-%d %H:%M:%S")
     stage = _stage(row, logs)
@@ -231,11 +232,11 @@ def _stage(row: JobRow, logs: Path) -> str:
     """What a running job does, from the last line of its progress beside its log, if that is on this machine."""
     step = str(row.spec.get("step"))
     try:
-        with (logs / f"{row.id}.jsonl").open("rb") as file:
+        with (logs / f"{check_id(row.id)}.jsonl").open("rb") as file:
             file.seek(0, 2)
             file.seek(max(0, file.tell() - _TAIL_BYTES))
             lines = file.read().decode("utf-8", "replace").splitlines()
-    except OSError:
+    except (OSError, InputError):
         return step
     for line in reversed(lines):
         try:

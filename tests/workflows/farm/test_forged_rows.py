@@ -192,6 +192,33 @@ def test_no_reader_of_the_database_unpickles(farm: Farm, capsys: pytest.CaptureF
     assert not forger.sprung.exists()
 
 
+def test_rows_of_any_content_are_listed_without_a_traceback(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """SQLite keeps anything in any column."""
+    with open_farm(tmp_path) as farm:
+        forger = Forger(farm)
+        forger.row("run/a", "[", status="ERROR", created_at="abc", completed_at="xyz", started_at_epoch_ms="q")
+        forger.row("run/b\x1b[2J", status="SUCCESS", completed_at=b"\x80", executor_id="e\x1b[31m")
+        forger.row("run/c", status="PENDING", executor_id=b"\xff/\x00..", started_at_epoch_ms="zz")
+        forger.row("run/d", status="ODD\x1b[2J", name=None)
+        forger.row("run/e", status=b"\x80", created_at=1e300)
+        forger.row("run/f", json.dumps({"args": [{"arguments": 5}]}), status="ERROR", completed_at=-5)
+        forger.row("run/g", status="SUCCESS", completed_at=1e18, output="5")
+        forger.row("../../x", status="PENDING", executor_id="..")
+        forger.insert("workflow_output", workflow_uuid="run/f", error=json.dumps({"error": {"status": [1]}}))
+    jobs = [["logs", f"run/{name}"] for name in "acefg"]
+    for words in (
+        ["status"],
+        ["status", "--run", "run"],
+        ["status", "--jobs"],
+        *jobs,
+        ["retry", "run"],
+        ["cancel", "run"],
+    ):
+        main([*words, "--folder", str(tmp_path)])
+    out, err = capsys.readouterr()
+    assert "Traceback" not in err and "\x1b" not in out + err and "run/f" in out
+
+
 @pytest.mark.parametrize("text", ["5", '"x"', "[]", '{"error": []}', "{", None, b"\x80", "9" * 5000, "[" * 10**6])
 def test_the_serializer_returns_a_value_or_says_that_the_row_is_unreadable(text: Any) -> None:
     with contextlib.suppress(UnreadableRow):
