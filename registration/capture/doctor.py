@@ -17,7 +17,7 @@ from registration.capture import native, triangulation
 from registration.capture.contact_sheet import draw_contact_sheet
 from registration.capture.ledger import Channel
 from registration.capture.scan import Scan, read_scan, read_truth
-from registration.capture.scan_checks import scan_facts, scan_warnings
+from registration.capture.scan_checks import scan_facts
 from registration.capture.text import listed
 from registration.capture.validation import eye_distance, validate_capture
 from registration.frames import MM_PER_M, opencv_intrinsics
@@ -150,7 +150,7 @@ def check_capture(path: Path, sheet: Path | None = None) -> CaptureReport:
         eye_distance_mm=None if distance is None else MM_PER_M * distance,
         scan=scan,
         channels=ledger.channels,
-        warnings=(*_warnings(capture, views, triangulated, scan), *ledger.warnings, *ledger.unread),
+        warnings=(*_warnings(views, triangulated, scan), *ledger.warnings, *ledger.unread),
         sheet=sheet,
     )
 
@@ -177,7 +177,6 @@ def _view_report(
 
 
 def _warnings(
-    capture: Capture,
     views: tuple[ViewReport, ...],
     triangulated: Mapping[str, Float[np.ndarray, "L 3"]],
     scan: Scan | None,
@@ -207,8 +206,8 @@ def _warnings(
             f"landmarks 68: {listed(jaw)} go backwards; the jaw must run from the right ear over the chin to the left"
         )
     if scan is None:
-        return [*warnings, "no scan: distances to it cannot be evaluated"]
-    return [*warnings, *scan_warnings(capture, scan, points)]
+        warnings.append("no scan: distances to it cannot be evaluated")
+    return warnings
 
 
 def _folds(camera: Camera) -> bool:

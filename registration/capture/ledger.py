@@ -130,6 +130,9 @@ def require_weight(capture: Capture, channels: Sequence[Channel]) -> list[str]:
                 got="background only",
                 fix="check the label maps and the order of [segmentation] classes in capture.toml",
             )
+        if not channel.total:
+            warnings.append(f"{channel.name}: the {channel.matched} files hold nothing to compare")
+            continue
         reason, lost = max(channel.losses.items(), key=lambda item: item[1], default=("", 0))
         if channel.counted <= _NOTHING * channel.total:
             raise InputError(

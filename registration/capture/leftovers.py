@@ -107,8 +107,6 @@ def warnings(capture: Capture, files: Mapping[str, FolderFiles]) -> list[str]:
 
 def _other_scans(capture: Capture) -> list[str]:
     """A line about meshes in other files or formats than the scan's."""
-    if capture.scan is None and os.path.lexists(capture.root / SCAN):
-        return [f"{SCAN} is not read: it is a folder, a device or a broken link; put the file itself there"]
     if not (names := unread_scans(capture.root)):
         return []
     mend = f"convert or rename it to {SCAN}" if capture.scan is None else f"only {SCAN} is; remove what is out of date"

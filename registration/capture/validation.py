@@ -19,7 +19,8 @@ from registration.capture.class_names import BACKGROUND
 from registration.capture.ledger import Channel, Ledger, require_weight, take_stock
 from registration.capture.samples import ViewSample, sample_views
 from registration.capture.scan import Scan
-from registration.capture.scan_checks import require_frames
+from registration.capture.scan_checks import scan_warnings
+from registration.capture.scan_frame import require_frames
 from registration.errors import InputError
 from registration.types import Capture, View
 
@@ -68,6 +69,7 @@ def validate_capture(capture: Capture) -> Ledger:
     warnings += require_weight(capture, channels)
     warnings += exchanged.exchanged_views(capture, samples, points)
     warnings += landmark_checks.unnamed_schemes(capture)
+    warnings += [] if scan is None else scan_warnings(capture, scan, points)
     return Ledger(
         channels=(*channels, _scan_channel(scan)),
         warnings=tuple(warnings),

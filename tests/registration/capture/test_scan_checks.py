@@ -17,7 +17,8 @@ from jaxtyping import Float
 from registration.capture.doctor import check_capture
 from registration.capture.native import read_capture
 from registration.capture.scan import Scan, read_scan
-from registration.capture.scan_checks import require_frame, scan_facts, scan_warnings, surface_landmarks
+from registration.capture.scan_checks import scan_facts, scan_warnings
+from registration.capture.scan_frame import require_frame, surface_landmarks
 from registration.capture.validation import validate_capture
 from registration.errors import InputError
 from registration.storage.mesh import write_ply
@@ -137,7 +138,7 @@ def test_a_scan_that_was_only_moved_is_not_called_turned(tmp_path: Path) -> None
 
 
 @pytest.mark.parametrize("kind", ["folder", "pipe", "broken link"])
-def test_a_scan_that_is_no_file_is_told(tmp_path: Path, kind: str) -> None:
+def test_a_scan_that_is_no_file_is_refused(tmp_path: Path, kind: str) -> None:
     root = make(tmp_path / "capture")
     (root / "scan.ply").unlink()
     if kind == "folder":
@@ -146,7 +147,9 @@ def test_a_scan_that_is_no_file_is_told(tmp_path: Path, kind: str) -> None:
         os.mkfifo(root / "scan.ply")
     else:
         (root / "scan.ply").symlink_to(root / "nothing.ply")
-    assert any("scan.ply is not read" in line for line in check_capture(root).warnings)
+    with pytest.raises(InputError) as error:
+        check_capture(root)
+    assert error.value.where.endswith("scan.ply")
 
 
 def test_a_mirrored_scan_is_told_whether_its_winding_was_mended_or_not(tmp_path: Path) -> None:
