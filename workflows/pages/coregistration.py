@@ -89,17 +89,14 @@ def _files(item: RoundFiles, record: Mapping[str, Any], running: str | None) -> 
     return {"files": item, "title": item.name.replace("_", " "), "note": note, "open": item.name == running}
 
 
-def _round(number: int, row: Mapping[str, Any], record: Mapping[str, Any], components: str) -> list[Any]:
+def _round(number: int, row: Mapping[str, Any], record: Mapping[str, Any], components: str) -> list[str]:
     captures = [capture for subject in row["register"].values() for capture in subject.values()]
     failed = sum(not capture["usable"] for capture in captures)
     built, model = row["build"], model_name(number)
     metrics = [record[name].get(model, {}).get(components) for name in ("generalization_mm", "specificity_mm")]
     return [
         row["name"],
-        len(captures) - failed,
-        failed,
-        len(built["rejected"]),
-        built["components"],
+        *map(str, (len(captures) - failed, failed, len(built["rejected"]), built["components"])),
         f"{built['drift_mm']:.3f}",
         *(MISSING if value is None else f"{value:.3f}" for value in metrics),
     ]
