@@ -13,7 +13,7 @@ from jaxtyping import Float, UInt8
 from scipy.spatial.transform import Rotation
 
 from registration.capture.colmap_binary import read_binary_model, read_binary_points
-from registration.capture.colmap_model import ColmapCamera, ColmapModel, Pose
+from registration.capture.colmap_model import ColmapCamera, ColmapImage, ColmapModel, Pose
 from registration.capture.colmap_text import read_text_model, read_text_points
 from registration.errors import InputError
 from registration.types import Camera
@@ -31,6 +31,11 @@ _WRITTEN = {0: "PINHOLE", 4: "OPENCV", 5: "FULL_OPENCV", 8: "FULL_OPENCV"}  # by
 _READERS = {"bin": read_binary_model, "txt": read_text_model}
 _NEEDED = ("cameras", "images")  # files of a model; points, rigs and frames may be missing
 _GREY = 128  # colour of points that have none
+_FAR_M, _MAX_ROUNDING, _MAX_MOVED_M = (
+    1e3,
+    1e-4,
+    5e-4,
+)  # of a world; of quaternions that are meant to be of length 1; of a camera
 _SAME_POSE, _ROUNDING = 1e-6, 1e-11  # of entries of two matrices of one pose, metres and cosines; relative
 
 
@@ -42,7 +47,8 @@ def read_cameras(sparse: Path) -> dict[str, Camera]:
 
     Raises:
         InputError: the model cannot be read, is there twice with other cameras, two images have one name, a camera
-            model is not supported, or intrinsics or a pose are singular, not finite, or not those of the frames.
+            model is not supported, a quaternion is too coarse for a far world, or intrinsics or a pose are singular,
+            not finite, or not those of the frames.
     """
     cameras: dict[str, Camera] = {}
     model = _read_model(_model_folder(sparse))
@@ -67,6 +73,7 @@ def read_cameras(sparse: Path) -> dict[str, Camera]:
             )
         source = model.cameras[image.camera_id]
         pose = _matrix((image.quaternion_wxyz, image.translation), where)
+        _check_digits(image, where)
         cameras[image.name] = _camera(source, pose, f"{source.where}: image {image.name}")
     return cameras
 
@@ -274,6 +281,21 @@ def _camera(source: ColmapCamera, T_cam_world: Float[np.ndarray, "4 4"], where: 
         T_cam_world=T_cam_world,
         distortion=tuple(distortion) if any(distortion) else (),
     )
+
+
+def _check_digits(image: ColmapImage, where: str) -> None:
+    """Refuse a rounded quaternion, whose length shows the rounding, where it moves a far camera noticeably."""
+    rounding = abs(float(np.linalg.norm(image.quaternion_wxyz)) - 1)
+    distance_m = float(np.linalg.norm(image.translation))
+    moved_m = rounding * distance_m
+    if distance_m > _FAR_M and rounding < _MAX_ROUNDING and moved_m > _MAX_MOVED_M:
+        raise InputError(
+            "The pose has too few digits for a world so far from its origin",
+            where=where,
+            expected=f"a quaternion whose rounding moves the camera by less than {_MAX_MOVED_M:g} m",
+            got=f"a length that differs from 1 by {rounding:.1g}, {moved_m:.2g} m at the camera",
+            fix="write all 17 digits of quaternions and translations, or move the world's origin near the subject",
+        )
 
 
 def _matrix(pose: Pose, where: str) -> Float[np.ndarray, "4 4"]:

@@ -164,7 +164,7 @@ def check_landmark_rays(capture: Capture) -> bool:
 def _check_digits(capture: Capture, agreement: float) -> None:
     """Refuse a far world whose poses do not agree: a rotation's rounding moves a camera by its part of the distance."""
     far = _distance(capture)
-    if far > _FAR_M:
+    if far > _FAR_M and agreement < _CONFIRMED:
         raise InputError(
             "The poses have too few digits for a world so far from its origin",
             where=capture.root / "sparse",
