@@ -4,7 +4,7 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -91,7 +91,7 @@ class StabilizedManifest(Record, kind=KIND, schema=1, title=_TITLE, fix=_FIX):
     versions: Mapping[str, str]
 
     @classmethod
-    def from_json(cls, value: Any, *, where: object) -> Self:
+    def from_json(cls, value: Any, *, where: object) -> "StabilizedManifest":
         """Read a manifest from a JSON value. Raises InputError as `Record.read`, and for other figures than ours."""
         manifest = super().from_json(value, where=where)
         structure(manifest.figures, StabilizationFigures, where=f"{where}, figures", title=_TITLE, fix=_FIX)

@@ -3,7 +3,7 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 
@@ -41,7 +41,7 @@ class EvaluationManifest(
     versions: Mapping[str, str]
 
     @classmethod
-    def from_json(cls, value: Any, *, where: object) -> Self:
+    def from_json(cls, value: Any, *, where: object) -> "EvaluationManifest":
         """Read a manifest from a JSON value. Raises InputError as `Record.read`, and for other figures than ours."""
         manifest = super().from_json(value, where=where)
         try:
