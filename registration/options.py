@@ -77,6 +77,22 @@ class RegisterOptions:
     def __post_init__(self) -> None:
         check_seed(self.seed)
 
+    def arguments(self) -> list[str]:
+        """Return the arguments of `gnmreg register` that give these options; defaults are omitted.
+
+        A recipe that was passed as an object has no import path; its name stands for it.
+        """
+        words: list[str] = []
+        default = RegisterOptions()
+        for name, value in (("--recipe", self.recipe_name), ("--views", self.views), ("--seed", self.seed)):
+            if value != getattr(default, name.removeprefix("--")):
+                words += [name, str(value)]
+        words += ["--deterministic"] if self.deterministic else []
+        words += ["--variant", self.variant] if self.variant != default.variant else []
+        if self.landmark_files:
+            words += ["--landmarks", *(f"{scheme}={file}" for scheme, file in sorted(self.landmark_files.items()))]
+        return words
+
     @property
     def recipe_name(self) -> str:
         """The recipe as it is shown: its name or import path."""

@@ -1,5 +1,6 @@
 """Register one capture: read the inputs, fit, evaluate, write the folder."""
 
+import shlex
 import time
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -38,7 +39,13 @@ from registration.report.inputs import ReportInputs, distance_heat_map, report_v
 from registration.report.page import render_report
 from registration.report.stage_snapshots import write_stage
 from registration.storage import hashing
-from registration.storage.registration_folder import check_output_folder, find_existing, save_registration
+from registration.storage.registration_folder import (
+    FILES,
+    REPORT,
+    check_output_folder,
+    find_existing,
+    save_registration,
+)
 from registration.targets.classes import class_map
 from registration.targets.pyramid import build_pyramid
 from registration.types import Parameters, Registration, Status
@@ -93,9 +100,22 @@ def register(
     fitted = _fit(inputs, options.seed, device, pictures, progress)
     progress.message("comparing with the views")
     comparison = compare_views(fitted.problem)
-    registration, page = _evaluate(inputs, comparison, _collect(inputs, fitted, comparison), progress)
+    provenance = _provenance(capture, model, out, options, neutral)
+    collected = replace(_collect(inputs, fitted, comparison), provenance=provenance)
+    registration, page = _evaluate(inputs, comparison, collected, progress)
     save_registration(registration, out, page)
     return registration
+
+
+def _provenance(
+    capture: Path, model: Path, out: Path, options: RegisterOptions, neutral: Path | None
+) -> dict[str, str]:
+    """The command that makes this registration, and the absolute paths in it."""
+    given = {"capture": capture, "model": model, "neutral": neutral}
+    paths = {name: str(Path(path).absolute()) for name, path in given.items() if path is not None}
+    words = ["gnmreg", "register", paths["capture"], "--model", paths["model"], "--out", str(out.absolute())]
+    words += ["--neutral", paths["neutral"]] if neutral is not None else []
+    return {"command": shlex.join([*words, *options.arguments()]), **paths}
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -156,7 +176,7 @@ def _context(inputs: RegistrationInputs, seed: int, device: torch.device, progre
         recipe=recipe,
         seed=seed,
         neutral=inputs.neutral,
-        triangulated=inputs.landmarks,
+        triangulated={name: points - inputs.origin for name, points in inputs.landmarks.items()},
     )
 
 
@@ -333,6 +353,7 @@ def _evaluate(
             class_names=comparison.class_names,
             heat_map=None if evaluation is None else distance_heat_map(registration, evaluation.vertex_distance_mm),
             versions=hashing.versions(),
+            files={name: meaning for name, meaning in FILES.items() if name != REPORT},
         )
     )
     return registration, page

@@ -240,6 +240,7 @@ class Registration:
     figures: Mapping[str, Any] = field(default_factory=dict)
     config: Mapping[str, Any] = field(default_factory=dict)  # the resolved configuration
     inputs: Mapping[str, str] = field(default_factory=dict)  # name -> sha256
+    provenance: Mapping[str, str] = field(default_factory=dict)  # the command, and the paths of what it read
 
 
 # Distance metrics among a registration's figures, as the report and the command line title them.

@@ -87,7 +87,12 @@ def judge(status: Status, figures: Mapping[str, Any]) -> Verdict:
         found.append(("look", "nothing measures the mesh: there is neither a scan of the face nor any image residual"))
     found += _views(figures) + _intersections(figures)
     if warnings := figures.get("warnings"):
-        found.append(("look", "1 warning about the capture" if len(warnings) == 1 else f"{len(warnings)} warnings"))
+        found.append(
+            (
+                "look",
+                "1 warning about the capture" if len(warnings) == 1 else f"{len(warnings)} warnings about the capture",
+            )
+        )
     worst = max((_ORDER.index(level) for level, _ in found), default=0)
     ranked = sorted(found, key=lambda item: -_ORDER.index(item[0]))
     kept = [reason for level, reason in ranked if level != "good" or not worst]

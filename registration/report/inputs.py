@@ -54,6 +54,7 @@ class ReportInputs:
     class_names: tuple[str, ...] = ()
     heat_map: HeatMap | None = None
     versions: Mapping[str, str] = field(default_factory=dict)
+    files: Mapping[str, str] = field(default_factory=dict)  # of the registration folder -> what each is
 
 
 def distance_heat_map(registration: Registration, distance_mm: Float[np.ndarray, "V"]) -> HeatMap:

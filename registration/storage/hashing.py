@@ -43,6 +43,7 @@ NOT_HASHED: Mapping[type, Mapping[str, str]] = {
         "figures": "measurements of the arrays",
         "config": "the arrays are its result",
         "inputs": "the arrays are their result",
+        "provenance": "where the inputs lay",
     },
 }
 

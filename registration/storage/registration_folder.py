@@ -6,7 +6,7 @@ A folder appears, or is replaced, in one rename; its content id is a digest of i
 import math
 import os
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -25,16 +25,17 @@ from registration.types import Registration, Status
 
 KIND = "gnm-registration"
 MANIFEST = "manifest.json"
-FILES = (
-    MANIFEST,
-    "history.json",
-    "registration.npz",
-    "mesh.ply",
-    "mesh.obj",
-    "mesh.mtl",
-    "texture.png",
-    "report.html",
-)
+REPORT = "report.html"
+FILES = {  # and what each is, for people
+    MANIFEST: "inputs, configuration, status and figures, for programs",
+    "registration.npz": "all arrays: vertices, parameters, offsets, confidence, landmarks",
+    "mesh.ply": "the mesh: the model's vertices in the model's order",
+    "mesh.obj": "the same mesh with uvs",
+    "mesh.mtl": "the material of mesh.obj",
+    "texture.png": "the texture, 16 bit sRGB",
+    "history.json": "the loss terms of every step",
+    REPORT: "this page",
+}
 # Axis letters of the arrays in registration.npz; one letter is one length within a file.
 AXES = {
     "identity": "I",
@@ -78,6 +79,7 @@ class RegistrationManifest(Record, kind=KIND, schema=1, title=_TITLE, fix=_FIX):
     inputs: Mapping[str, str]  # name -> sha256
     versions: Mapping[str, str]
     config: Mapping[str, Any]  # the resolved configuration, as `to_jsonable` returns it
+    provenance: Mapping[str, str] = field(default_factory=dict)  # the command, and the paths of what it read
 
 
 def check_output_folder(out: Path) -> None:
@@ -140,7 +142,7 @@ def save_registration(registration: Registration, out: Path, report_html: str | 
         write_obj(temporary / "mesh.obj", arrays["vertices"], arrays["triangles"], arrays["corner_uvs"], "texture.png")
         write_json(temporary / "history.json", registration.history)
         if report_html is not None:
-            (temporary / "report.html").write_text(report_html, encoding="utf-8")
+            (temporary / REPORT).write_text(report_html, encoding="utf-8")
         _manifest(registration, content_id(arrays, texture)).write(temporary / MANIFEST)
     return out
 
@@ -182,6 +184,7 @@ def load_registration(path: Path) -> Registration:
         figures=manifest.figures,
         config=manifest.config,
         inputs=manifest.inputs,
+        provenance=manifest.provenance,
     )
 
 
@@ -206,7 +209,7 @@ def update_figures(path: Path, figures: Mapping[str, Any], report_html: str | No
     manifest = read_manifest(path)
     replace(manifest, figures={**manifest.figures, **figures}).write(path / MANIFEST)
     if report_html is not None:
-        atomic_write_text(path / "report.html", report_html)
+        atomic_write_text(path / REPORT, report_html)
 
 
 def read_manifest(path: Path) -> RegistrationManifest:
@@ -238,6 +241,7 @@ def _manifest(registration: Registration, content: str) -> RegistrationManifest:
         inputs=registration.inputs,
         versions=versions(),
         config=to_jsonable(registration.config),
+        provenance=registration.provenance,
     )
 
 

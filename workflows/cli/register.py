@@ -94,6 +94,8 @@ def evaluate(
         neutral_capture: The capture of that neutral registration.
     """
     from registration.evaluate.folder import evaluate_folder
+    from registration.report.summary import refresh_report
 
     evaluate_folder(registration, capture, neutral, neutral_capture)
+    refresh_report(registration)
     return 0

@@ -19,6 +19,7 @@ from registration.options import RegisterOptions
 from registration.pipeline import register
 from registration.progress import NullProgress, PrefixedProgress, Progress
 from registration.report.pictures import RgbImage, data_uri
+from registration.report.summary import refresh_report
 from registration.storage import hashing
 from registration.storage.registration_folder import read_manifest, update_figures
 from registration.types import Capture, Registration
@@ -269,7 +270,8 @@ def _with_drift(result: Registration, capture: Capture, folder: Path, neutral: _
         return result
     evaluation = evaluate_registration(result, capture, neutral=neutral.registration, neutral_capture=neutral.capture)
     update_figures(folder, evaluation.metrics)
-    return replace(result, figures={**result.figures, **evaluation.metrics})
+    refresh_report(folder)
+    return replace(result, figures=read_manifest(folder).figures)
 
 
 def _comparable(capture: Capture, neutral: Capture) -> bool:

@@ -21,11 +21,11 @@ from registration.capture.pixels import read_view
 from registration.capture.scan import Scan, read_scan
 from registration.frames import MM_PER_M, linear_to_srgb
 from registration.geometry.closest_point import ClosestPointQuery
+from registration.report.glb import static_glb
 from registration.report.heat_map import scale_limit_mm
 from registration.report.pictures import scale_colours
 from registration.types import Camera, Capture
 from workflows.web import panels
-from workflows.web.glb import static_glb
 from workflows.web.server import PageServer, literal
 
 TO_SCAN, MOTION, PLAIN = "distance to the scan", "motion in this stage", "nothing"

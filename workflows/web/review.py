@@ -10,6 +10,7 @@ from jaxtyping import Float
 from registration.errors import InputError
 from registration.model import gnm_npz, regions
 from registration.progress import Progress
+from registration.report.glb import AMPLITUDE_SIGMAS, animated_glb
 from registration.report.heat_map import scale_limit_mm
 from registration.report.pictures import scale_colours
 from registration.stabilize import stabilized_folder as disk
@@ -19,7 +20,6 @@ from workflows.records.decisions import read_decisions
 from workflows.records.run import Selection
 from workflows.steps.stabilize import LOG, stabilize_run
 from workflows.web import panels
-from workflows.web.glb import AMPLITUDE_SIGMAS, animated_glb
 from workflows.web.review_state import ReviewState
 from workflows.web.server import PageServer, literal
 

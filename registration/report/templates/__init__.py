@@ -27,6 +27,7 @@ def environment(*packages: str) -> Environment:
         lstrip_blocks=True,
     )
     result.filters["words"] = lambda name: str(name).replace("_", " ")
+    result.filters["capitalise"] = lambda text: f"{text[:1].upper()}{text[1:]}"  # `capitalize` lowers the rest
     result.globals["COLOUR_SCALE"] = ", ".join(f"rgb{colour}" for colour in COLOUR_SCALE)  # stops of a CSS gradient
     result.globals["UNMEASURED"] = f"rgb{UNMEASURED}"
     return result

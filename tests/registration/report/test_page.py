@@ -1,5 +1,6 @@
 """The page is complete, well-formed and self-contained, and escapes names."""
 
+import html
 import re
 from html.parser import HTMLParser
 from xml.etree import ElementTree
@@ -16,6 +17,7 @@ from registration.report.inputs import ReportInputs, distance_heat_map
 from registration.report.page import render_report
 from registration.report.remarks import headline, remarks
 from registration.storage.hashing import versions
+from registration.storage.registration_folder import FILES
 from registration.types import Registration
 from tests.conftest import FIXTURES
 from tests.registration.report.test_pictures import a_view
@@ -64,6 +66,7 @@ def some_inputs(**changes) -> ReportInputs:
         views=(a_view(name="cam00"), a_view(name="cam01")),
         class_names=("skin", "left_eye"),
         heat_map=distance_heat_map(registration, np.array([0.1, 0.2, np.nan, 0.4])),
+        files=FILES,
         versions=versions(),
     )
     return ReportInputs(**{**fields, **changes})
@@ -98,7 +101,8 @@ def check_page(page: str) -> None:
     balance.feed(page)
     assert not balance.open
     links = re.findall(r'(?:src|href)="?([^"\s>]+)', page)
-    assert links and all(link.startswith(("data:", "#")) for link in links), "an external resource"
+    ours = [link for link in links if link not in FILES]
+    assert ours and all(link.startswith(("data:", "#")) for link in ours), "an external resource"
     assert "url(http" not in page and "@import" not in page
 
 
@@ -109,15 +113,17 @@ def test_a_full_page():
         assert text in page, text
     for text in ("subject&#39;s left", "left_eye", "3 min 21 s", "mitsuba", "ab" * 32, "&#34;recipe&#34;"):
         assert text in page, text
-    assert page.count("data:image/jpeg") == 3 + 2 * 9
-    positions = [page.index(f'id="{name}"') for name in ("distances", "views", "optimization", "provenance")]
+    assert page.count("data:image/jpeg") == 1 + 3 * 3 + 1 + 2 * 9  # poster, mesh from three sides, atlas, views
+    sections = ("mesh", "distances", "views", "optimization", "files", "provenance")
+    positions = [page.index(f'id="{name}"') for name in sections]
     assert positions == sorted(positions)
 
 
 def test_an_empty_page_has_no_empty_sections():
     empty = {name: {} for name in ("seconds", "history", "figures", "config", "inputs")}
-    registration = a_registration(status="failed", reason="no initial guess", **empty)
-    page = render_report(some_inputs(registration=registration, views=(), heat_map=None, versions={}))
+    vertices = np.full((4, 3), np.nan, np.float32)
+    registration = a_registration(status="failed", reason="no initial guess", vertices=vertices, **empty)
+    page = render_report(some_inputs(registration=registration, views=(), heat_map=None, versions={}, files={}))
     check_page(page + '<a href="#"></a>')
     assert "<section" not in page and "The registration failed: no initial guess." in page
 
@@ -190,6 +196,27 @@ def test_remarks_name_low_weights_exclusions_and_intersections():
     assert "<ul>" not in render_report(some_inputs())
 
 
+def test_the_command_the_paths_and_the_files_are_on_the_page():
+    command = "gnmreg register /captures/anna --model '/my models/gnm.npz' --out /out/anna"
+    origin = {"command": command, "capture": "/captures/anna", "model": "/my models/gnm.npz"}
+    page = render_report(some_inputs(registration=a_registration(provenance=origin)))
+    check_page(page)
+    assert html.escape(command, quote=True).replace("&#x27;", "&#39;") in page
+    assert '<td class="mono">/my models/gnm.npz</td>' in page and '<a href="mesh.ply">mesh.ply</a>' in page
+
+
+def test_the_colours_of_distances_end_where_a_millimetre_is_not_good():
+    row = {"points": 9, "mean_mm": 0.5, "median_mm": 0.4, "std_mm": 0.1, "p95_mm": 0.7}
+
+    def ends_at(**figures) -> str:
+        page = render_report(some_inputs(registration=a_registration(figures=figures)))
+        return re.search("<span>([0-9.]+) mm and more</span>", page)[1]
+
+    assert ends_at(mesh_to_scan={"face": row}) == "1"
+    assert ends_at(mesh_to_scan={"face": {**row, "p95_mm": 30.0}}) == "2"
+    assert ends_at() == "0.5"  # of all vertices
+
+
 def test_one_vertex_is_singular():
     row = {"vertices_beyond_0.3mm": 1, "max_excess_mm": 0.5}
     [line] = remarks(a_registration(figures={"intersections": {"pairs": {"lips in teeth": row}}}))
@@ -215,7 +242,7 @@ def test_the_page_says_how_many_views_of_how_many_it_shows():
 def test_a_converged_face_that_is_a_millimetre_wrong_is_not_green():
     row = {"points": 1234, "mean_mm": 1.15, "median_mm": 1.0, "std_mm": 0.2, "p95_mm": 2.5}
     page = render_report(some_inputs(registration=a_registration(figures={"scan_to_mesh": {"face": row}})))
-    assert '<span class="badge wrong">wrong</span><span class="status">converged</span>' in page
+    assert '<span class="badge wrong">wrong</span><span class="status">status: converged</span>' in page
     assert 'class="badge good"' not in page and "1.15 mm from the mesh on average" in page
 
 

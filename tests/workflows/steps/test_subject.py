@@ -82,7 +82,8 @@ def test_the_drift_equals_that_of_evaluate(subject: Path, fake: FakeRegister, tm
     assert figures["drift"]["face"]["mean_mm"] == pytest.approx(1.0, abs=0.05)
     assert "drift" not in read_manifest(out / "rest").figures
     row_figures = manifest(out)["captures"][-1]["figures"]
-    assert row_figures == {name: {"face": figures[name]["face"]} for name in ("scan_to_mesh", "drift")}
+    faces = {name: {"face": figures[name]["face"]} for name in ("scan_to_mesh", "drift")}
+    assert row_figures == {**faces, "verdict": figures["verdict"]}
     by_hand = evaluate_folder(out / "smile", subject / "smile", out / "rest", subject / "rest").metrics
     assert by_hand["drift"] == figures["drift"] and by_hand["scan_to_mesh"] == figures["scan_to_mesh"]
 

@@ -17,7 +17,6 @@ from tests.workflows.browser import CHROMIUM, FLAGS, launch, needs_browser
 from workflows.records.decisions import read_decisions
 from workflows.records.run import read_run
 from workflows.steps.stabilize import stabilize_run
-from workflows.web.glb import animated_glb
 from workflows.web.review import ReviewPage, review
 from workflows.web.review_state import ReviewState
 
@@ -181,20 +180,3 @@ def test_opening_a_review_again_keeps_the_decisions(page, run, model_file):  # n
 def test_a_port_in_use_is_refused(page, run, model_file):  # noqa: F811
     with pytest.raises(InputError, match="cannot be served"):
         review(run, model_path=model_file, port=page.port)
-
-
-def test_an_animated_head_is_a_glb():
-    """Read back by trimesh, an independent reader; it knows no morph targets."""
-    import io
-
-    import trimesh
-
-    rng = np.random.default_rng(0)
-    sphere = trimesh.creation.icosphere(subdivisions=2)
-    blob = animated_glb(
-        sphere.vertices, rng.normal(size=sphere.vertices.shape), sphere.faces, 255 * (sphere.vertices > 0)
-    )
-    assert len(blob) % 4 == 0 and int.from_bytes(blob[8:12], "little") == len(blob)
-    (mesh,) = trimesh.load(io.BytesIO(blob), file_type="glb", process=False).geometry.values()
-    np.testing.assert_allclose(mesh.vertices, sphere.vertices, atol=1e-6)
-    np.testing.assert_array_equal(mesh.faces, sphere.faces)

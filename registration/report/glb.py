@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float, Int, UInt16
 
 from registration.frames import srgb_to_linear
 from registration.geometry.topology import vertex_normals
@@ -17,16 +17,28 @@ from registration.geometry.topology import vertex_normals
 AMPLITUDE_SIGMAS = 3.0  # of the animation, in standard deviations to either side
 _PERIOD_S = 4.0
 _KEYFRAMES = 33
-_FLOAT, _UINT = 5126, 5125
+_FLOAT, _UINT, _USHORT = 5126, 5125, 5123
 _ARRAY, _ELEMENTS = 34962, 34963
 
 
 def static_glb(
     points: Float[np.ndarray, "P 3"], triangles: Int[np.ndarray, "F 3"], colours: Float[np.ndarray, "P 3"]
 ) -> bytes:
-    """Return a mesh as GLB; positions in metres, colours sRGB in [0, 255]."""
+    """Return a mesh as GLB; positions in metres, colours sRGB in [0, 255].
+
+    The file ends with the bytes of `colour_bytes`.
+    """
     normals = vertex_normals(torch.from_numpy(points), torch.from_numpy(triangles.astype(np.int64))).numpy()
-    return _glb({"POSITION": points, "NORMAL": normals, "COLOR_0": _linear(colours)}, triangles)
+    return _glb({"POSITION": points, "NORMAL": normals}, triangles, colours)
+
+
+def colour_bytes(colours: Float[np.ndarray, "P 3"]) -> bytes:
+    """Return vertex colours as a GLB file holds them: linear RGBA of 16 bits.
+
+    Args:
+        colours: sRGB in [0, 255].
+    """
+    return _colours(colours).tobytes()
 
 
 def animated_glb(
@@ -50,33 +62,37 @@ def animated_glb(
     arrays = {
         "POSITION": points,
         "NORMAL": rest,
-        "COLOR_0": _linear(colours),
         "motion": AMPLITUDE_SIGMAS * motion,
         "normal_change": (high - low) / 2,
         "times": times,
         "weights": np.sin(2 * np.pi * times / _PERIOD_S),
     }
-    return _glb(arrays, triangles)
+    return _glb(arrays, triangles, colours)
 
 
-def _linear(colours: Float[np.ndarray, "P 3"]) -> np.ndarray:
-    return srgb_to_linear(np.clip(colours, 0, 255) / 255)
+def _colours(colours: Float[np.ndarray, "P 3"]) -> UInt16[np.ndarray, "P 4"]:
+    linear = srgb_to_linear(np.clip(np.asarray(colours, np.float64), 0, 255) / 255)
+    opaque = np.concatenate([linear, np.ones((len(linear), 1))], 1)
+    return np.ascontiguousarray(np.round(opaque * 65535), "<u2")
 
 
-def _glb(arrays: dict[str, np.ndarray], triangles: Int[np.ndarray, "F 3"]) -> bytes:
+def _glb(arrays: dict[str, np.ndarray], triangles: Int[np.ndarray, "F 3"], colours: np.ndarray) -> bytes:
     """Return the file. `arrays`: vertex attributes by their glTF names; an animated head also has motion,
-    normal_change, times and weights."""
+    normal_change, times and weights. Colours come last."""
     blobs = {name: np.ascontiguousarray(array, "<f4") for name, array in arrays.items()}
     blobs["faces"] = np.ascontiguousarray(triangles, "<u4").reshape(-1)
+    blobs["COLOR_0"] = _colours(colours)
     number = {name: k for k, name in enumerate(blobs)}
     views, accessors, offset = [], [], 0
     for name, array in blobs.items():
         target = _ELEMENTS if name == "faces" else None if name in ("times", "weights") else _ARRAY
         view = {"buffer": 0, "byteOffset": offset, "byteLength": array.nbytes}
         views.append(view | ({"target": target} if target else {}))
-        kind = "VEC3" if array.ndim == 2 else "SCALAR"
+        kind = "SCALAR" if array.ndim == 1 else f"VEC{array.shape[1]}"
         accessor = {"bufferView": number[name], "count": len(array), "type": kind}
-        accessor["componentType"] = _UINT if name == "faces" else _FLOAT
+        accessor["componentType"] = {"<f4": _FLOAT, "<u4": _UINT, "<u2": _USHORT}[array.dtype.str]
+        if name == "COLOR_0":
+            accessor["normalized"] = True
         if name in ("POSITION", "motion", "times"):  # glTF requires these
             accessor |= {"min": np.atleast_1d(array.min(0)).tolist(), "max": np.atleast_1d(array.max(0)).tolist()}
         accessors.append(accessor)
