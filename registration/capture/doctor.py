@@ -150,7 +150,7 @@ def check_capture(path: Path, sheet: Path | None = None) -> CaptureReport:
         eye_distance_mm=None if distance is None else MM_PER_M * distance,
         scan=scan,
         channels=ledger.channels,
-        warnings=(*_warnings(views, triangulated, scan), *ledger.warnings, *ledger.unread),
+        warnings=(*_warnings(capture, views, triangulated, scan), *ledger.warnings, *ledger.unread),
         sheet=sheet,
     )
 
@@ -177,6 +177,7 @@ def _view_report(
 
 
 def _warnings(
+    capture: Capture,
     views: tuple[ViewReport, ...],
     triangulated: Mapping[str, Float[np.ndarray, "L 3"]],
     scan: Scan | None,
@@ -198,8 +199,13 @@ def _warnings(
         if _folds(view.camera):
             warnings.append(f"{view.name}: the distortion folds the image over itself; check its coefficients")
     for scheme, points in triangulated.items():
-        if lost := np.flatnonzero(~np.isfinite(points).all(-1)).tolist():
-            warnings.append(f"landmarks {scheme}: not triangulated, no two views agree: {listed(lost)}")
+        lost = np.flatnonzero(~np.isfinite(points).all(-1))
+        seen = _views_that_see(capture, scheme)
+        if unseen := [int(i) for i in lost if seen[i] < 2]:
+            hint = "the others say null or a low confidence"
+            warnings.append(f"landmarks {scheme}: not triangulated, fewer than two views see {listed(unseen)}; {hint}")
+        if disputed := [int(i) for i in lost if seen[i] > 1]:
+            warnings.append(f"landmarks {scheme}: not triangulated, no two views agree: {listed(disputed)}")
     points = triangulated.get("68", np.zeros((0, 3)))
     if len(points) == 68 and (jaw := triangulation.reversed_jaw_points(points)):
         warnings.append(
@@ -208,6 +214,12 @@ def _warnings(
     if scan is None:
         warnings.append("no scan: distances to it cannot be evaluated")
     return warnings
+
+
+def _views_that_see(capture: Capture, scheme: str) -> list[int]:
+    """Number of views in which each landmark is used."""
+    views = [view.landmarks[scheme][:, 2] for view in capture.views if scheme in view.landmarks]
+    return [int(count) for count in (np.stack(views) > triangulation.MIN_CONFIDENCE).sum(0)]
 
 
 def _folds(camera: Camera) -> bool:

@@ -143,8 +143,24 @@ def _expected(capture: Capture) -> dict[str, list[str]]:
     """Folder -> the paths below it that belong to the views."""
     images = capture.root / "images"
     expected = {"images": [view.image.relative_to(images).as_posix() for view in capture.views]}
-    names = [view.name for view in capture.views]
-    return expected | {folder: [name + suffix for name in names] for folder, suffix in SUFFIXES.items()}
+    for folder, suffix in SUFFIXES.items():
+        read = _read_files(capture, folder)
+        expected[folder] = [read.get(view.name, view.name + suffix) for view in capture.views]
+    return expected
+
+
+def _read_files(capture: Capture, folder: str) -> dict[str, str]:
+    """View's name -> the path below the folder of the file that was read for it."""
+    if folder == "landmarks":
+        names = {view.name: (view.name, view.image.relative_to(capture.root / "images")) for view in capture.views}
+        paths = {view: [f"{stem}.json", f"{image.as_posix()}.json"] for view, (stem, image) in names.items()}
+        return {
+            view: next((path for path in found if (capture.root / folder / path).is_file()), found[0])
+            for view, found in paths.items()
+        }
+    field = {"masks": "mask"}.get(folder, folder)
+    read = {view.name: getattr(view, field) for view in capture.views}
+    return {name: path.relative_to(capture.root / folder).as_posix() for name, path in read.items() if path is not None}
 
 
 def _meant_root_file(path: Path) -> str | None:

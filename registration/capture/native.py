@@ -3,7 +3,7 @@
 import os
 import re
 from functools import partial
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 
 from registration.capture.colmap import read_cameras
 from registration.capture.headers import require_size
@@ -13,6 +13,8 @@ from registration.capture.settings import read_settings
 from registration.errors import InputError
 from registration.storage.reading import open_file
 from registration.types import Camera, Capture, View
+
+_MASK_SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff")
 
 
 def read_capture(root: Path) -> Capture:
@@ -65,16 +67,23 @@ def _read_view(root: Path, file_name: str, camera: Camera) -> View:
     relative = image_file(root, file_name)
     image = _inside(root, root / "images" / relative)
     require_size(image, "image", camera.width_px, camera.height_px)
-    landmarks = _optional(root, root / "landmarks" / relative.with_suffix(".json"))
+    landmarks = _channel(root, "landmarks", relative, ".json")
     return View(
         name=str(relative.with_suffix("")),
         camera=camera,
         image=image,
-        mask=_optional(root, root / "masks" / relative.with_suffix(".png")),
-        normals=_optional(root, root / "normals" / relative.with_suffix(".png")),
-        segmentation=_optional(root, root / "segmentation" / relative.with_suffix(".png")),
+        mask=_channel(root, "masks", relative, *_MASK_SUFFIXES),
+        normals=_channel(root, "normals", relative, ".png"),
+        segmentation=_channel(root, "segmentation", relative, ".png"),
         landmarks={} if landmarks is None else read_landmarks(landmarks),
     )
+
+
+def _channel(root: Path, folder: str, image: PurePosixPath, *suffixes: str) -> Path | None:
+    """The file of an image in a channel's folder: its suffix replaced, or kept and followed by another."""
+    names = [image.with_suffix(suffix) for suffix in suffixes]
+    names += [image.with_name(image.name + suffix) for suffix in suffixes]
+    return next((path for name in names if (path := _optional(root, root / folder / name)) is not None), None)
 
 
 def _optional(root: Path, path: Path) -> Path | None:

@@ -2,6 +2,7 @@ import json
 import shutil
 from pathlib import Path
 
+import cv2
 import pytest
 
 from registration.capture import leftovers, native
@@ -32,7 +33,7 @@ def test_no_name_is_near(name: str) -> None:
 
 
 @pytest.mark.parametrize("folder", ["masks", "normals", "segmentation", "landmarks"])
-@pytest.mark.parametrize("suffix", [".jpg", ".PNG", ".png.png", ".txt", ".png.json", "_x.png"])
+@pytest.mark.parametrize("suffix", [".bmp", ".PNG", ".txt", ".tar.png.x", "_x.png"])
 def test_a_channel_without_a_file_that_belongs_to_a_view_is_refused(
     good: Path, tmp_path: Path, folder: str, suffix: str
 ) -> None:
@@ -42,6 +43,22 @@ def test_a_channel_without_a_file_that_belongs_to_a_view_is_refused(
     with pytest.raises(InputError) as caught:
         check_capture(root)
     assert folder in caught.value.what and f"cam0{suffix}" in caught.value.got and "cam0." in caught.value.fix
+
+
+@pytest.mark.parametrize("folder, suffix", [("masks", ".jpg"), ("masks", ".png.png"), ("landmarks", ".png.json")])
+def test_masks_and_landmarks_by_usual_other_names_are_read(
+    good: Path, tmp_path: Path, folder: str, suffix: str
+) -> None:
+    root = shutil.copytree(good, tmp_path / "capture")
+    for path in sorted((root / folder).iterdir()):
+        if suffix == ".jpg":
+            cv2.imwrite(str(path.with_suffix(suffix)), cv2.imread(str(path), 0))
+            path.unlink()
+        else:
+            path.rename(path.with_name(path.stem + suffix))
+    report = check_capture(root)
+    assert report.warnings == () and all(view.landmarks for view in report.views)
+    assert all(view.mask is not None for view in report.capture.views)
 
 
 def test_files_that_belong_to_no_view_are_named(good: Path, tmp_path: Path) -> None:
