@@ -113,16 +113,6 @@ class QueueClient:
             cancelled += len(ids)
         return cancelled
 
-    def requeue(self, ids: Sequence[str]) -> list[str]:
-        """Restart flows that have ended, under their ids. Returns the ids of those."""
-        ended = [i for i in ids for row in [self._rows(i).get(i)] if row is not None and row["status"] not in ACTIVE]
-        self._wait_for_cancelled(ended)
-        queues = self._queues(ended)
-        ended = [identity for identity in ended if identity in queues]
-        for identity in ended:
-            self._client.rewind_workflow(identity, start_step=1, queue_name=queues[identity])
-        return ended
-
     def retry(self, run: str, *, failed: bool = True, cancelled: bool = False) -> list[str]:
         """Requeue the failed jobs of a run and their dependents, under their ids. Returns the ids.
 
@@ -157,7 +147,9 @@ class QueueClient:
         queues = self._queues(ordered)
         ordered = [identity for identity in ordered if identity in queues]
         for identity in ordered:
-            self._client.rewind_workflow(identity, start_step=1, queue_name=queues[identity])
+            self._client.rewind_workflow(
+                identity, start_step=1, queue_name=queues[identity], application_version=VERSION
+            )
         return ordered
 
     def forget(self, part: str) -> int:
@@ -175,6 +167,7 @@ class QueueClient:
                 fix="wait, or cancel it first",
             )
         ids = self._ids(part, ())
+        self._wait_for_cancelled(ids)
         for chunk in _chunks(ids):
             self._client.delete_workflows(chunk)
         return len(ids)
@@ -234,12 +227,17 @@ class QueueClient:
         with the arguments that were cancelled.
         """
         query = sa.text(
-            f"SELECT max(completed_at) FROM {table(self.url, 'workflow_status')} "
-            "WHERE status = 'CANCELLED' AND workflow_uuid IN :ids"
+            f"SELECT executor_id, max(completed_at) FROM {table(self.url, 'workflow_status')} "
+            "WHERE status = 'CANCELLED' AND executor_id IS NOT NULL AND workflow_uuid IN :ids GROUP BY executor_id"
         ).bindparams(sa.bindparam("ids", expanding=True, type_=sa.Text()))
+        last: dict[str, float] = {}
         with self._engine.connect() as connection:
-            times = [number(connection.execute(query, {"ids": chunk}).scalar()) for chunk in _chunks(ids)]
-        time.sleep(min(SETTLE_S, max(0.0, max(times, default=0.0) / 1000 + SETTLE_S - time.time())))
+            for chunk in _chunks(ids):
+                for name, cancelled in connection.execute(query, {"ids": chunk}):
+                    last[str(name)] = max(last.get(str(name), 0.0), number(cancelled) / 1000)
+        living = set(last) - ended_processes(self.url, last)
+        pause_s = max((last[name] + SETTLE_S - time.time() for name in living), default=0.0)
+        time.sleep(min(SETTLE_S, max(0.0, pause_s)))
 
     def _ids(self, run: str, statuses: Sequence[str]) -> list[str]:
         """Ids of a run in the given states (none given: in any), the shortest first."""

@@ -114,8 +114,7 @@ def submit_batch(url: str, batch: Batch) -> "Submission":
                 fix="name the run with --run",
             )
         submission = queue.resubmit(batch.jobs)
-        queue.submit([driver])
-        queue.requeue([batch.run])  # a driver that had ended waits for the new jobs
+        queue.resubmit([driver])  # one that had ended waits for the new jobs
     finally:
         queue.close()
     return submission

@@ -3,9 +3,11 @@
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+from registration.errors import InputError
 from registration.progress import NullProgress, Progress
 from workflows.engine.client import QueueClient
 from workflows.engine.jobs import DRIVER, FlowJob
+from workflows.engine.reader import QueueReader
 from workflows.farm.local import LocalFarm, run_until_done
 from workflows.ids import check_id
 from workflows.records.coregistration import (
@@ -34,17 +36,31 @@ def submit_coregistration(url: str, plan: CoregistrationPlan, *, run: str | None
     missing or changed products are computed.
 
     Raises:
-        InputError: there is no queue, the name is invalid, or a run of this name has not ended.
+        InputError: there is no queue, the name is invalid, or a run of this name has not ended or is a batch.
     """
     name = check_id(run or plan.out.name)
     queue = QueueClient(url)
     try:
+        _refuse_batch(url, name)
         queue.forget(name)
         arguments = {"plan": str(start_coregistration(plan))}
         queue.submit([FlowJob(id=name, flow="coregister", arguments=arguments, queue=DRIVER)])
     finally:
         queue.close()
     return name
+
+
+def _refuse_batch(url: str, name: str) -> None:
+    """Raise InputError if a run is a batch: its rows are not a coregistration's to cancel and delete."""
+    row = QueueReader(url, known=True).rows([name]).get(name)
+    if row is not None and row.spec.get("flow") == "batch":
+        raise InputError(
+            "The run is a batch",
+            where=name,
+            expected="a new name, or that of a coregistration",
+            got="a batch in this queue",
+            fix="choose an output folder of another name, or another queue with --folder",
+        )
 
 
 def start_coregistration(plan: CoregistrationPlan) -> Path:
@@ -83,7 +99,8 @@ def coregister(
     plan = replace(plan, options=replace(plan.options, variant="cuda" if gpus else "llvm"))
     queue = QueueClient(url)
     try:
-        queue.cancel(check_id(plan.out.name))  # the run of an earlier command that was killed
+        _refuse_batch(url, check_id(plan.out.name))
+        queue.cancel(plan.out.name)  # the run of an earlier command that was killed
     finally:
         queue.close()
     name = submit_coregistration(url, plan)

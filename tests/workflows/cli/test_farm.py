@@ -22,7 +22,7 @@ from tests.workflows.farm.harness import ROOT, alive, interruptible
 from workflows.cli.app import main
 from workflows.engine.client import QueueClient, Submission
 from workflows.engine.database import default_url
-from workflows.engine.jobs import FlowJob
+from workflows.engine.jobs import VERSION, FlowJob
 from workflows.engine.liveness import FileLocks
 from workflows.engine.reader import QueueReader
 from workflows.farm.batch import batch_jobs, submit_batch
@@ -275,6 +275,22 @@ def test_jobs_that_run_with_other_settings_are_not_replaced(captures: Path) -> N
     set_rows(captures, status="PENDING", executor_id="dead")
     assert submit(captures, "ann", "bob", recipe="preview") == Submission(again=2)
     assert recipe(captures, "r/ann/rest") == "preview"
+
+
+def test_jobs_of_an_earlier_release_are_put_into_the_queue_of_this_one(captures: Path) -> None:
+    main(["migrate", "--folder", str(captures)])
+    submit(captures, "ann", "bob")
+    set_rows(captures, application_version="wf-1")
+    with closing(sqlite3.connect(captures / "queue.sqlite")) as database, database:
+        change = "UPDATE workflow_status SET application_version = 'wf-1', status = 'SUCCESS' WHERE name = 'flow'"
+        database.execute(change)
+    assert submit(captures, "ann") == Submission(again=1)
+    queue, reader = QueueClient(default_url(captures)), QueueReader(default_url(captures))
+    versions = {row.id: row.version for row in reader.listing("r")}
+    assert versions == {"r": VERSION, "r/ann/rest": VERSION, "r/bob/rest": "wf-1"}
+    queue.cancel("r")
+    queue.retry("r", cancelled=True)
+    assert {row.version for row in reader.listing("r")} == {VERSION}
 
 
 def test_the_name_of_a_coregistration_cannot_be_a_batchs(captures: Path) -> None:

@@ -9,10 +9,10 @@ from registration.progress import NullProgress
 from tests.workflows.rounds import MODEL, write_people
 from workflows.engine.client import QueueClient
 from workflows.engine.database import default_url
-from workflows.engine.jobs import Job
+from workflows.engine.jobs import FlowJob, Job
 from workflows.engine.process import migrate
 from workflows.engine.reader import QueueReader
-from workflows.farm.coregistration import submit_coregistration
+from workflows.farm.coregistration import coregister, submit_coregistration
 from workflows.farm.local import LocalFarm, run_until_done
 from workflows.farm.plan import RoundSettings, make_plan
 from workflows.records.coregistration import PLAN
@@ -37,6 +37,20 @@ def test_an_active_run_is_kept_and_an_ended_run_is_replaced(capture: Path, tmp_p
     queue.cancel("june")
     submit_coregistration(url, plan)
     assert reader.rows(["june"])["june"].state == "waiting" and not reader.counts("june", kind="job")
+
+
+def test_the_name_of_a_batch_is_refused(capture: Path, tmp_path: Path) -> None:
+    plan = make_plan(
+        write_people(capture, tmp_path / "dataset", 5), MODEL, tmp_path / "june", rounds=RoundSettings(components=(2,))
+    )
+    url = default_url(tmp_path)
+    migrate(url)
+    QueueClient(url).submit([FlowJob(id="june", flow="batch", queue="driver")])
+    with pytest.raises(InputError, match="The run is a batch"):
+        submit_coregistration(url, plan)
+    with pytest.raises(InputError, match="The run is a batch"):
+        coregister(plan, url=url, folder=tmp_path / "farm")
+    assert QueueReader(url).rows(["june"])["june"].state == "waiting" and not plan.out.exists()
 
 
 def test_without_a_worker_nothing_starts(tmp_path: Path) -> None:

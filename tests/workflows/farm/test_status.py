@@ -207,3 +207,26 @@ def test_a_round_is_shown_with_its_jobs_failed_ones_first(queue: Queue) -> None:
         "  failed       run/it00/s00002-bob/neutral: died: it was killed",
         "  waiting      run/it00/s00001-ann/neutral",
     ]
+
+
+@pytest.mark.parametrize(
+    "columns",
+    [
+        {"status": "STRANGE"},
+        {"created_at": 10**17, "started_at_epoch_ms": "later", "completed_at": 1e300, "status": "SUCCESS"},
+        {"status": "ERROR", "error": json.dumps({"error": {"status": [1], "reason": {}, "what": 3, "fix": None}})},
+        {"status": "PENDING", "executor_id": "../../etc/passwd"},
+        {"status": "PENDING", "executor_id": b"\xff", "queue_name": b"\xfe", "application_version": b"\x00"},
+        {"queue_name": "other", "application_version": "x" * 100},
+    ],
+)
+@pytest.mark.parametrize("arguments", [{"capture": 3, "out": ["x"]}, "text", None])
+def test_rows_that_others_wrote_are_shown_too(queue: Queue, columns: dict[str, object], arguments: object) -> None:
+    queue.submit("r/a/x")
+    queue.set("r/a/x", **columns)
+    with closing(sqlite3.connect(queue.folder / "queue.sqlite")) as database, database:
+        inputs = json.dumps({"args": [{"step": [], "arguments": arguments}], "kwargs": {"queue": "gpu"}})
+        database.execute("UPDATE workflow_input SET inputs = ?", (inputs,))
+        database.execute("INSERT OR REPLACE INTO gnmreg_workers VALUES ('w', '[1, {'), ('v', '{\"queues\": 3}')")
+    assert "jobs: 1" in queue.status() and queue.jobs() == ["r/a/x"]
+    assert "r/a/x" in "\n".join(group_lines(*find_jobs(queue.reader, "r")))
