@@ -290,7 +290,7 @@ def _parts(ids: Iterable[str], typed: str) -> set[str]:
 def _unknown(kind: str, typed: str, known: Iterable[str]) -> InputError:
     names = sorted(known)
     close = nearest(typed, names)
-    listed = ", ".join(close or names[:10]) or "nothing: the queue is empty"
+    listed = ", ".join(close or names[:10]) or f"nothing: the queue has no {kind}"
     return InputError(
         f"There is no such {kind}",
         where=kind,

@@ -106,6 +106,7 @@ def test_cancel_stops_running_and_waiting_jobs(farm: Farm) -> None:
     farm.wait_for_end("after/a")
     assert farm.reader.counts("stop") == {"cancelled": 4}
     assert farm.lines("begin stop").total() == 2 and not farm.lines("end stop")
+    assert "Traceback" not in farm.output("w0") + farm.output("w1")
 
 
 def test_forget_refuses_unfinished_jobs(farm: Farm) -> None:

@@ -162,7 +162,7 @@ def test_typing_errors_are_answered_with_the_nearest_names(queue: Queue) -> None
 def test_an_empty_queue_has_no_names(queue: Queue) -> None:
     with pytest.raises(InputError, match="no such run") as caught:
         require_part(queue.reader, "r")
-    assert "the queue is empty" in caught.value.expected
+    assert "the queue has no run" in caught.value.expected
 
 
 @pytest.mark.parametrize(
