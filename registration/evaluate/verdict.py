@@ -31,7 +31,7 @@ class Limit:
 # Statistics of the distance of the scan's face from the mesh, mm.
 SCAN_LIMITS = {
     "median_mm": Limit(look=0.2, wrong=0.6),
-    "mean_mm": Limit(look=0.4, wrong=1.0),
+    "mean_mm": Limit(look=0.4, wrong=0.8),
     "p95_mm": Limit(look=2.0),  # inside an open mouth, where only the model's teeth are known, 1.5 mm is usual
 }
 # Residuals in the images; they count where no scan measures the face.
@@ -40,7 +40,7 @@ RESIDUAL_LIMITS = {
     "normals_deg": Limit(look=5.0, wrong=15.0),
     "colour_levels": Limit(look=10.0),
     "labels_percent": Limit(look=5.0),
-    "landmarks_px": Limit(look=3.0, wrong=9.0),
+    "landmarks_px": Limit(look=5.0, wrong=12.0),
 }
 INTERSECTION_LIMIT_MM = Limit(look=2.0)
 NOT_TRUSTED_LIMIT = Limit(look=0.0, wrong=0.5)  # fraction of the views
@@ -121,6 +121,8 @@ def _residuals(residuals: Mapping[str, Any]) -> list[tuple[Level, str]]:
         for name, value in known.items()
         if (level := RESIDUAL_LIMITS[name].level(value)) != "good"
     ]
+    if not {"normals_deg", "colour_levels"} & known.keys():
+        off.append(("look", "neither normals nor colours were compared: nothing measures the surface itself"))
     return off or [("good", f"no scan; in the images {', '.join(shown.values())} off")]
 
 

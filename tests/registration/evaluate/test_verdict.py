@@ -30,6 +30,8 @@ def residuals(**values: float) -> dict[str, Any]:
         (residuals(colour_levels=40.0), "look", "colour 40.0"),
         ({**scan(0.05, 0.1, 0.3), **residuals(normals_deg=30.0)}, "good", "0.10 mm"),  # the scan decides
         ({}, "look", "nothing measures the mesh"),
+        ({"residuals": residual_figures({"a": {"silhouette_px": 0.5}})}, "look", "neither normals nor colours"),
+        (scan(0.459, 0.828, 2.569), "wrong", "0.83 mm"),
         ({"scan_to_mesh": {"face": {"points": 0, "mean_mm": None}}}, "look", "nothing measures the mesh"),
     ],
 )
