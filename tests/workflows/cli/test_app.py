@@ -174,7 +174,7 @@ def test_register_passes_every_argument(
 
     def record(capture: Path, model: Path, out: Path, options: RegisterOptions, **settings) -> SimpleNamespace:
         received.update(settings, capture=capture, model=model, out=out, options=options)
-        return SimpleNamespace(status=status, reason="because")
+        return SimpleNamespace(status=status, reason="because", figures={})
 
     monkeypatch.setattr(pipeline, "register", record)
     flags = "--recipe studio --views 7 --seed 3 --neutral N --deterministic --force --variant cuda --landmarks 68=a 5=b"
