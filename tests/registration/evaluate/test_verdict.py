@@ -50,6 +50,8 @@ def test_good_distances_with_something_to_look_at() -> None:
     pairs = {"lips in teeth": {"max_excess_mm": 3.2}, "lips in gums": {"max_excess_mm": 0.1}}
     inside = judge("converged", {**good, "intersections": {"pairs": pairs}})
     assert inside.level == "look" and "up to 3.2 mm inside one another (lips in teeth)" in inside.reasons[0]
+    hidden = {"tongue in gums": {"max_excess_mm": 4.04}, "upper lip in lower lip": {"max_excess_mm": 1.56}}
+    assert judge("converged", {**good, "intersections": {"pairs": hidden}}).level == "good"
     assert judge("converged", {**good, "warnings": ["masks: 40 % lost"]}).level == "look"
 
 
