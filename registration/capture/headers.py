@@ -9,7 +9,7 @@ from pathlib import Path
 
 from registration.capture.tiff import is_tiff, read_tiff_header, refuse_tiff
 from registration.errors import InputError
-from registration.storage.image_files import MAX_PIXELS, image_size
+from registration.storage.image_files import MAX_PIXELS, image_size, too_many_pixels
 from registration.storage.reading import Refuse, open_file
 
 _PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
@@ -59,7 +59,7 @@ def _tiff_size(path: Path, role: str, refuse: Refuse) -> tuple[int, int]:
         except ValueError as error:
             raise refuse(expected="a PNG, JPEG or TIFF file", got=error) from None
     if header.width_px * header.height_px > MAX_PIXELS:
-        raise refuse(expected=f"at most {MAX_PIXELS} pixels", got=f"{header.width_px} x {header.height_px}")
+        raise too_many_pixels(path, f"{header.width_px} x {header.height_px}")
     if header.defect is not None:
         raise refuse_tiff(path, role, header.defect)
     return header.width_px, header.height_px

@@ -15,6 +15,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from registration.errors import InputError
 from registration.storage.reading import Refuse, open_file
 
 if TYPE_CHECKING:
@@ -46,12 +47,23 @@ def image_size(file: Path, refuse: Refuse) -> tuple[int, int]:
             got = f"a file that starts with {stream.read(8)!r}"
             raise refuse(expected="a PNG, JPEG or TIFF file", got=got) from None
         except Image.DecompressionBombError as error:
-            raise refuse(expected=f"at most {MAX_PIXELS} pixels", got=error) from None
+            raise too_many_pixels(file, error) from None
         except Exception as error:  # a damaged header makes Pillow's parsers raise nearly anything
             raise refuse(expected="a PNG, JPEG or TIFF file", got=f"{type(error).__name__}: {error}") from None
     if width_px * height_px > MAX_PIXELS:
-        raise refuse(expected=f"at most {MAX_PIXELS} pixels", got=f"{width_px} x {height_px}")
+        raise too_many_pixels(file, f"{width_px} x {height_px}")
     return width_px, height_px
+
+
+def too_many_pixels(file: Path, got: object) -> InputError:
+    """Return the error for an image of more than `MAX_PIXELS`."""
+    return InputError(
+        "The image has too many pixels",
+        where=file,
+        expected=f"at most {MAX_PIXELS} pixels",
+        got=got,
+        fix="scale it down, and its camera in the COLMAP model likewise",
+    )
 
 
 def decode(file: Path, flags: int, refuse: Refuse) -> "np.ndarray":

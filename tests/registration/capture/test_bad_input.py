@@ -164,7 +164,7 @@ def image_that_is_none(root: Path) -> None:
     (root / "images" / "cam1.png").write_text("hello")
 
 
-@bad("The image is not a readable image", where="images/cam1.png", got="exceeds limit", fix="again")
+@bad("The image has too many pixels", where="images/cam1.png", got="exceeds limit", fix="scale it down")
 def image_bomb(root: Path) -> None:
     path = root / "images" / "cam1.png"
     content = bytearray(path.read_bytes())

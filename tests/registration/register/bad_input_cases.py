@@ -214,7 +214,7 @@ class Payload:
         return os.mkdir, (str(self._path),)
 
 
-@bad("'variant' cannot be read", where="tiny_gnm.npz", got="allow_pickle=False", fix="gnmreg model fetch")
+@bad("'variant' cannot be read", where="tiny_gnm.npz", got="Python objects", fix="gnmreg model fetch")
 def model_with_a_pickle(request: Request) -> None:
     unpickled = request.folder / "unpickled"
     pickle.loads(pickle.dumps(Payload(unpickled)))
@@ -270,7 +270,7 @@ def scheme_given_has_another_count(request: Request) -> None:
 # The neutral
 
 
-@bad("The registration cannot be read", where="neutral/manifest.json", got="No such file", fix="gnmreg register")
+@bad("The registration cannot be read", where="neutral/manifest.json", got="no such file", fix="gnmreg register")
 def neutral_missing(request: Request) -> None:
     request.options["neutral"] = request.folder / "neutral"
 
