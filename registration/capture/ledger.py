@@ -117,7 +117,7 @@ def require_weight(capture: Capture, channels: Sequence[Channel]) -> list[str]:
         InputError: a channel was supplied, and ends with (nearly) no weight.
     """
     warnings: list[str] = []
-    told: set[str] = set()
+    named: set[str] = set()
     order = ("masks", "segmentation", "landmarks", "normals", "images")  # a cause before what follows from it
     for channel in sorted(channels, key=lambda channel: order.index(channel.name)):
         if not channel.matched:
@@ -142,8 +142,8 @@ def require_weight(capture: Capture, channels: Sequence[Channel]) -> list[str]:
                 got=f"{_percent(channel.counted, channel.total)} of the {channel.unit} count; lost: {_lost(channel)}",
                 fix=_fix(reason, capture.classes),
             )
-        if lost > _LARGE * channel.total and not _on_purpose(reason) and reason not in told:
-            told.add(reason)
+        if lost > _LARGE * channel.total and not _on_purpose(reason) and reason not in named:
+            named.add(reason)
             warnings.append(
                 f"{channel.name}: only {_percent(channel.counted, channel.total)} of the {channel.unit} count; "
                 f"lost: {_lost(channel)}; {_fix(reason, capture.classes)}"
