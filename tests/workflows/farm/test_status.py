@@ -187,7 +187,7 @@ def test_ids_are_found_by_what_people_type(queue: Queue, typed: str, found: str)
 
 def test_the_latest_of_a_steps_jobs_is_meant(queue: Queue) -> None:
     queue.submit("run/it00/build-0123abcd", "run/it00/build-fedc4567", "run/it00/build-89ab89ab")
-    queue.set("run/it00/build-fedc4567", created_at=int(1000 * (NOW + 60)))
+    queue.set("run/it00/build-fedc4567", created_at=int(1000 * (NOW + 86_400)))
     assert find_jobs(queue.reader, "run/it00/build")[0] == "run/it00/build-fedc4567"
 
 
