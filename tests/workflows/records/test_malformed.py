@@ -8,14 +8,12 @@ from typing import Any
 
 import pytest
 
-from coregister.next_model.recipes import few_registrations
-from coregister.stopping_rule import StoppingRule
 from registration.errors import InputError
 from registration.model import gnm_npz
-from registration.options import RegisterOptions
 from tests.registration.register import synthetic
+from tests.workflows.records.plan import PLAN
 from workflows.records.coregistration import CoregistrationPlan, CoregistrationState, RoundProducts, initial_state
-from workflows.records.dataset import DatasetRecord, Split, read_dataset
+from workflows.records.dataset import DatasetRecord, read_dataset
 from workflows.records.decisions import DecisionEntry, read_decisions
 from workflows.records.held_out import read_held_out
 from workflows.records.run import known_model, read_run
@@ -36,19 +34,6 @@ SUBJECT = SubjectRecord(
     recipe="draft",
     neutral="rest",
     rows=(CaptureRow(name="rest", expression="neutral", status="converged", folder="rest"),),
-)
-PLAN = CoregistrationPlan(
-    dataset=Path("/d"),
-    model=Path("/m.npz"),
-    out=Path("/o"),
-    options=RegisterOptions(),
-    model_recipe=few_registrations(),
-    components=(2,),
-    samples=0,
-    rule=StoppingRule(),
-    split=Split(training=("ann",), held_out=("bob",), how="by the list"),
-    captures={"ann": ("rest",), "bob": ("rest",)},
-    without_truth=(),
 )
 
 

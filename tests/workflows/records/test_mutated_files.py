@@ -17,8 +17,6 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from coregister.next_model.recipes import few_registrations
-from coregister.stopping_rule import StoppingRule
 from registration.capture import pixels
 from registration.capture.colmap import read_cameras, read_points
 from registration.capture.landmark_files import read_landmarks
@@ -27,13 +25,13 @@ from registration.capture.settings import read_settings
 from registration.errors import InputError
 from registration.model import gnm_npz
 from registration.model.landmarks import read_scheme
-from registration.options import RegisterOptions
 from registration.storage.registration_folder import load_registration, read_manifest
 from registration.types import Camera
 from tests.conftest import FIXTURES
 from tests.fixtures.malformed.sandbox import make_templates
+from tests.workflows.records.plan import PLAN
 from workflows.records.coregistration import CoregistrationPlan, CoregistrationState, initial_state
-from workflows.records.dataset import DatasetRecord, Split
+from workflows.records.dataset import DatasetRecord
 from workflows.records.decisions import read_decisions
 from workflows.records.held_out import read_held_out
 from workflows.records.store import Store
@@ -48,19 +46,6 @@ QUICK = settings(
 )
 SIZE = (120, 160)
 EXTREMES = (0, 1, 2**15, 2**31 - 1, 2**31, 2**32 - 1)
-PLAN = CoregistrationPlan(
-    dataset=Path("/d"),
-    model=Path("/m.npz"),
-    out=Path("/o"),
-    options=RegisterOptions(),
-    model_recipe=few_registrations(),
-    components=(2,),
-    samples=0,
-    rule=StoppingRule(),
-    split=Split(training=("ann",), held_out=("bob",), how="by the list"),
-    captures={"ann": ("rest",), "bob": ("rest",)},
-    without_truth=(),
-)
 
 
 @pytest.fixture(scope="module")
