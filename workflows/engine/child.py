@@ -51,7 +51,10 @@ class StepProcess:
 
         Call it in the main thread: the kernel signals an orphan when the *thread* that started it ends.
         """
-        pid: int = self._schedule(os.getpid, (), None).result()
+        try:
+            pid: int = self._schedule(os.getpid, (), None).result()
+        except BrokenProcessPool:  # the last child died, and the pool noticed it after this call was put into it
+            pid = self._schedule(os.getpid, (), None).result()
         return pid
 
     async def run(

@@ -15,6 +15,7 @@ from registration.errors import InputError
 from workflows.engine.alive import ended_processes
 from workflows.engine.database import BELOW, below, checked_url, engine, require_queue, table
 from workflows.engine.jobs import MAX_BYTES, VERSION, FlowJob, Job
+from workflows.engine.log_output import configure_logging
 from workflows.engine.reader import number
 from workflows.engine.serialization import APPLICATION, JsonSerializer, UnreadableRow
 from workflows.ids import check_id
@@ -49,6 +50,7 @@ class QueueClient:
         if not known:
             require_queue(self.url)
         self._engine = engine(self.url)
+        configure_logging()
         self._client = DBOSClient(
             system_database_engine=self._engine,
             serializer=JsonSerializer(),

@@ -16,19 +16,18 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 from dbos import DBOS, DBOSConfig
-from dbos._error import DBOSAwaitedWorkflowCancelledError, DBOSWorkflowCancelledError
 
 from registration.errors import InputError
-from registration.terminal import printable
 from workflows.engine.child import RETRIED, StepOutcome, StepProcess
 from workflows.engine.coverage import Coverage, create_workers_table, publish_worker, take_covered_jobs_only
 from workflows.engine.database import SECRETS, checked_url, prepare, with_environments_password
 from workflows.engine.jobs import DRIVER, GPU, REBUILD, SUBJECTS, VERSION, Step, validate_arguments
 from workflows.engine.liveness import Liveness, LivenessTimeouts
+from workflows.engine.log_output import configure_logging
 from workflows.engine.row_check import refuse_unreadable_rows
 from workflows.engine.scope import FlowScope
 from workflows.engine.serialization import APPLICATION, JobFailed, JsonSerializer
-from workflows.ids import check_id, redact, resolve_roots
+from workflows.ids import check_id, resolve_roots
 
 log = logging.getLogger("gnmreg")
 
@@ -38,8 +37,6 @@ QUEUES = {GPU: 1, REBUILD: 1, SUBJECTS: 64, DRIVER: 1}  # jobs of a queue that o
 ATTEMPTS, BACK_OFF_S, BACK_OFF_FACTOR = 3, 10.0, 3.0
 RECOVERIES = 5  # a job that killed more workers than this is dead: it is not run again
 Flow = Callable[..., Awaitable[Any]]
-# Errors that say nothing more than the job's row and log do.
-_REPORTED = (JobFailed, DBOSWorkflowCancelledError, DBOSAwaitedWorkflowCancelledError)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -84,7 +81,7 @@ def serve(process: EngineProcess) -> NoReturn:
     url = with_environments_password(checked_url(process.url))
     for name in SECRETS:
         os.environ.pop(name, None)  # children print their environment when they crash
-    _configure_logging()
+    configure_logging()
     migrate(url)
     liveness = Liveness(url, process.timeouts)
     name = liveness.join(process.names)  # before launch, which recovers this executor id's jobs
@@ -184,29 +181,6 @@ def _register_workflows(process: EngineProcess, url: str, child: StepProcess | N
         except (KeyError, TypeError) as error:
             raise JobFailed({"status": "refused", "reason": f"there is no such flow: {error}"}) from None
         return await function(FlowScope(url), **arguments)
-
-
-class _Redacting(logging.Filter):
-    """Removes passwords from URLs in all log records, and the tracebacks of failed and cancelled jobs."""
-
-    def filter(self, record: logging.LogRecord) -> bool:
-        if record.exc_info and isinstance(record.exc_info[1], _REPORTED):
-            return False
-        record.msg, record.args = printable(redact(record.getMessage())), None
-        if record.exc_info:
-            record.exc_text = printable(redact(logging.Formatter().formatException(record.exc_info)))
-            record.exc_info = None
-        return True
-
-
-def _configure_logging() -> None:
-    handler = logging.StreamHandler()
-    handler.setFormatter(logging.Formatter("%(asctime)s %(name)s: %(message)s", datefmt="%H:%M:%S"))
-    handler.addFilter(_Redacting())
-    for name in ("dbos", "gnmreg"):
-        logger = logging.getLogger(name)
-        logger.handlers, logger.propagate = [handler], False
-        logger.setLevel(logging.WARNING)
 
 
 def check_queues(queues: Sequence[str]) -> tuple[str, ...]:

@@ -125,6 +125,15 @@ def test_a_child_that_dies_between_jobs_is_replaced(process: StepProcess, tmp_pa
     assert process.warm() != pid
 
 
+def test_a_child_that_has_just_died_is_replaced(process: StepProcess) -> None:
+    """The pool may notice the death before or after the next call is put into it."""
+    for delay_s in (0.0, 0.02, 0.04, 0.06, 0.08):
+        pid = process.warm()
+        os.kill(pid, signal.SIGKILL)
+        time.sleep(delay_s)
+        assert process.warm() != pid
+
+
 def test_a_child_dies_with_its_parent(tmp_path: Path) -> None:
     code = """
 import time
