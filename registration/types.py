@@ -56,6 +56,16 @@ class Camera:
 
 
 @dataclass(frozen=True, kw_only=True)
+class Colour:
+    """How the values of an image become linear sRGB light: decode, then apply the matrix and the gain."""
+
+    encoding: str = "srgb"  # transfer function of the file: "srgb", "linear" or a log curve (capture.colour)
+    matrix: tuple[tuple[float, ...], ...] | None = None  # 3 x 3 or, with an offset, 3 x 4
+    matrix_space: Literal["encoded", "linear"] = "linear"  # values in [0, 1] that the matrix applies to
+    gain: float = 1.0  # of linear light
+
+
+@dataclass(frozen=True, kw_only=True)
 class View:
     """One image of a capture, as it lies on disk: nothing is decoded, landmarks are in distorted pixels."""
 
@@ -66,6 +76,7 @@ class View:
     normals: Path | None = None
     segmentation: Path | None = None
     landmarks: Mapping[str, Float[np.ndarray, "L 3"]] = field(default_factory=dict)  # scheme -> x_px y_px confidence
+    colour: Colour = Colour()
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -1,0 +1,1 @@
+"""Write registrations and models in the formats of other programs."""

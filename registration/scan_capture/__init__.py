@@ -1,0 +1,1 @@
+"""Make captures from scans without photographs: virtual cameras that render them."""
