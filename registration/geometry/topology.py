@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 from torch import Tensor
@@ -74,6 +74,16 @@ def directed_edges_used_twice(triangles: Int[np.ndarray, "F 3"]) -> int:
     start, end = triangles.T.astype(np.int64), np.roll(triangles, -1, 1).T.astype(np.int64)
     keys = np.sort((start * (triangles.max(initial=0) + 1) + end).ravel())
     return int((np.diff(keys) == 0).sum())
+
+
+def boundary_vertices(triangles: Int[np.ndarray, "F 3"], count: int) -> Bool[np.ndarray, "V"]:
+    """Return which of `count` vertices lie on an edge that only one triangle has. Non-manifold meshes are accepted."""
+    start, end = triangles.ravel().astype(np.int64), np.roll(triangles, -1, 1).ravel().astype(np.int64)
+    keys = np.minimum(start, end) * count + np.maximum(start, end)
+    single, uses = np.unique(keys, return_counts=True)
+    found = np.zeros(count, bool)
+    found[np.concatenate(np.divmod(single[uses == 1], count))] = True
+    return found
 
 
 def connected_parts(triangles: Int[np.ndarray, "F 3"]) -> Int[np.ndarray, "F"]:
