@@ -13,8 +13,8 @@ from registration.lazy_imports import attach
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
 if TYPE_CHECKING:
-    from registration.capture.doctor import CaptureReport, check_capture
     from registration.capture.native import read_capture
+    from registration.doctor.report import CaptureReport, check_capture
     from registration.errors import InputError
     from registration.evaluate.evaluation import RegistrationEvaluation, evaluate_registration
     from registration.fit.recipes import Lengths, OffsetRegion, Rate, Recipe, Stage, Weights, load_recipe

@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from registration.capture.ledger import Ledger
 from registration.capture.native import read_capture
 from registration.capture.origin import capture_origin
 from registration.capture.triangulation import triangulate
-from registration.capture.validation import validate_capture
+from registration.doctor.ledger import Ledger
+from registration.doctor.validation import validate_capture
 from registration.errors import InputError
 from registration.fit.initialization import MIN_LANDMARKS, select_spread_views
 from registration.fit.recipes import Recipe, expression_recipe, load_recipe

@@ -1,1 +1,1 @@
-"""Read, write, validate and degrade captures."""
+"""Read and write captures."""

@@ -7,7 +7,7 @@ from rich.console import Console
 from rich.markup import escape
 
 from registration.capture.native import read_capture
-from registration.capture.scan_frame import require_frames
+from registration.doctor.scan_frame import require_frames
 from registration.evaluate.console_table import print_metrics
 from registration.evaluate.evaluation import RegistrationEvaluation, evaluate_registration
 from registration.evaluate.verdict import judge

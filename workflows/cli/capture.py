@@ -26,9 +26,9 @@ def check(capture: CaptureFolder, /, out: OptionalImage = None) -> int:
         capture: The capture folder.
         out: Contact sheet to draw: every image with the scan and the landmarks projected into it.
     """
-    from registration.capture import doctor
+    from registration.doctor import report
 
-    print(doctor.check_capture(capture, sheet=out))
+    print(report.check_capture(capture, sheet=out))
     return 0
 
 
@@ -81,7 +81,7 @@ def degrade(
         faults: Views with a fault: shifted (by 30 px), black, or exposure (2.5 times the light). They are kept.
     """
     parsed = _faults(faults)
-    from registration.capture import degradation, degrade
+    from registration.degrading import degradation, degrade
 
     print(degrade.degrade(source, target, preset=degradation.PRESETS[preset], seed=seed, faults=parsed))
     return 0

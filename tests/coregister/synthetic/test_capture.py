@@ -10,9 +10,9 @@ import torch
 
 from coregister.synthetic.capture import LABELS, Studio, render_capture
 from registration.capture import native, triangulation
-from registration.capture.doctor import check_capture
 from registration.capture.pixels import read_image, read_labels, read_mask, read_normals
 from registration.capture.scan import read_scan, read_truth
+from registration.doctor.report import check_capture
 from registration.errors import InputError
 from registration.geometry.closest_point import closest_points
 from registration.geometry.rasterizer import visible

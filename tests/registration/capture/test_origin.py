@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from registration.capture import native
-from registration.capture.doctor import check_capture
 from registration.capture.origin import capture_origin
 from registration.capture.scan import read_scan, read_truth
 from registration.capture.triangulation import triangulate
+from registration.doctor.report import check_capture
 from registration.errors import InputError
 from registration.storage.mesh import write_ply
 from tests.conftest import SHARED, needs_shared

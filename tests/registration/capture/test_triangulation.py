@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from registration.capture import native
-from registration.capture.doctor import eye_distance
 from registration.capture.triangulation import residuals, reversed_jaw_points, triangulate
+from registration.doctor.report import eye_distance
 from registration.types import Camera, Capture, View
 from tests.conftest import SHARED, needs_shared
 from tests.registration.capture.small import DISTORTIONS, YAWS_RAD, camera, distorted, landmarks_68

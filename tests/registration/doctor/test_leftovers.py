@@ -5,8 +5,9 @@ from pathlib import Path
 import cv2
 import pytest
 
-from registration.capture import leftovers, native
-from registration.capture.doctor import check_capture
+from registration.capture import native
+from registration.doctor import leftovers
+from registration.doctor.report import check_capture
 from registration.errors import InputError
 from tests.registration.capture.small import make
 

@@ -11,10 +11,10 @@ from scipy.spatial.transform import Rotation
 
 from registration.capture import native
 from registration.capture.colmap import write_model
-from registration.capture.doctor import check_capture
 from registration.capture.pixels import read_mask
-from registration.capture.rig_checks import check_landmark_rays, check_landmark_size, check_mask_rays, mask_box
-from registration.capture.validation import validate_capture
+from registration.doctor.report import check_capture
+from registration.doctor.rig_checks import check_landmark_rays, check_landmark_size, check_mask_rays, mask_box
+from registration.doctor.validation import validate_capture
 from registration.errors import InputError
 from registration.types import Capture
 from tests.conftest import SHARED, needs_shared

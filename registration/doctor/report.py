@@ -14,12 +14,12 @@ from rich.table import Table
 from rich.text import Text
 
 from registration.capture import native, triangulation
-from registration.capture.contact_sheet import draw_contact_sheet
-from registration.capture.ledger import Channel
 from registration.capture.scan import Scan, read_scan, read_truth
-from registration.capture.scan_checks import scan_facts
 from registration.capture.text import listed
-from registration.capture.validation import eye_distance, validate_capture
+from registration.doctor.contact_sheet import draw_contact_sheet
+from registration.doctor.ledger import Channel
+from registration.doctor.scan_checks import scan_facts
+from registration.doctor.validation import eye_distance, validate_capture
 from registration.frames import MM_PER_M, opencv_intrinsics
 from registration.geometry.meshlab import scan_topology
 from registration.storage.files import check_output_file

@@ -7,7 +7,7 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from registration.capture.scan import Scan
-from registration.capture.scan_frame import (
+from registration.doctor.scan_frame import (
     FEW_SAMPLES,
     GRID,
     MAX_DISTANCE_M,

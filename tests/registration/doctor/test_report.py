@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 
 from registration.capture import native
-from registration.capture.contact_sheet import CAPTION_PX, TILE_WIDTH_PX
-from registration.capture.doctor import NO_TOPOLOGY, check_capture
 from registration.capture.native_writer import CaptureDescription, write_capture
 from registration.capture.scan import Scan
-from registration.capture.validation import validate_capture
+from registration.doctor.contact_sheet import CAPTION_PX, TILE_WIDTH_PX
+from registration.doctor.report import NO_TOPOLOGY, check_capture
+from registration.doctor.validation import validate_capture
 from registration.errors import InputError
 from registration.storage.mesh import write_ply
 from tests.conftest import SHARED, needs_shared

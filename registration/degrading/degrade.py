@@ -16,12 +16,13 @@ import cv2
 import numpy as np
 from jaxtyping import Float
 
-from registration.capture import degradation, native, pixels, triangulation
+from registration.capture import native, pixels, triangulation
 from registration.capture.colmap import read_points, write_model
-from registration.capture.degradation import FAULTS, DegradationPreset
 from registration.capture.native_writer import check_new
 from registration.capture.scan import read_scan
-from registration.capture.validation import validate_capture
+from registration.degrading import degradation
+from registration.degrading.degradation import FAULTS, DegradationPreset
+from registration.doctor.validation import validate_capture
 from registration.errors import InputError, check_seed
 from registration.storage.files import atomic_directory
 from registration.types import Camera, Capture, View

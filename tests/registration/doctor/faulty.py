@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 
 from registration.capture import native
-from registration.capture.validation import validate_capture
+from registration.doctor.validation import validate_capture
 from tests.conftest import SHARED
 
 SOURCE = SHARED / "data" / "captures" / "ict_pop_00" / "neutral"  # 7 views of 480 x 720 px

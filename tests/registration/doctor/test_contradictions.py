@@ -7,7 +7,7 @@ import pytest
 
 from registration.errors import InputError
 from tests.conftest import needs_shared
-from tests.registration.capture import faulty
+from tests.registration.doctor import faulty
 
 pytestmark = needs_shared
 EYES, LIPS = {"left_eye": "right_eye", "right_eye": "left_eye"}, {"upper_lip": "lower_lip", "lower_lip": "upper_lip"}

@@ -5,11 +5,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from registration.capture.landmark_checks import MIRRORED_68
+from registration.doctor.landmark_checks import MIRRORED_68
 from registration.errors import InputError
 from tests.conftest import needs_shared
-from tests.registration.capture import faulty
-from tests.registration.capture.faulty import HEIGHT_PX, WIDTH_PX
+from tests.registration.doctor import faulty
+from tests.registration.doctor.faulty import HEIGHT_PX, WIDTH_PX
 
 pytestmark = needs_shared
 SIZE = np.array([WIDTH_PX, HEIGHT_PX, 1])

@@ -5,7 +5,7 @@ import pytest
 
 from registration.errors import InputError
 from tests.conftest import needs_shared
-from tests.registration.capture import faulty
+from tests.registration.doctor import faulty
 
 pytestmark = needs_shared
 

@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 
 from registration.capture import native
-from registration.capture.degradation import PRESETS, DegradationPreset
-from registration.capture.degrade import degrade
-from registration.capture.doctor import check_capture
 from registration.capture.native_writer import CaptureDescription, write_capture
 from registration.capture.scan import read_scan
+from registration.degrading.degradation import PRESETS, DegradationPreset
+from registration.degrading.degrade import degrade
+from registration.doctor.report import check_capture
 from registration.errors import InputError
 from registration.types import Capture, View
 from tests.conftest import SHARED, needs_shared

@@ -5,15 +5,15 @@ import numpy as np
 import pytest
 
 from registration.capture import native
-from registration.capture.degradation import PRESETS
-from registration.capture.degrade import degrade
-from registration.capture.doctor import check_capture
-from registration.capture.ledger import Channel
-from registration.capture.validation import validate_capture
+from registration.degrading.degradation import PRESETS
+from registration.degrading.degrade import degrade
+from registration.doctor.ledger import Channel
+from registration.doctor.report import check_capture
+from registration.doctor.validation import validate_capture
 from registration.errors import InputError
 from tests.conftest import SHARED, needs_shared
-from tests.registration.capture import faulty
 from tests.registration.capture.small import ball, make
+from tests.registration.doctor import faulty
 
 
 def channels(root: Path) -> dict[str, Channel]:

@@ -12,9 +12,10 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float
 
-from registration.capture import class_names, leftovers, triangulation
+from registration.capture import class_names, triangulation
 from registration.capture.samples import ViewSample
 from registration.capture.text import listed
+from registration.doctor import leftovers
 from registration.errors import InputError
 from registration.types import Capture, View
 

@@ -5,22 +5,21 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from registration.capture import (
+from registration.capture import headers, triangulation
+from registration.capture.class_names import BACKGROUND
+from registration.capture.samples import ViewSample, sample_views
+from registration.capture.scan import Scan
+from registration.doctor import (
     contradictions,
     exchanged,
-    headers,
     landmark_checks,
     leftovers,
     normal_axes,
     rig_checks,
-    triangulation,
 )
-from registration.capture.class_names import BACKGROUND
-from registration.capture.ledger import Channel, Ledger, require_weight, take_stock
-from registration.capture.samples import ViewSample, sample_views
-from registration.capture.scan import Scan
-from registration.capture.scan_checks import scan_warnings
-from registration.capture.scan_frame import require_frames
+from registration.doctor.ledger import Channel, Ledger, require_weight, take_stock
+from registration.doctor.scan_checks import scan_warnings
+from registration.doctor.scan_frame import require_frames
 from registration.errors import InputError
 from registration.types import Capture, View
 

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from registration.capture.doctor import check_capture
+from registration.doctor.report import check_capture
 from registration.errors import InputError
 from tests.registration.capture.binary_model import to_binary
 from tests.registration.capture.small import data_lines, make

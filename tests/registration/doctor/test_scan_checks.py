@@ -14,12 +14,12 @@ import pytest
 import trimesh
 from jaxtyping import Float
 
-from registration.capture.doctor import check_capture
 from registration.capture.native import read_capture
 from registration.capture.scan import Scan, read_scan
-from registration.capture.scan_checks import scan_facts, scan_warnings
-from registration.capture.scan_frame import require_frame, surface_landmarks
-from registration.capture.validation import validate_capture
+from registration.doctor.report import check_capture
+from registration.doctor.scan_checks import scan_facts, scan_warnings
+from registration.doctor.scan_frame import require_frame, surface_landmarks
+from registration.doctor.validation import validate_capture
 from registration.errors import InputError
 from registration.storage.mesh import write_ply
 from registration.types import Capture, View

@@ -14,8 +14,8 @@ import cv2
 import numpy as np
 from jaxtyping import Float
 
-from registration.capture.contradictions import overlap
 from registration.capture.samples import ViewSample
+from registration.doctor.contradictions import overlap
 from registration.errors import InputError
 from registration.types import Camera
 

@@ -7,8 +7,8 @@ import pytest
 from registration.capture import native
 from registration.errors import InputError
 from tests.conftest import needs_shared
-from tests.registration.capture import faulty
 from tests.registration.capture.small import make
+from tests.registration.doctor import faulty
 
 REFUSED: dict[str, tuple[Callable[[np.ndarray], np.ndarray], str, str]] = {
     "OpenGL": (lambda n: n * [1, -1, -1], "OpenGL", "store (x, -y, -z)"),

@@ -9,9 +9,9 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from registration.capture import triangulation
-from registration.capture.contradictions import overlap, silhouettes
-from registration.capture.landmark_checks import misread_view
 from registration.capture.samples import ViewSample
+from registration.doctor.contradictions import overlap, silhouettes
+from registration.doctor.landmark_checks import misread_view
 from registration.types import Capture, View
 
 _MIN_POINTS = 6

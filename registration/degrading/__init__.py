@@ -1,0 +1,1 @@
+"""Copies of clean captures with realistic errors, to measure robustness."""

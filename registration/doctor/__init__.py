@@ -1,0 +1,1 @@
+"""Checks of captures before anything is computed: what is wrong, and what mends it."""
