@@ -9,6 +9,7 @@ from registration.capture.colmap import read_cameras
 from registration.capture.headers import require_size
 from registration.capture.image_names import image_file
 from registration.capture.landmark_files import read_landmarks
+from registration.capture.scan import find_scan
 from registration.capture.settings import read_settings
 from registration.errors import InputError
 from registration.storage.reading import open_file
@@ -45,7 +46,7 @@ def read_capture(root: Path) -> Capture:
     cameras = read_cameras(root / "sparse")
     views = tuple(_read_view(root, name, cameras[name]) for name in sorted(cameras, key=natural_key))
     _check_names(root, views)
-    scan, truth = root / "scan.ply", root / "ground_truth.npz"
+    scan, truth = find_scan(root), root / "ground_truth.npz"
     return Capture(
         root=root,
         subject=settings.subject,
@@ -53,7 +54,7 @@ def read_capture(root: Path) -> Capture:
         views=views,
         classes=settings.classes,
         tags=settings.tags,
-        scan=_optional(root, scan),
+        scan=None if scan is None else _optional(root, scan),
         ground_truth=_optional(root, truth),
     )
 

@@ -7,13 +7,13 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 
-from registration.capture.scan import SCAN, unread_scans
+from registration.capture.scan import SCAN, SCANS, unread_scans
 from registration.capture.text import listed
 from registration.errors import InputError
 from registration.types import Capture
 
 SUFFIXES = {"masks": ".png", "normals": ".png", "segmentation": ".png", "landmarks": ".json"}  # besides images/
-_ROOT_FILES = ("capture.toml", "scan.ply", "ground_truth.npz")
+_ROOT_FILES = ("capture.toml", *SCANS, "ground_truth.npz")
 _OTHER_FOLDERS = {
     "image": "images",
     "rgb": "images",
@@ -109,7 +109,11 @@ def _other_scans(capture: Capture) -> list[str]:
     """A line about meshes in other files or formats than the scan's."""
     if not (names := unread_scans(capture.root)):
         return []
-    mend = f"convert or rename it to {SCAN}" if capture.scan is None else f"only {SCAN} is; remove what is out of date"
+    mend = (
+        f"convert or rename it to {SCAN}"
+        if capture.scan is None
+        else f"{capture.scan.name} is; remove what is out of date"
+    )
     return [f"{listed(names)} is not read; {mend}"]
 
 
@@ -166,7 +170,7 @@ def _read_files(capture: Capture, folder: str) -> dict[str, str]:
 def _meant_root_file(path: Path) -> str | None:
     name = path.name.casefold()
     for expected in _ROOT_FILES:
-        if expected == SCAN:  # `_other_scans` finds them
+        if expected in SCANS:  # `_other_scans` finds them
             continue
         if name == expected or (PurePosixPath(name).stem == PurePosixPath(expected).stem):
             return expected

@@ -8,7 +8,7 @@ from jaxtyping import Float
 from registration.capture import headers, triangulation
 from registration.capture.class_names import BACKGROUND
 from registration.capture.samples import ViewSample, sample_views
-from registration.capture.scan import Scan
+from registration.capture.scan import SCANS, Scan
 from registration.doctor import (
     contradictions,
     exchanged,
@@ -70,7 +70,7 @@ def validate_capture(capture: Capture) -> Ledger:
     warnings += landmark_checks.unnamed_schemes(capture)
     warnings += [] if scan is None else scan_warnings(capture, scan, points)
     return Ledger(
-        channels=(*channels, _scan_channel(scan)),
+        channels=(*channels, _scan_channel(capture, scan)),
         warnings=tuple(warnings),
         unread=tuple(leftovers.warnings(capture, files)),
         coverage={sample.name: sample.coverage for sample in samples},
@@ -78,10 +78,10 @@ def validate_capture(capture: Capture) -> Ledger:
     )
 
 
-def _scan_channel(scan: Scan | None) -> Channel:
+def _scan_channel(capture: Capture, scan: Scan | None) -> Channel:
     count, unused = (0, 0) if scan is None else (len(scan.vertices), scan.unused_vertices)
     return Channel(
-        name="scan.ply",
+        name=SCANS[0] if capture.scan is None else capture.scan.name,
         files=int(scan is not None),
         matched=int(scan is not None),
         unit="vertices",

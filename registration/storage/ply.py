@@ -34,6 +34,7 @@ class PlyMesh:
     triangles: Int[np.ndarray, "F 3"]  # polygons are split into fans
     faces: int  # in the file, of any number of corners
     unread: Mapping[str, int]  # element that is neither vertices nor faces -> its count
+    colours: Float[np.ndarray, "V 3"] | None = None  # of the vertices, sRGB in [0, 1]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -73,6 +74,9 @@ def read_ply(path: Path) -> PlyMesh:
     corners = None if face is None else _index_list(face)
     body = _Body.of(path, start, order)
     vertices, triangles = np.zeros((0, 3)), np.zeros((0, 3), np.int64)
+    tints = [vertex.place(name) for name in ("red", "green", "blue")]
+    coloured = all(k is not None and not vertex.properties[k].count_type for k in tints)
+    columns += tints if coloured else []
     wanted = {"vertex", "face"} if face is not None and corners is not None else {"vertex"}
     for element in elements:
         if not wanted:
@@ -87,11 +91,19 @@ def read_ply(path: Path) -> PlyMesh:
         wanted.discard(element.name)
     read = (vertex, face) if corners is not None else (vertex,)
     return PlyMesh(
-        vertices=vertices,
+        vertices=vertices[:, :3],
+        colours=_in_unit_range(vertices[:, 3:]) if coloured and len(vertices) else None,
         triangles=triangles,
         faces=face.count if face is not None and corners is not None else 0,
         unread={element.name: element.count for element in elements if not any(element is one for one in read)},
     )
+
+
+def _in_unit_range(colours: Float[np.ndarray, "V 3"]) -> Float[np.ndarray, "V 3"]:
+    """Colours in [0, 1] of those in [0, 1], in bytes or in words of two bytes."""
+    colours = np.nan_to_num(colours)
+    top = next((top for top in (1.0, 255.0) if colours.max() <= top), 65535.0)
+    return np.clip(colours / top, 0, 1)
 
 
 def _index_list(face: _Element) -> int | None:

@@ -65,8 +65,17 @@ def test_indices_of_missing_vertices_are_refused(tmp_path: Path, corner: int) ->
 
 
 def test_files_that_look_like_a_scan_but_are_not_read_are_named(tmp_path: Path) -> None:
-    names = ["SCAN.PLY", "head.stl", "scan.obj", "scan.ply.gz"]
-    for name in (*names, "scan.ply", "capture.toml", "ground_truth.npz", "scan.png", "notes.txt.gz"):
+    names = ["SCAN.PLY", "head.stl", "scan.ply.gz", "scan.stl"]
+    for name in (
+        *names,
+        "scan.ply",
+        "scan.obj",
+        "scan.glb",
+        "capture.toml",
+        "ground_truth.npz",
+        "scan.png",
+        "notes.txt.gz",
+    ):
         (tmp_path / name).write_bytes(b"")
     (tmp_path / "meshes.obj").mkdir()
     (tmp_path / "scans").mkdir()

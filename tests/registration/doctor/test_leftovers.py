@@ -69,12 +69,12 @@ def test_files_that_belong_to_no_view_are_named(good: Path, tmp_path: Path) -> N
     (root / "masks" / ".hidden").touch()
     (root / "Labels").mkdir()
     (root / "Labels" / "cam0.png").touch()
-    (root / "scan.ply").rename(root / "scan.obj")
+    (root / "scan.ply").rename(root / "scan.stl")
     warnings = check_capture(root).warnings
     assert "1 files in masks/ belong to no view: cam1.PNG (near cam1.png)" in warnings
     assert "1 files in images/ are not calibrated, the COLMAP model does not name them: other.png" in warnings
     assert "Labels/ with 1 files is not read; rename it to segmentation/" in warnings
-    assert "scan.obj is not read; convert or rename it to scan.ply" in warnings
+    assert "scan.stl is not read; convert or rename it to scan.ply or scan.obj or scan.glb" in warnings
 
 
 @pytest.mark.parametrize("encoding", ["utf-8-sig", "utf-8"])
