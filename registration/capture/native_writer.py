@@ -77,7 +77,7 @@ def write_capture(
             _write_view(temporary, view, bits)
         cameras = {f"{view.name}.png": view.camera for view in views}
         write_model(temporary / "sparse", cameras, np.zeros((0, 3)) if points is None else points)
-        _write_settings(temporary / "capture.toml", description)
+        write_settings(temporary / "capture.toml", description)
         if scan is not None:
             write_ply(temporary / "scan.ply", scan.vertices, scan.triangles)
         if truth is not None:
@@ -135,7 +135,8 @@ def _file(folder: Path, view: ViewArrays, suffix: str) -> Path:
     return path
 
 
-def _write_settings(path: Path, description: CaptureDescription) -> None:
+def write_settings(path: Path, description: CaptureDescription) -> None:
+    """Write a `capture.toml`. Raises ValueError for a tag that is no string, number, boolean, or list of these."""
     settings = {"subject": description.subject, "expression": description.expression, "units": "m", **description.tags}
     lines = [f"{json.dumps(key)} = {_toml(value)}" for key, value in settings.items()]
     if description.classes:

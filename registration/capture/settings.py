@@ -12,7 +12,7 @@ from registration.capture.class_names import canonical
 from registration.errors import InputError
 from registration.storage.reading import parse_toml, read_bytes
 
-_UNITS_M = {"mm": 1e-3, "cm": 1e-2, "dm": 0.1, "km": 1e3, "in": 0.0254, "inch": 0.0254, "ft": 0.3048}
+UNITS_M = {"m": 1.0, "mm": 1e-3, "cm": 1e-2, "dm": 0.1, "km": 1e3, "in": 0.0254, "inch": 0.0254, "ft": 0.3048}
 _RESERVED = ("subject", "expression", "units", "segmentation")
 
 
@@ -48,10 +48,9 @@ def read_settings(path: Path) -> CaptureSettings:
             raise refuse(f'capture.toml lacks "{key}"', f'{key} = "..."', got)
     if settings.get("units") != "m":
         got = settings.get("units", _misspelt("units", settings))
-        factor = _UNITS_M.get(str(got).lower())
-        scale = (
-            f"scale the COLMAP model, the scan and the ground truth by {factor:g}, and write " if factor else "write "
-        )
+        factor = UNITS_M.get(str(got).lower())
+        by = f"scale the COLMAP model, the scan and the ground truth by {factor:g}, and " if factor else ""
+        scale = f"{'' if factor == 1 else by}write "
         raise refuse("The units are not metres", 'units = "m"', got, f'{scale}units = "m"; see docs/formats.md')
     if "segmentation" not in settings:
         near = _nearest("segmentation", [key for key, value in settings.items() if isinstance(value, dict)])

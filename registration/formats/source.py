@@ -85,3 +85,4 @@ class Format:
     files: str  # the files by which it is recognized, for messages
     detect: Callable[[Path], bool]  # looks at names and first bytes only
     read: Callable[[Path, ReadOptions], SourceCapture]  # raises InputError
+    sequences: bool = False  # whether it holds several frames, so that `ReadOptions.frame` has a meaning

@@ -21,7 +21,7 @@ import tyro
 from registration.errors import InputError
 from registration.storage.files import DiskFull
 from registration.terminal import escaped_output, printable
-from workflows.cli import capture, coregister, farm, model, register, stabilize, store
+from workflows.cli import capture, coregister, farm, importing, model, register, stabilize, store
 from workflows.cli.arguments import (
     PRINT_COMPLETION,
     SHELLS,
@@ -38,6 +38,7 @@ HELP = ("-h", "--help")
 
 GROUPS: Mapping[str, Mapping[str, Command]] = {
     "Capture": {
+        "capture import": importing.import_capture,
         "capture check": capture.check,
         "capture synth": capture.synth,
         "capture degrade": capture.degrade,

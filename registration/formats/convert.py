@@ -1,0 +1,264 @@
+"""Write a capture that a reader of this room returned as a native capture folder (docs/formats.md)."""
+
+import json
+import shutil
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from registration.capture import pixels
+from registration.capture.colmap import write_model
+from registration.capture.native import read_capture
+from registration.capture.native_writer import CaptureDescription, check_new, write_settings
+from registration.capture.scan import SCAN, read_scan
+from registration.errors import InputError
+from registration.formats.plan import ViewPlan, plan_views
+from registration.formats.source import SourceCapture, SourceView, VideoFrame
+from registration.formats.undistort import scaled_world, turned
+from registration.formats.units import world_unit
+from registration.progress import NullProgress, Progress
+from registration.storage.files import atomic_directory, write_json
+from registration.storage.mesh import write_ply
+from registration.storage.reading import open_file
+from registration.types import Camera, Colour
+
+RECORD = "import.json"
+_KIND = "gnm-import"
+_MASK_SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Imported:
+    """What an import wrote.
+
+    Attributes:
+        root: the native capture folder.
+        format: name of the source's format.
+        views: their number.
+        unit_m: metres per unit of the source's world.
+        notes: what was decided or left out.
+    """
+
+    root: Path
+    format: str
+    views: int
+    unit_m: float
+    notes: tuple[str, ...]
+
+
+def import_capture(
+    source: SourceCapture, target: Path, *, unit_m: float | None = None, progress: Progress | None = None
+) -> Imported:
+    """Write a native capture folder, which appears in one rename. One image is in memory at a time.
+
+    Image files whose lens a native camera holds are copied byte for byte, and so are their masks, normals and labels;
+    other views are undistorted (`registration.formats.undistort`).
+
+    Args:
+        source: the capture.
+        target: the folder to write; it must not exist.
+        unit_m: metres per unit of the source's world; None: as its format says, or else estimated.
+        progress: receives one step a view.
+
+    Raises:
+        InputError: `target` exists, a file or camera cannot be used, or the unit is not known. Nothing is written then.
+    """
+    target = Path(target)
+    check_new(target)
+    plans, notes = plan_views(source)
+    unit_m, note = world_unit(source, plans, unit_m)
+    notes = [*source.notes, *notes, *([note] if note else [])]
+    progress = progress or NullProgress()
+    cameras: dict[str, Camera] = {}
+    with atomic_directory(target) as temporary:
+        for number, plan in enumerate(plans):
+            progress.update(number, len(plans), "views imported")
+            cameras[_write_view(temporary, plan, source.classes)] = scaled_world(plan.camera, unit_m)
+        progress.update(len(plans), len(plans), "views imported")
+        write_model(temporary / "sparse", cameras, np.zeros((0, 3)))
+        description = CaptureDescription(
+            subject=source.subject, expression=source.expression, classes=source.classes, tags=source.tags
+        )
+        write_settings(temporary / "capture.toml", description)
+        notes += _write_scan(temporary, source.scan, unit_m)
+        notes += _colour_notes(plans)
+        write_json(temporary / RECORD, _record(source, plans, unit_m, notes))
+        read_capture(temporary)
+    return Imported(root=target, format=source.format, views=len(plans), unit_m=unit_m, notes=tuple(notes))
+
+
+def _write_view(root: Path, plan: ViewPlan, classes: tuple[str, ...]) -> str:
+    """Write the files of a view. Returns its image's name."""
+    view = plan.view
+    suffix = view.image.suffix if plan.as_it_is and isinstance(view.image, Path) else ".png"
+    image = _target(root / "images", view, suffix)
+    if plan.as_it_is and isinstance(view.image, Path):
+        _copy(view.image, image)
+    else:
+        _write_png(image, _through(plan, _decoded(plan)))
+    camera = _source_camera(view)
+    if view.mask is not None:
+        if plan.lens is None and view.mask.suffix.lower() in _MASK_SUFFIXES:
+            _copy(view.mask, _target(root / "masks", view, view.mask.suffix.lower()))
+        else:
+            mask = pixels.read_mask(view.mask, camera)
+            _write_png(_target(root / "masks", view), mask if plan.lens is None else plan.lens.image(mask))
+    if view.normals is not None:
+        normals = _target(root / "normals", view)
+        if plan.lens is None:
+            _copy(view.normals, normals)
+        else:
+            _write_png(normals, _normals(plan, pixels.read_normals(view.normals, camera)))
+    if view.segmentation is not None:
+        labels = _target(root / "segmentation", view)
+        if plan.lens is None:
+            _copy(view.segmentation, labels)
+        else:
+            _write_png(labels, plan.lens.labels(pixels.read_labels(view.segmentation, camera, classes)))
+    if view.landmarks:
+        moved = {name: _landmarks(plan, rows) for name, rows in view.landmarks.items()}
+        text = json.dumps({name: rows.tolist() for name, rows in moved.items()})
+        _target(root / "landmarks", view, ".json").write_text(text, "utf-8")
+    return f"{view.name}{suffix}"
+
+
+def _landmarks(plan: ViewPlan, points: np.ndarray) -> np.ndarray:
+    return points if plan.lens is None else plan.lens.landmarks(points)
+
+
+def _through(plan: ViewPlan, image: np.ndarray) -> np.ndarray:
+    return image if plan.lens is None else plan.lens.image(image)
+
+
+def _decoded(plan: ViewPlan) -> np.ndarray:
+    """The pixels of a view's image at its camera's size, before undistortion."""
+    view = plan.view
+    if isinstance(view.image, VideoFrame):
+        return _video_frame(view, view.image)
+    stored = Camera(
+        width_px=plan.stored_px[0],
+        height_px=plan.stored_px[1],
+        intrinsics=view.intrinsics,
+        T_cam_world=view.T_cam_world,
+    )
+    return turned(pixels.read_image(view.image, stored), plan.orientation)
+
+
+def _video_frame(view: SourceView, frame: VideoFrame) -> np.ndarray:
+    """Decode one frame as (H, W, 3) RGB. All frames before it are passed: seeking is inexact in many files."""
+
+    def refuse(expected: object, got: object) -> InputError:
+        fix = "convert the video to images, or choose another frame with --frame"
+        return InputError("The video frame cannot be read", where=frame.file, expected=expected, got=got, fix=fix)
+
+    open_file(frame.file, refuse).close()
+    video = cv2.VideoCapture(str(frame.file))
+    try:
+        passed = 0
+        while passed < frame.index and video.grab():
+            passed += 1
+        whole, image = video.read() if passed == frame.index else (False, None)
+    finally:
+        video.release()
+    if not whole or image is None:
+        raise refuse(f"frame {frame.index}, counted from 0", f"a video of {passed} frames")
+    if image.shape[:2] != (view.height_px, view.width_px):
+        raise refuse(f"{view.width_px} x {view.height_px} px", f"{image.shape[1]} x {image.shape[0]} px")
+    return np.ascontiguousarray(image[..., ::-1])
+
+
+def _normals(plan: ViewPlan, encoded: np.ndarray) -> np.ndarray:
+    """A normal map through the lens: vectors are averaged, not codes, and keep the camera's frame."""
+    assert plan.lens is not None
+    normals = plan.lens.image(pixels.decode_normals(encoded))
+    length = np.linalg.norm(normals, axis=-1, keepdims=True)
+    result = np.round((normals / np.maximum(length, 1e-6) + 1) / 2 * 65535).astype(np.uint16)
+    result[length[..., 0] < 0.5] = 0  # background, or across an edge of depth
+    return result
+
+
+def _source_camera(view: SourceView) -> Camera:
+    return Camera(
+        width_px=view.width_px, height_px=view.height_px, intrinsics=view.intrinsics, T_cam_world=view.T_cam_world
+    )
+
+
+def _write_scan(root: Path, scan: Path | None, unit_m: float) -> list[str]:
+    """Copy or scale the scan. Returns notes."""
+    if scan is None:
+        return []
+    if scan.suffix.lower() != ".ply":
+        return [f"the scan {scan.name} was left out: only PLY is read; convert it to {SCAN}"]
+    if unit_m == 1:
+        _copy(scan, root / SCAN)
+        return []
+    mesh = read_scan(scan)
+    write_ply(root / SCAN, mesh.vertices * unit_m, mesh.triangles)
+    return ["the scan was scaled to metres: its vertices and triangles were written, without colours"]
+
+
+def _colour_notes(plans: Sequence[ViewPlan]) -> list[str]:
+    names = [plan.view.name for plan in plans if plan.view.colour != Colour()]
+    if not names:
+        return []
+    return [f"colour corrections of {len(names)} views are in {RECORD} and are not applied"]
+
+
+def _record(source: SourceCapture, plans: Sequence[ViewPlan], unit_m: float, notes: Sequence[str]) -> dict[str, Any]:
+    return {
+        "kind": _KIND,
+        "schema": 1,
+        "format": source.format,
+        "source": str(source.root),
+        "unit_m": unit_m,
+        "notes": list(notes),
+        "views": {plan.view.name: _view_record(source, plan) for plan in plans},
+    }
+
+
+def _view_record(source: SourceCapture, plan: ViewPlan) -> dict[str, Any]:
+    view = plan.view
+    video = view.image if isinstance(view.image, VideoFrame) else None
+    image = view.image.file if isinstance(view.image, VideoFrame) else view.image
+    files = {part: getattr(view, part) for part in ("mask", "normals", "segmentation")}
+    named = {part: _name(source, file) for part, file in files.items() if file is not None}
+    record: dict[str, Any] = {"image": _name(source, image), **named}
+    if video is not None:
+        record["frame"] = video.index
+    if plan.orientation != 1:
+        record["turned_by_orientation"] = plan.orientation
+    if plan.lens is not None:
+        record["undistorted"] = {"model": view.distortion.model, "coefficients": list(view.distortion.coefficients)}
+        record["intrinsics"] = view.intrinsics.tolist()
+    if view.colour != Colour():
+        record["colour"] = {name: getattr(view.colour, name) for name in ("encoding", "matrix", "matrix_space", "gain")}
+    return record
+
+
+def _name(source: SourceCapture, file: Path) -> str:
+    """The path below the source's folder, or else the whole one."""
+    absolute = file.absolute()
+    root = source.root.absolute()
+    return absolute.relative_to(root).as_posix() if absolute.is_relative_to(root) else str(file)
+
+
+def _target(folder: Path, view: SourceView, suffix: str = ".png") -> Path:
+    path = folder / f"{view.name}{suffix}"
+    path.parent.mkdir(parents=True, exist_ok=True)
+    return path
+
+
+def _copy(file: Path, target: Path) -> None:
+    refuse = partial(InputError, "A file of the capture cannot be read", where=file, fix="check it, and import again")
+    with open_file(file, refuse) as stream, target.open("wb") as written:
+        shutil.copyfileobj(stream, written, 2**20)
+
+
+def _write_png(path: Path, content: np.ndarray) -> None:
+    if not cv2.imwrite(str(path), content[..., ::-1] if content.ndim == 3 else content):
+        raise OSError(f"{path} cannot be written")
