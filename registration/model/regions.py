@@ -79,6 +79,25 @@ def components(data: GNMData) -> Int[np.ndarray, "V"]:
     return weights.argmax(0)
 
 
+_MATERIALS = {  # of the components that share one; the others' materials have the component's name
+    "left_eye": "eyes",
+    "right_eye": "eyes",
+    "upper_teeth_and_gums": "teeth",
+    "lower_teeth_and_gums": "teeth",
+}
+
+
+def materials(data: GNMData) -> tuple[tuple[str, ...], Int[np.ndarray, "V"]]:
+    """Return the names of the materials (skin, eyes, teeth, tongue) and each vertex' index into them.
+
+    Raises:
+        InputError: a vertex is in no component.
+    """
+    of_component = [_MATERIALS.get(name, name) for name in data.mesh_component_names.tolist()]
+    names = tuple(dict.fromkeys(of_component))
+    return names, np.array([names.index(name) for name in of_component])[components(data)]
+
+
 def solids(data: GNMData) -> dict[str, Int[np.ndarray, "_ 3"]]:
     """Triangles of the parts that must not intersect: skin, left eye, right eye, teeth with their gums, tongue."""
     upper, lower = "upper_teeth_and_gums", "lower_teeth_and_gums"

@@ -21,7 +21,7 @@ import tyro
 from registration.errors import InputError
 from registration.storage.files import DiskFull
 from registration.terminal import escaped_output, printable
-from workflows.cli import capture, coregister, farm, importing, model, register, stabilize, store
+from workflows.cli import capture, coregister, export, farm, importing, model, register, stabilize, store
 from workflows.cli.arguments import (
     PRINT_COMPLETION,
     SHELLS,
@@ -51,6 +51,7 @@ GROUPS: Mapping[str, Mapping[str, Command]] = {
         "evaluate": register.evaluate,
         "stabilize": stabilize.stabilize,
         "stabilize review": stabilize.review,
+        "export": export.export,
     },
     "Model": {
         "coregister": coregister.coregister,

@@ -1,0 +1,58 @@
+"""`gnmreg export`: what it writes and prints, and what it refuses."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+
+from tests.registration.export.heads import MODEL, a_folder
+from workflows.cli.app import main
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return a_folder(tmp_path_factory.mktemp("export") / "neutral")
+
+
+def test_a_registration_is_exported_and_the_files_are_named(folder: Path, tmp_path: Path, capsys) -> None:
+    out = tmp_path / "new" / "head.obj"
+    assert main(["export", str(folder), str(out)]) == 0
+    assert capsys.readouterr().out.split() == [str(out), str(out.with_suffix(".png")), str(out.with_suffix(".mtl"))]
+    assert main(["export", str(folder), str(out)]) == 2
+    assert "--force" in capsys.readouterr().err
+    assert main(["export", str(folder), str(out), "--force"]) == 0
+    assert main(["export", str(folder), str(tmp_path / "head.glb"), "--model", str(MODEL)]) == 0
+    assert "does not hold the quads" in capsys.readouterr().out
+
+
+def test_a_model_is_exported(tmp_path: Path) -> None:
+    assert main(["export", str(MODEL), str(tmp_path / "template.ply")]) == 0
+    assert np.isfinite(trimesh.load(tmp_path / "template.ply").vertices).all()
+
+
+def test_sources_that_are_none_are_refused(folder: Path, tmp_path: Path, capsys) -> None:
+    for source, message in (
+        (tmp_path, "There is nothing to export"),
+        (tmp_path / "missing", "There is nothing to export"),
+        (folder / "texture.png", "head model"),
+    ):
+        assert main(["export", str(source), str(tmp_path / "head.glb")]) == 2
+        assert message in capsys.readouterr().err
+    assert main(["export", str(folder), str(tmp_path / "head.xyz")]) == 2
+    assert ".glb" in capsys.readouterr().err
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_model_that_is_gone_is_asked_for(tmp_path: Path, capsys) -> None:
+    lost = a_folder(tmp_path / "neutral", inputs={"model": "ab" * 32}, provenance={"model": str(tmp_path / "gone.npz")})
+    assert main(["export", str(lost), str(tmp_path / "head.glb")]) == 2
+    assert "--model" in capsys.readouterr().err
+    assert main(["export", str(lost), str(tmp_path / "head.glb"), "--model", str(MODEL)]) == 0
+
+
+def test_a_failed_registration_needs_a_word(tmp_path: Path, capsys) -> None:
+    failed = a_folder(tmp_path / "failed", status="failed", reason="the mesh moved")
+    assert main(["export", str(failed), str(tmp_path / "head.glb")]) == 2
+    assert "the mesh moved" in capsys.readouterr().err
+    assert main(["export", str(failed), str(tmp_path / "head.glb"), "--accept-failed"]) == 0
