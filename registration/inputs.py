@@ -10,6 +10,7 @@ from jaxtyping import Float
 
 from registration.capture.native import read_capture
 from registration.capture.origin import capture_origin
+from registration.capture.scan import Scan, read_scan
 from registration.capture.triangulation import triangulate
 from registration.doctor.ledger import Ledger
 from registration.doctor.validation import validate_capture
@@ -46,6 +47,7 @@ class RegistrationInputs:
     landmarks: Mapping[str, Float[np.ndarray, "L 3"]]  # triangulated, world; of the shared schemes
     recipe: Recipe
     neutral: Registration | None
+    scan: Scan | None  # whose normals stand in for normal maps, or whose surface is fitted; None: neither
     digests: Mapping[str, str]  # input -> sha256
     config: Mapping[str, Any]  # the resolved options; decide the result together with the digests
 
@@ -71,7 +73,7 @@ def read_inputs(
     """
     recipe = load_recipe(options.recipe)
     capture = read_capture(capture_path)
-    ledger = validate_capture(capture)
+    ledger = validate_capture(capture, use_scan=options.use_scan != "never")
     selected = _select_views(capture, options.views)
     data = gnm_npz.read(model_path)
     _check_model(data)
@@ -93,6 +95,7 @@ def read_inputs(
         landmarks=landmarks,
         recipe=recipe if start is None else expression_recipe(recipe),
         neutral=start,
+        scan=_scan_of_the_fit(selected, options),
         digests=digests,
         config=config,
     )
@@ -160,6 +163,14 @@ def _select_views(capture: Capture, count: int | None) -> Capture:
         raise InputError("Too few views", where="views", expected="at least 2", got=count, fix="use at least two views")
     selected = select_spread_views([view.camera for view in capture.views], count)
     return replace(capture, views=tuple(capture.views[i] for i in selected))
+
+
+def _scan_of_the_fit(capture: Capture, options: RegisterOptions) -> Scan | None:
+    """The scan if the fit uses its normals or its surface."""
+    if capture.scan is None or options.use_scan == "never":
+        return None
+    needed = options.use_scan == "always" or any(view.normals is None for view in capture.views)
+    return read_scan(capture.scan) if needed else None
 
 
 def _triangulated(capture: Capture, schemes: Mapping[str, LandmarkScheme]) -> dict[str, Float[np.ndarray, "L 3"]]:

@@ -64,6 +64,9 @@ class RegisterOptions:
         seed: Seed of the view subsets and of the silhouette samples.
         deterministic: Make every array equal from run to run on the CPU, in about twice the time.
         variant: Render on the CPU (llvm) or on an NVIDIA GPU (cuda).
+        use_scan: Whether the capture's scan takes part in the fit. auto: its normals, in views without normal maps,
+            and its surface, if no view has normal maps. always: its surface beside normal maps too. never: the scan
+            is only measured, so that its distances judge the fit.
         landmark_files: The model's vertices of landmark schemes, instead of the files next to the model.
     """
 
@@ -72,6 +75,7 @@ class RegisterOptions:
     seed: Annotated[int, arg(metavar="S")] = 0
     deterministic: bool = False
     variant: Literal["llvm", "cuda"] = "llvm"
+    use_scan: Literal["auto", "always", "never"] = "auto"
     landmark_files: Annotated[Mapping[str, Path], _LANDMARK_FILES, _LANDMARKS_ARGUMENT] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -89,6 +93,7 @@ class RegisterOptions:
                 words += [name, str(value)]
         words += ["--deterministic"] if self.deterministic else []
         words += ["--variant", self.variant] if self.variant != default.variant else []
+        words += ["--use-scan", self.use_scan] if self.use_scan != default.use_scan else []
         if self.landmark_files:
             words += ["--landmarks", *(f"{scheme}={file}" for scheme, file in sorted(self.landmark_files.items()))]
         return words

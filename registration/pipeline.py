@@ -27,6 +27,7 @@ from registration.fit.problem import FitProblem, FitTrace, assess, refine
 from registration.fit.recipes import Stage
 from registration.fit.variables import InitialGuess, initial_guess_from
 from registration.fit.view_weights import ViewErrors
+from registration.geometry.surface_views import SurfaceViews
 from registration.inputs import RegistrationInputs, read_inputs
 from registration.model.atlas import texture_atlas
 from registration.model.gnm import GNM
@@ -158,12 +159,18 @@ def _fit(
 def _context(inputs: RegistrationInputs, seed: int, device: torch.device, progress: Progress) -> FitContext:
     """Decode the views and collect the inputs of the fit."""
     classes, recipe, count = class_map(inputs.capture.classes), inputs.recipe, len(inputs.capture.views)
+    capture = inputs.capture.cameras_relative_to(inputs.origin)
+    surface = None
+    if inputs.scan is not None and len(inputs.scan.triangles):
+        cameras = [view.camera for view in capture.views]
+        surface = SurfaceViews(inputs.scan.vertices - inputs.origin, inputs.scan.triangles, cameras)
     pyramid = build_pyramid(
-        inputs.capture.cameras_relative_to(inputs.origin),
+        capture,
         classes,
         finest_head_px=recipe.finest_head_px,
         levels=recipe.levels,
         head_rows=inputs.ledger.head_rows,
+        surface=surface,
         progress=lambda done: progress.update(done, count, "reading views"),
     )
     return FitContext(

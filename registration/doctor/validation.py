@@ -20,6 +20,7 @@ from registration.doctor import (
 from registration.doctor.ledger import Channel, Ledger, require_weight, take_stock
 from registration.doctor.scan_checks import scan_warnings
 from registration.doctor.scan_frame import require_frames
+from registration.doctor.scan_normals import scan_normals
 from registration.errors import InputError
 from registration.types import Capture, View
 
@@ -27,12 +28,16 @@ EYE_DISTANCE_M = (0.05, 0.15)  # between the outer corners; adults have 0.08 to 
 OUTER_EYES = (36, 45)  # of the 68 scheme
 
 
-def validate_capture(capture: Capture) -> Ledger:
+def validate_capture(capture: Capture, *, use_scan: bool = True) -> Ledger:
     """Check a capture before it is registered: the headers of all views first, then contents.
 
     Masks and label maps are decoded whole. Images of more than `samples.MAX_DECODED_PIXELS` are only checked for
     truncation, and so are all but some normal maps of more; other damage is reported when the views are decoded for the
     fit.
+
+    Args:
+        capture: as read.
+        use_scan: whether the scan's normals stand in for missing normal maps.
 
     Returns:
         What of the capture counts, and what may be wrong with it.
@@ -68,9 +73,15 @@ def validate_capture(capture: Capture) -> Ledger:
     warnings += require_weight(capture, channels)
     warnings += exchanged.exchanged_views(capture, samples, points)
     warnings += landmark_checks.unnamed_schemes(capture)
-    warnings += [] if scan is None else scan_warnings(capture, scan, points)
+    rows = [_scan_channel(capture, scan)]
+    if scan is not None:
+        warnings += scan_warnings(capture, scan, points)
+        if use_scan:
+            row, found = scan_normals(capture, samples, scan)
+            rows += [] if row is None else [row]
+            warnings += found
     return Ledger(
-        channels=(*channels, _scan_channel(capture, scan)),
+        channels=(*channels, *rows),
         warnings=tuple(warnings),
         unread=tuple(leftovers.warnings(capture, files)),
         coverage={sample.name: sample.coverage for sample in samples},

@@ -14,6 +14,7 @@ from jaxtyping import Bool, Float
 
 from registration.capture.pixels import read_view, undistort_landmarks
 from registration.capture.samples import sample_views
+from registration.geometry.surface_views import SurfaceViews
 from registration.targets.classes import BACKGROUND, ClassMap
 from registration.types import Camera, Capture, Pixels, Targets, View, ViewPixels
 
@@ -36,10 +37,11 @@ class _ViewCrop:
     neck: Float[np.ndarray, "H W"]  # coverage, as the next
     excluded: Float[np.ndarray, "H W"]
     valid: Float[np.ndarray, "H W"]
+    incidence: Float[np.ndarray, "H W"]  # cosine, where it is known without normals; else 1
     landmarks: Mapping[str, Float[np.ndarray, "L 3"]]
     has_mask: bool
     has_classes: bool
-    has_normals: bool
+    has_normals: bool  # from a file: colours count where these do
     head_px: float
 
 
@@ -50,6 +52,7 @@ def build_pyramid(
     finest_head_px: int,
     levels: int,
     head_rows: Mapping[str, int] | None = None,
+    surface: SurfaceViews | None = None,
     progress: Callable[[int], None] = lambda done: None,
 ) -> tuple[Targets, ...]:
     """Return the targets of all views from fine to coarse; each level has half the resolution of the one before.
@@ -62,6 +65,7 @@ def build_pyramid(
         levels: how many.
         head_rows: height of the head in each view, px of the stored image, by the view's name, as the ledger of a
             validated capture has it; None: masks and labels are decoded once more to measure it.
+        surface: of the subject, in the cameras' world: its normals stand in for normal maps where a view has none.
         progress: called with the number of views that are decoded.
 
     Raises:
@@ -74,7 +78,8 @@ def build_pyramid(
     crops = []
     for done, view in enumerate(capture.views):
         progress(done)
-        crops.append(_view_crop(view, capture, mapping, min(downsample, view.camera.width_px, view.camera.height_px)))
+        crop = _view_crop(view, capture, mapping, min(downsample, view.camera.width_px, view.camera.height_px))
+        crops.append(crop if crop.has_normals or surface is None else _with_surface(crop, surface))
     block = 2 ** (levels - 1)
     height, width = (
         -(-max(crop.mask.shape[axis] for crop in crops) // block) * block for axis in (0, 1)
@@ -116,6 +121,7 @@ def _view_crop(view: View, capture: Capture, mapping: ClassMap, downsample: int)
         neck=neck,
         excluded=excluded,
         valid=pixels.valid,
+        incidence=zeros + 1,
         landmarks=landmarks,
         has_mask=mask is not None,
         has_classes=pixels.label_coverage is not None,
@@ -123,6 +129,15 @@ def _view_crop(view: View, capture: Capture, mapping: ClassMap, downsample: int)
         head_px=float(shape[0]),
     )
     return _crop_to_head(full)
+
+
+def _with_surface(crop: _ViewCrop, surface: SurfaceViews) -> _ViewCrop:
+    """A crop with the normals of a surface; colours count beside it too, where it has holes."""
+    view = surface.view(crop.camera)
+    normals = (view.normals * (view.weight > 0)[..., None]).astype(np.float32)
+    towards = -(_directions(crop.camera) * view.normals).sum(-1)  # below 0 behind a hole
+    incidence = np.where(towards > 0, towards, 1).astype(np.float32)
+    return replace(crop, normals=normals, incidence=incidence)
 
 
 def _coverage(pixels: ViewPixels, capture: Capture) -> Float[np.ndarray, "H W"] | None:
@@ -226,7 +241,7 @@ def _apply_weights(crop: _ViewCrop) -> dict[str, np.ndarray]:
     return {
         "normals": normals,
         "normal_weight": facing,
-        "rgb_weight": core * (facing if crop.has_normals else 1.0),
+        "rgb_weight": core * (facing if crop.has_normals else crop.incidence),
         "mask_weight": _silhouette_weight(crop) * valid if crop.has_mask else 0 * valid,
         "class_weight": inside * (crop.classes.sum(-1) > 0.5),
     }

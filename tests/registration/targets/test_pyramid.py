@@ -10,6 +10,7 @@ from scipy.ndimage import distance_transform_edt
 
 from registration.capture.native import read_capture
 from registration.capture.native_writer import CaptureDescription, ViewArrays, write_capture
+from registration.geometry.surface_views import SurfaceViews
 from registration.targets.classes import class_map
 from registration.targets.pyramid import build_pyramid
 from registration.types import Targets
@@ -295,3 +296,30 @@ def test_a_mask_larger_than_the_labels_does_not_count_the_neck_as_head(tmp_path)
         assert not weight[of_neck].any() and (weight[of_head] == 1).all() and not classes[ring].any()
         unlabelled += of_head.sum()
     assert unlabelled > 100
+
+
+def test_a_surface_stands_in_for_missing_normal_maps(capture, pyramid):
+    """Its normals are those of the maps where it is seen well; at a hole there are none, but colours count."""
+    ball = small.ball()
+    from_front = np.linalg.norm(ball.vertices[ball.triangles].mean(1) - [0, 0, small.RADIUS_M], axis=1)
+    triangles = ball.triangles[from_front > 0.02]  # with a hole
+    without = replace(capture, views=tuple(replace(view, normals=None) for view in capture.views))
+    surface = SurfaceViews(ball.vertices, triangles, [view.camera for view in capture.views])
+    settings = {"finest_head_px": 10_000, "levels": LEVELS, "surface": surface}
+    found = build_pyramid(without, class_map(CLASSES), **settings)[0]
+    normals, weights = images(found, "normals"), images(found, "normal_weight")[..., 0]
+    expected, known = images(pyramid[0], "normals"), images(pyramid[0], "normal_weight")[..., 0]
+    colours, bare = images(found, "rgb_weight")[..., 0], 0
+    for number, camera in enumerate(found.pixels.cameras):
+        world, depth = world_directions(camera)
+        hole = np.linalg.norm(world * small.RADIUS_M - [0, 0, small.RADIUS_M], axis=-1) < 0.018
+        inside = (depth > 0) & (known[number] > 0)
+        assert not weights[number][hole].any()
+        bare += (hole & inside & (colours[number] > 0)).sum()
+        both = inside & (weights[number] > 0)
+        assert both.sum() > 0.5 * inside.sum()
+        np.testing.assert_allclose(normals[number][both], expected[number][both], atol=0.05)
+        np.testing.assert_allclose(weights[number][both], known[number][both], atol=0.05)
+    assert bare > 50
+    for mine, theirs in zip(build_pyramid(capture, class_map(CLASSES), **settings), pyramid, strict=True):
+        assert torch.equal(mine.normals, theirs.normals) and torch.equal(mine.rgb_weight, theirs.rgb_weight)
