@@ -101,6 +101,11 @@ class NpzSchema:
             raise self.error(defect, file)
         return arrays
 
+    def names(self, file: Path) -> tuple[str, ...]:
+        """Return the names of a file's arrays, whether they are in the schema or not. Raises InputError as `read`."""
+        with open_file(file, partial(InputError.unreadable, self.title, where=file, fix=self.fix)) as stream:
+            return self._members(file, stream).names
+
     def find_defect(
         self,
         arrays: Mapping[str, ArrayHeader],
