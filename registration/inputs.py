@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from registration.capture.jaw_order import has_reversed_jaw, with_corrected_jaw
 from registration.capture.native import read_capture
 from registration.capture.origin import capture_origin
 from registration.capture.scan import Scan, read_scan
@@ -21,6 +22,7 @@ from registration.fit.variables import pivot
 from registration.geometry.topology import edges
 from registration.model import gnm_npz
 from registration.model.atlas import texture_atlas
+from registration.model.jaw_order import SCHEME
 from registration.model.landmarks import LandmarkScheme, read_scheme, schemes_beside
 from registration.model.regions import vertex_classes
 from registration.options import RegisterOptions
@@ -39,7 +41,7 @@ NOT_HASHED = {  # fields of the options that decide nothing by themselves, and w
 class RegistrationInputs:
     """The inputs of a registration, read and checked."""
 
-    capture: Capture  # with the selected views only
+    capture: Capture  # with the selected views only, and its landmarks in the schemes' order
     ledger: Ledger  # of all views
     data: gnm_npz.GNMData
     schemes: Mapping[str, LandmarkScheme]
@@ -50,6 +52,7 @@ class RegistrationInputs:
     scan: Scan | None  # whose normals stand in for normal maps, or whose surface is fitted; None: neither
     digests: Mapping[str, str]  # input -> sha256
     config: Mapping[str, Any]  # the resolved options; decide the result together with the digests
+    notes: tuple[str, ...]  # what is not used, or was read in another way than it is in the files
 
     @property
     def input_hash(self) -> str:
@@ -98,6 +101,7 @@ def read_inputs(
         scan=_scan_of_the_fit(selected, options),
         digests=digests,
         config=config,
+        notes=(*data.remarks, *_reversed_files(capture, schemes)),
     )
 
 
@@ -107,8 +111,9 @@ def read_schemes(model_path: Path, data: gnm_npz.GNMData, files: Mapping[str, Pa
     Raises:
         InputError: a file that cannot be read as a scheme of this model.
     """
-    count = len(data.template_vertex_positions)
-    return schemes_beside(model_path, count) | {name: read_scheme(file, count, name) for name, file in files.items()}
+    template = data.template_vertex_positions
+    given = {name: read_scheme(file, template, name) for name, file in files.items()}
+    return schemes_beside(model_path, template) | given
 
 
 def input_hash(
@@ -155,8 +160,20 @@ def _deciding(
     return digests, {**config, "views": [view.name for view in selected.views]}
 
 
+def _reversed_files(capture: Capture, schemes: Mapping[str, LandmarkScheme]) -> tuple[str, ...]:
+    """The user's files whose jaw is in the reverse order, if any."""
+    files = [f"the model's scheme {name}" for name, scheme in schemes.items() if scheme.reversed_in_file]
+    files += ["the capture's landmarks 68"] if SCHEME in schemes and has_reversed_jaw(capture) else []
+    order = "points 2-6 of the right jaw in reverse, as Google's first file had them; read in the scheme's order"
+    return tuple(f"{file}: {order}" for file in files)
+
+
 def _select_views(capture: Capture, count: int | None) -> Capture:
-    """The capture with only `count` views, spread around the head; with all of them for None."""
+    """The capture with only `count` views, spread around the head; with all of them for None.
+
+    Its landmarks are in the order of the model's schemes.
+    """
+    capture = with_corrected_jaw(capture)
     if count is None:
         return capture
     if count < 2:

@@ -137,7 +137,7 @@ def _fit(
     context = _context(inputs, seed, device, progress)
     targets_time = time.perf_counter()
     initial = _initial_guess(inputs, context, progress)
-    for note in initial.notes:
+    for note in (*inputs.notes, *initial.notes):
         progress.message(note)
     problem = FitProblem(context, initial)
     initial_time = time.perf_counter()
@@ -287,7 +287,7 @@ def _collect(inputs: RegistrationInputs, fitted: _Fitted, comparison: Comparison
             "landmark_residual_px": landmark_px,
             "camera_gains": problem.appearance.gains.cpu().numpy().round(4).tolist(),
             "views_not_trusted": dict(problem.view_weights.notes),
-            "notes": list(fitted.initial.notes),
+            "notes": [*inputs.notes, *fitted.initial.notes],
             **({"warnings": list(inputs.ledger.warnings)} if inputs.ledger.warnings else {}),
             "residuals": comparison.residuals,
         },

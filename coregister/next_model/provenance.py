@@ -98,7 +98,7 @@ def write(
     """
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
-    for scheme in landmarks.schemes_beside(previous, len(data.template_vertex_positions)).values():
+    for scheme in landmarks.schemes_beside(previous, data.template_vertex_positions).values():
         landmarks.write_scheme(scheme, path)
     if coefficients is not None:
         arrays = {"mean": coefficients.mean, "covariance": coefficients.covariance}

@@ -70,7 +70,7 @@ def synthesize_capture(
         root,
         data=data,
         vertices=vertices,
-        schemes=schemes_beside(model, len(data.template_vertex_positions)),
+        schemes=schemes_beside(model, data.template_vertex_positions),
         subject=f"synth_{seed:04d}",
         expression=expression,
         tags={**person.tags, "category": performed.category, **(tags or {})},

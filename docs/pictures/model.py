@@ -279,7 +279,7 @@ def main() -> None:
     parser.add_argument("out", type=Path)
     arguments = parser.parse_args()
     data = gnm_npz.read(arguments.model)
-    schemes = schemes_beside(arguments.model, len(data.template_vertex_positions))
+    schemes = schemes_beside(arguments.model, data.template_vertex_positions)
     faces = data.triangles[without_corneas(data)]
     moved = units(data)
     arguments.out.mkdir(parents=True, exist_ok=True)

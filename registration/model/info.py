@@ -41,7 +41,7 @@ def describe(path: Path, picture: Path | None = None, console: Console | None = 
     if picture is not None:
         check_output_file(Path(picture))
     data = gnm_npz.read(path)
-    schemes = landmarks.schemes_beside(path, len(data.template_vertex_positions))
+    schemes = landmarks.schemes_beside(path, data.template_vertex_positions)
     title = f"  GNM {data.variant} {data.version}  sha256 {gnm_npz.content_hash(data)[:12]}"
     console.print(Text.assemble((str(path), "bold"), title))
     for table in (_dimensions(data), _parts(data), _joints(data), _regions(data)):

@@ -1,6 +1,6 @@
 """Landmark schemes of a model: named lists of points on its surface, each the weighted mean of three vertices."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import overload
@@ -11,6 +11,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from registration.errors import InputError
+from registration.model import jaw_order
 from registration.storage.reading import read_text
 
 _PREFIX = "head_sparse_"
@@ -19,11 +20,15 @@ _FIX = "write one landmark a row as `i0 w0 i1 w1 i2 w2`: vertex indices from 0, 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class LandmarkScheme:
-    """L points on the surface, in the order of the scheme's file; captures must have the same order."""
+    """L points on the surface, in the order of the scheme's file; captures must have the same order.
+
+    The scheme of 68 points is in the corrected order (`registration.model.jaw_order`), whatever its file's is.
+    """
 
     name: str  # "68" for head_sparse_68.txt
     indices: Int[np.ndarray, "L 3"]
     weights: Float[np.ndarray, "L 3"]  # rows sum to 1
+    reversed_in_file: bool = field(default=False, metadata={"not_hashed": "the points are in the corrected order"})
 
     @overload
     def points(self, vertices: Float[np.ndarray, "*B V 3"]) -> Float[np.ndarray, "*B L 3"]: ...
@@ -37,18 +42,18 @@ class LandmarkScheme:
         return (vertices[..., self.indices, :] * self.weights.astype(vertices.dtype)[..., None]).sum(-2)
 
 
-def read_scheme(path: Path, vertex_count: int, name: str | None = None) -> LandmarkScheme:
+def read_scheme(path: Path, template: Float[np.ndarray, "V 3"], name: str | None = None) -> LandmarkScheme:
     """Read a scheme from a text file of rows `i0 w0 i1 w1 i2 w2`.
 
     Args:
         path: the file.
-        vertex_count: number of the model's vertices.
+        template: the model's template vertices, metres; tell the order of the rows of scheme 68.
         name: of the scheme; None: NAME of the file `head_sparse_NAME.txt`.
 
     Raises:
         InputError: the file has other rows, a vertex index is out of range, or weights do not sum to one.
     """
-    path = Path(path)
+    path, vertex_count = Path(path), len(template)
     text = read_text(path, partial(InputError, "The landmark scheme cannot be read", where=path, fix=_FIX))
     try:
         rows = [[float(word) for word in line.split()] for line in text.splitlines() if line.strip()]
@@ -71,13 +76,18 @@ def read_scheme(path: Path, vertex_count: int, name: str | None = None) -> Landm
         raise _input_error("has wrong weights", path, "three weights that sum to 1", got)
     weights = weights / weights.sum(1, keepdims=True)  # the files round to three digits
     name = name or path.stem.removeprefix(_PREFIX)
-    return LandmarkScheme(name=name, indices=indices.astype(np.int64), weights=weights)
+    indices = indices.astype(np.int64)
+    scheme = LandmarkScheme(name=name, indices=indices, weights=weights)
+    if name != jaw_order.SCHEME or not jaw_order.is_reversed(scheme.points(template.astype(np.float64))):
+        return scheme
+    order = jaw_order.TURNED
+    return replace(scheme, indices=indices[order], weights=weights[order], reversed_in_file=True)
 
 
-def schemes_beside(model_path: Path, vertex_count: int) -> dict[str, LandmarkScheme]:
+def schemes_beside(model_path: Path, template: Float[np.ndarray, "V 3"]) -> dict[str, LandmarkScheme]:
     """Read all schemes `head_sparse_NAME.txt` in the model file's folder, by name. Raises InputError."""
     files = sorted(Path(model_path).parent.glob(f"{_PREFIX}*.txt"))
-    return {scheme.name: scheme for scheme in (read_scheme(file, vertex_count) for file in files)}
+    return {scheme.name: scheme for scheme in (read_scheme(file, template) for file in files)}
 
 
 def write_scheme(scheme: LandmarkScheme, model_path: Path) -> Path:

@@ -67,9 +67,13 @@ def hash_fields(value: Any) -> str:
 
 
 def hashed_fields(value: Any, not_hashed: Mapping[str, str] | None = None) -> dict[str, Any]:
-    """The fields of a dataclass that decide a result, by name: all but those of `NOT_HASHED` and `not_hashed`."""
+    """The fields of a dataclass that decide a result, by name: all but those of `NOT_HASHED` and `not_hashed`.
+
+    A field may also say `not_hashed` itself, with the reason, in its metadata.
+    """
     excluded = {name for kind, names in NOT_HASHED.items() if isinstance(value, kind) for name in names}
     excluded |= set(not_hashed or {})
+    excluded |= {f.name for f in fields(value) if "not_hashed" in f.metadata}
     return {f.name: getattr(value, f.name) for f in fields(value) if f.name not in excluded}
 
 

@@ -51,7 +51,7 @@ ORAL_MIRROR_LANDMARKS = {**{n: 5 - n for n in range(3)}, **{6 + n: 11 - n for n 
 
 @pytest.fixture(scope="module")
 def schemes(model_file, model):
-    return schemes_beside(model_file, len(model.template_vertex_positions))
+    return schemes_beside(model_file, model.template_vertex_positions)
 
 
 def own_quads(model, component):

@@ -152,7 +152,7 @@ def test_coefficients_and_landmark_schemes_are_written_beside_the_file(built: Bu
     assert names.tolist() == built.data.expression_names[: len(names)].tolist()
     assert mean.shape == (len(names),) and covariance.shape == (len(names),) * 2
     assert np.linalg.eigvalsh(covariance).min() > -1e-9
-    assert sorted(landmarks.schemes_beside(files, len(built.data.template_vertex_positions))) == ["68", "dense", "oral"]
+    assert sorted(landmarks.schemes_beside(files, built.data.template_vertex_positions)) == ["68", "dense", "oral"]
 
 
 def test_building_is_deterministic(built: BuiltModel, subjects, model):

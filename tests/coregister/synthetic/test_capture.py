@@ -25,7 +25,7 @@ from registration.render.studio.shoot import Quality, Sensor
 from tests.conftest import FIXTURES
 
 TINY = gnm_npz.read(FIXTURES / "tiny_gnm.npz")
-SCHEMES = {"68": read_scheme(FIXTURES / "head_sparse_68.txt", len(TINY.template_vertex_positions))}
+SCHEMES = {"68": read_scheme(FIXTURES / "head_sparse_68.txt", TINY.template_vertex_positions)}
 SMALL = Studio(
     cameras=6,
     size_px=(144, 216),

@@ -30,7 +30,7 @@ ROTATION = Rotation.from_rotvec([0.4, -1.9, 0.7]).as_matrix()
 
 @pytest.fixture(scope="module")
 def scheme() -> LandmarkScheme:
-    return read_scheme(FIXTURES / "head_sparse_68.txt", len(tiny_model().template_vertex_positions), "68")
+    return read_scheme(FIXTURES / "head_sparse_68.txt", tiny_model().template_vertex_positions, "68")
 
 
 def truth(scale: float) -> InitialGuess:

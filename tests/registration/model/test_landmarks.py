@@ -1,9 +1,12 @@
+from pathlib import Path
+
 import numpy as np
 import pytest
 import torch
 
 from registration.errors import InputError
-from registration.model import landmarks
+from registration.model import jaw_order, landmarks
+from registration.storage.hashing import hash_fields
 from tests.conftest import SHARED, needs_shared
 from tests.fixtures.make_fixtures import HERE, tiny_model
 
@@ -13,7 +16,7 @@ TINY = HERE / "head_sparse_68.txt"
 def test_points_are_weighted_means(tmp_path):
     path = tmp_path / "head_sparse_two.txt"
     path.write_text("0 0.25 1 0.75 2 0\n\n3 1 3 0 3 0\n")
-    scheme = landmarks.read_scheme(path, 4)
+    scheme = landmarks.read_scheme(path, np.zeros((4, 3)))
     vertices = np.random.default_rng(0).normal(size=(2, 4, 3))
     expected = np.stack([0.25 * vertices[:, 0] + 0.75 * vertices[:, 1], vertices[:, 3]], 1)
     assert scheme.name == "two"
@@ -29,7 +32,7 @@ def test_points_are_weighted_means(tmp_path):
 def test_rounded_weights_are_normalized_to_sum_to_one(tmp_path):
     path = tmp_path / "head_sparse_a.txt"
     path.write_text("0 0.333 1 0.333 2 0.333\n")
-    np.testing.assert_allclose(landmarks.read_scheme(path, 3).weights.sum(1), 1)
+    np.testing.assert_allclose(landmarks.read_scheme(path, np.zeros((3, 3))).weights.sum(1), 1)
 
 
 @pytest.mark.parametrize(
@@ -50,21 +53,21 @@ def test_bad_files_are_refused(tmp_path, text, message):
     path = tmp_path / "head_sparse_x.txt"
     path.write_text(text, encoding="utf-8")
     with pytest.raises(InputError) as caught:
-        landmarks.read_scheme(path, 9)
+        landmarks.read_scheme(path, np.zeros((9, 3)))
     assert message in str(caught.value) and str(path) in str(caught.value)
 
 
 def test_a_missing_file_is_refused(tmp_path):
     with pytest.raises(InputError, match="cannot be read"):
-        landmarks.read_scheme(tmp_path / "head_sparse_x.txt", 9)
+        landmarks.read_scheme(tmp_path / "head_sparse_x.txt", np.zeros((9, 3)))
 
 
 def test_schemes_in_the_folder_of_a_model(tmp_path):
-    assert landmarks.schemes_beside(tmp_path / "model.npz", 10) == {}
+    assert landmarks.schemes_beside(tmp_path / "model.npz", np.zeros((10, 3))) == {}
     for name in ("5", "68"):
         (tmp_path / f"head_sparse_{name}.txt").write_text("0 1 1 0 2 0\n")
-    assert list(landmarks.schemes_beside(tmp_path / "model.npz", 10)) == ["5", "68"]
-    assert landmarks.read_scheme(tmp_path / "head_sparse_5.txt", 10, name="mine").name == "mine"
+    assert list(landmarks.schemes_beside(tmp_path / "model.npz", np.zeros((10, 3)))) == ["5", "68"]
+    assert landmarks.read_scheme(tmp_path / "head_sparse_5.txt", np.zeros((10, 3)), name="mine").name == "mine"
 
 
 def check_68(points: np.ndarray) -> None:
@@ -77,20 +80,43 @@ def check_68(points: np.ndarray) -> None:
 
 def test_tiny_head():
     data = tiny_model()
-    points = landmarks.read_scheme(TINY, len(data.template_vertex_positions)).points(data.template_vertex_positions)
+    points = landmarks.read_scheme(TINY, data.template_vertex_positions).points(data.template_vertex_positions)
     check_68(points)
     np.testing.assert_allclose(points[16::-1] * (-1, 1, 1), points[:17], atol=2e-3)
 
 
+def reverse_rows(source: Path, target: Path) -> None:
+    """Write a scheme of 68 points with rows 2 to 6 in the reverse order, as Google's first file has them."""
+    rows = source.read_text().splitlines()
+    target.write_text("\n".join([*rows[:2], *rows[6:1:-1], *rows[7:]]) + "\n")
+
+
+def test_both_orders_of_the_right_jaw_are_read_as_one(tmp_path):
+    data = tiny_model()
+    corrected = landmarks.read_scheme(TINY, data.template_vertex_positions)
+    assert not corrected.reversed_in_file
+    reverse_rows(TINY, tmp_path / TINY.name)
+    scheme = landmarks.schemes_beside(tmp_path / "model.npz", data.template_vertex_positions)["68"]
+    assert scheme.reversed_in_file
+    np.testing.assert_array_equal(scheme.indices, corrected.indices)
+    np.testing.assert_array_equal(scheme.weights, corrected.weights)
+    assert hash_fields(scheme) == hash_fields(corrected)
+    (tmp_path / "new").mkdir()
+    landmarks.write_scheme(scheme, tmp_path / "new" / "model.npz")  # in the corrected order
+    assert not landmarks.read_scheme(tmp_path / "new" / TINY.name, data.template_vertex_positions).reversed_in_file
+    assert not landmarks.read_scheme(tmp_path / TINY.name, data.template_vertex_positions, "other").reversed_in_file
+
+
 @needs_shared
-def test_full_head_keeps_the_file_order():
-    """The official file lists rows 2-6 of the jaw from chin to ear; the reader must not reorder them silently."""
+def test_the_full_head_is_read_in_the_corrected_order():
     folder = SHARED / "data" / "gnm"
     with np.load(folder / "gnm_head_reconstructed.npz") as archive:
         vertices = archive["template_vertex_positions"]
-    schemes = landmarks.schemes_beside(folder / "gnm_head_reconstructed.npz", len(vertices))
-    points = schemes["68"].points(vertices)
+    scheme = landmarks.schemes_beside(folder / "gnm_head_reconstructed.npz", vertices)["68"]
+    points = scheme.points(vertices)
     check_68(points)
-    assert (np.diff(points[2:7, 1]) > 0).all() and (np.diff(points[10:16, 1]) > 0).all()
+    assert scheme.reversed_in_file
+    assert (np.diff(points[:9, 1]) < 0).all() and (np.diff(points[9:16, 1]) > 0).all()
+    assert np.linalg.norm(np.diff(points[:17], axis=0), axis=1).max() < 0.025
     raw = np.loadtxt(folder / "head_sparse_68.txt")
-    np.testing.assert_array_equal(schemes["68"].indices, raw[:, ::2])
+    np.testing.assert_array_equal(scheme.indices[jaw_order.TURNED], raw[:, ::2])

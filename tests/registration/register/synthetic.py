@@ -70,7 +70,7 @@ def make(root: Path, expression: str = "neutral") -> Truth:
     data = read(MODEL)
     parameters, offsets = _known(data, expression)
     vertices = GNM(data)(parameters, torch.as_tensor(offsets, dtype=torch.float32)).numpy()
-    scheme = read_scheme(FIXTURES / "head_sparse_68.txt", len(vertices))
+    scheme = read_scheme(FIXTURES / "head_sparse_68.txt", vertices)
     cameras = [_camera(*row, number) for number, row in enumerate(RIG)]
     images = _images(data, vertices, cameras)
     views = []
