@@ -6,6 +6,7 @@ Our own reader, since pycolmap's wheel contains GPL code (docs/adr/0006-no-gpl-b
 import math
 import os
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -19,7 +20,7 @@ from registration.errors import InputError
 from registration.types import Camera
 
 # COLMAP's parameters -> (fx, fy, cx, cy, OpenCV distortion in the order k1 k2 p1 p2 k3 k4 k5 k6)
-_MODELS: dict[str, Callable[..., tuple[float, ...]]] = {
+INTRINSICS: dict[str, Callable[..., tuple[float, ...]]] = {
     "SIMPLE_PINHOLE": lambda f, cx, cy: (f, f, cx, cy),
     "PINHOLE": lambda fx, fy, cx, cy: (fx, fy, cx, cy),
     "SIMPLE_RADIAL": lambda f, cx, cy, k1: (f, f, cx, cy, k1, 0.0, 0.0, 0.0),
@@ -27,6 +28,10 @@ _MODELS: dict[str, Callable[..., tuple[float, ...]]] = {
     "OPENCV": lambda *parameters: parameters,
     "FULL_OPENCV": lambda *parameters: parameters,
 }
+_TWO_FOCALS = frozenset(
+    ("PINHOLE", "OPENCV", "OPENCV_FISHEYE", "FULL_OPENCV", "FOV", "THIN_PRISM_FISHEYE", "RAD_TAN_THIN_PRISM_FISHEYE")
+    + ("DIVISION", "FISHEYE", "EUCM")
+)
 _WRITTEN = {0: "PINHOLE", 4: "OPENCV", 5: "FULL_OPENCV", 8: "FULL_OPENCV"}  # by number of distortion coefficients
 _READERS = {"bin": read_binary_model, "txt": read_text_model}
 _NEEDED = ("cameras", "images")  # files of a model; points, rigs and frames may be missing
@@ -39,6 +44,15 @@ _FAR_M, _MAX_ROUNDING, _MAX_MOVED_M = (
 _SAME_POSE, _ROUNDING = 1e-6, 1e-11  # of entries of two matrices of one pose, metres and cosines; relative
 
 
+@dataclass(frozen=True, kw_only=True)
+class PosedImage:
+    """An image of a model: its camera, with any lens, and its pose."""
+
+    camera: ColmapCamera
+    T_cam_world: Float[np.ndarray, "4 4"]
+    where: str  # the camera's file and line or record, and the image
+
+
 def read_cameras(sparse: Path) -> dict[str, Camera]:
     """Read the cameras of a COLMAP model, text or binary, in `sparse` or `sparse/0`.
 
@@ -46,15 +60,26 @@ def read_cameras(sparse: Path) -> dict[str, Camera]:
         Image's file name -> its camera.
 
     Raises:
-        InputError: the model cannot be read, is there twice with other cameras, two images have one name, a camera
-            model is not supported, a quaternion is too coarse for a far world, or intrinsics or a pose are singular,
-            not finite, or not those of the frames.
+        InputError: as `read_images`; a camera model is not supported, or intrinsics are singular or not finite.
     """
-    cameras: dict[str, Camera] = {}
+    return {name: _camera(image) for name, image in read_images(sparse).items()}
+
+
+def read_images(sparse: Path) -> dict[str, PosedImage]:
+    """Read the images of a COLMAP model as `read_cameras`, with lenses of any model.
+
+    Returns:
+        Image's file name -> its camera and pose.
+
+    Raises:
+        InputError: the model cannot be read, is there twice with other cameras, two images have one name, a quaternion
+            is too coarse for a far world, or a pose is singular, not finite, or not that of the frames.
+    """
+    images: dict[str, PosedImage] = {}
     model = _read_model(_model_folder(sparse))
     _check_frames(model)
     for image in sorted(model.images, key=lambda image: image.name):
-        if image.name in cameras:
+        if image.name in images:
             raise InputError(
                 "Two images of the COLMAP model have one name",
                 where=sparse,
@@ -71,11 +96,12 @@ def read_cameras(sparse: Path) -> dict[str, Camera]:
                 got=image.camera_id,
                 fix="add the camera, or correct the image's camera id",
             )
-        source = model.cameras[image.camera_id]
+        camera = model.cameras[image.camera_id]
         pose = _matrix((image.quaternion_wxyz, image.translation), where)
         _check_digits(image, where)
-        cameras[image.name] = _camera(source, pose, f"{source.where}: image {image.name}")
-    return cameras
+        where = f"{camera.where}: image {image.name}"
+        images[image.name] = PosedImage(camera=camera, T_cam_world=pose, where=where)
+    return images
 
 
 def read_points(sparse: Path) -> tuple[Float[np.ndarray, "P 3"], UInt8[np.ndarray, "P 3"]]:
@@ -247,21 +273,40 @@ def _check_frames(model: ColmapModel) -> None:
                 )
 
 
-def _camera(source: ColmapCamera, T_cam_world: Float[np.ndarray, "4 4"], where: str) -> Camera:
-    if source.model not in _MODELS:
+def _camera(image: PosedImage) -> Camera:
+    source, where = image.camera, image.where
+    if source.model not in INTRINSICS:
         raise InputError(
             "The camera model is not supported",
             where=where,
-            expected=", ".join(_MODELS),
+            expected=", ".join(INTRINSICS),
             got=source.model,
-            fix="undistort the images with `colmap image_undistorter`, masks, normals, labels and landmarks likewise; "
-            "or calibrate again with a supported model, OPENCV or FULL_OPENCV for wide lenses",
+            fix="undistort the capture with `gnmreg capture import`, which takes other lenses: masks, normals, labels "
+            "and landmarks likewise; or calibrate with a supported model, OPENCV or FULL_OPENCV for wide lenses",
         )
-    fx, fy, cx, cy, *distortion = _MODELS[source.model](*source.parameters)
-    if not all(map(math.isfinite, (fx, fy, cx, cy, *distortion))) or fx <= 0 or fy <= 0:
+    check_camera(image)
+    fx, fy, cx, cy, *distortion = INTRINSICS[source.model](*source.parameters)
+    return Camera(
+        width_px=source.width_px,
+        height_px=source.height_px,
+        intrinsics=np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]]),
+        T_cam_world=image.T_cam_world,
+        distortion=tuple(distortion) if any(distortion) else (),
+    )
+
+
+def check_camera(image: PosedImage) -> None:
+    """Refuse a camera whose numbers are not finite, whose focal length is not above 0, or whose size is no image's.
+
+    Raises:
+        InputError: as above.
+    """
+    source = image.camera
+    focals = source.parameters[:2] if source.model in _TWO_FOCALS else source.parameters[:1]
+    if not all(map(math.isfinite, source.parameters)) or min(focals) <= 0:
         raise InputError(
             "The intrinsics are singular or not finite",
-            where=where,
+            where=image.where,
             expected="finite numbers, focal lengths > 0",
             got=", ".join(map(str, source.parameters)),
             fix="calibrate the camera again",
@@ -269,18 +314,11 @@ def _camera(source: ColmapCamera, T_cam_world: Float[np.ndarray, "4 4"], where: 
     if not (0 < source.width_px < 2**16 and 0 < source.height_px < 2**16):
         raise InputError(
             "The camera's image size is out of range",
-            where=where,
+            where=image.where,
             expected="1 to 65535 px a side",
             got=f"{source.width_px} x {source.height_px}",
             fix="write the image's size into the COLMAP model",
         )
-    return Camera(
-        width_px=source.width_px,
-        height_px=source.height_px,
-        intrinsics=np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]]),
-        T_cam_world=T_cam_world,
-        distortion=tuple(distortion) if any(distortion) else (),
-    )
 
 
 def _check_digits(image: ColmapImage, where: str) -> None:

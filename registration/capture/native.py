@@ -2,6 +2,7 @@
 
 import os
 import re
+from collections.abc import Callable, Mapping
 from functools import partial
 from pathlib import Path, PurePosixPath
 
@@ -18,13 +19,14 @@ from registration.types import Camera, Capture, View
 _MASK_SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff")
 
 
-def read_capture(root: Path) -> Capture:
+def read_capture(root: Path, *, cameras_of: Callable[[Path], Mapping[str, Camera]] = read_cameras) -> Capture:
     """Read a native capture folder; of images only the headers. Views are in natural order of their names.
 
     A capture may come from an untrusted source: symbolic links that lead out of its folder are refused.
 
     Args:
         root: the folder, with capture.toml, sparse/ and images/ (docs/formats.md).
+        cameras_of: reads the cameras in the folder of the COLMAP model, by the images' file names.
 
     Raises:
         InputError: `capture.toml`, the COLMAP model or a landmark file is damaged, a camera model is not supported, a
@@ -43,7 +45,7 @@ def read_capture(root: Path) -> Capture:
     settings = read_settings(_inside(root, root / "capture.toml"))
     for path in (root / "sparse", *sorted((root / "sparse").rglob("*"))):
         _inside(root, path)
-    cameras = read_cameras(root / "sparse")
+    cameras = cameras_of(root / "sparse")
     views = tuple(_read_view(root, name, cameras[name]) for name in sorted(cameras, key=natural_key))
     _check_names(root, views)
     scan, truth = find_scan(root), root / "ground_truth.npz"

@@ -15,7 +15,7 @@ from registration.capture import pixels
 from registration.capture.colmap import write_model
 from registration.capture.native import read_capture
 from registration.capture.native_writer import CaptureDescription, check_new, write_settings
-from registration.capture.scan import SCAN, read_scan
+from registration.capture.scan import SCAN, SCANS, read_scan
 from registration.errors import InputError
 from registration.formats.plan import ViewPlan, plan_views
 from registration.formats.source import SourceCapture, SourceView, VideoFrame
@@ -192,13 +192,14 @@ def _write_scan(root: Path, scan: Path | None, unit_m: float) -> list[str]:
     """Copy or scale the scan. Returns notes."""
     if scan is None:
         return []
-    if scan.suffix.lower() != ".ply":
-        return [f"the scan {scan.name} was left out: only PLY is read; convert it to {SCAN}"]
+    name = f"scan{scan.suffix.lower()}"
+    if name not in SCANS:
+        return [f"the scan {scan.name} was left out: convert it to {SCAN}"]
     if unit_m == 1:
-        _copy(scan, root / SCAN)
+        _copy(scan, root / name)
         return []
     mesh = read_scan(scan)
-    write_ply(root / SCAN, mesh.vertices * unit_m, mesh.triangles)
+    write_ply(root / SCANS[0], mesh.vertices * unit_m, mesh.triangles)
     return ["the scan was scaled to metres: its vertices and triangles were written, without colours"]
 
 

@@ -1,10 +1,14 @@
-"""Native capture folders as a source: to copy one, to scale it, or to look through a link into it."""
+"""Native capture folders as a source: to scale one, or to undistort lenses that a registration does not read."""
 
 from pathlib import Path
 
+import numpy as np
+
+from registration.capture.colmap import read_images
 from registration.capture.native import read_capture
+from registration.formats.colmap_lenses import lens_of
 from registration.formats.source import Distortion, Format, ReadOptions, SourceCapture, SourceView
-from registration.types import View
+from registration.types import Camera, View
 
 
 def _detect(path: Path) -> bool:
@@ -12,15 +16,30 @@ def _detect(path: Path) -> bool:
 
 
 def read(path: Path, options: ReadOptions) -> SourceCapture:
-    """Read a native capture folder. Raises InputError as `registration.capture.native.read_capture`."""
-    capture = read_capture(path)
+    """Read a native capture folder; cameras may have any of COLMAP's lenses.
+
+    Raises:
+        InputError: as `registration.capture.native.read_capture`.
+    """
+    lenses: dict[str, Distortion] = {}
+
+    def pinholes(sparse: Path) -> dict[str, Camera]:
+        cameras = {}
+        for name, image in read_images(sparse).items():
+            intrinsics, lenses[name] = lens_of(image)
+            width_px, height_px, T = image.camera.width_px, image.camera.height_px, image.T_cam_world
+            cameras[name] = Camera(width_px=width_px, height_px=height_px, intrinsics=intrinsics, T_cam_world=T)
+        return cameras
+
+    capture = read_capture(path, cameras_of=pinholes)
+    images = path / "images"
     notes = () if capture.ground_truth is None else ("ground_truth.npz was left out: it is for tests",)
     return SourceCapture(
         format=FORMAT.name,
         root=path,
         subject=options.subject or capture.subject,
         expression=options.expression or capture.expression,
-        views=tuple(_view(view) for view in capture.views),
+        views=tuple(_view(view, lenses[view.image.relative_to(images).as_posix()]) for view in capture.views),
         unit_m=1.0,
         scan=capture.scan,
         classes=capture.classes,
@@ -29,16 +48,16 @@ def read(path: Path, options: ReadOptions) -> SourceCapture:
     )
 
 
-def _view(view: View) -> SourceView:
+def _view(view: View, lens: Distortion) -> SourceView:
     camera = view.camera
     return SourceView(
         name=view.name,
         image=view.image,
         width_px=camera.width_px,
         height_px=camera.height_px,
-        intrinsics=camera.intrinsics,
+        intrinsics=np.array(camera.intrinsics),
         T_cam_world=camera.T_cam_world,
-        distortion=Distortion(model="opencv", coefficients=camera.distortion),
+        distortion=lens,
         colour=view.colour,
         mask=view.mask,
         normals=view.normals,
@@ -48,5 +67,10 @@ def _view(view: View) -> SourceView:
 
 
 FORMAT = Format(
-    name="native", title="native capture folder", files="capture.toml and sparse/", detect=_detect, read=read
+    name="native",
+    title="native capture folder",
+    files="capture.toml and sparse/",
+    detect=_detect,
+    read=read,
+    physical=True,
 )

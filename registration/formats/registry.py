@@ -4,10 +4,10 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from registration.errors import InputError
-from registration.formats import native_source, nerfstudio
+from registration.formats import colmap_project, native_source, nerfstudio
 from registration.formats.source import Format, ReadOptions, SourceCapture
 
-FORMATS: tuple[Format, ...] = (native_source.FORMAT, nerfstudio.FORMAT)
+FORMATS: tuple[Format, ...] = (native_source.FORMAT, colmap_project.FORMAT, nerfstudio.FORMAT)
 
 
 def find_format(name: str) -> Format:

@@ -85,4 +85,5 @@ class Format:
     files: str  # the files by which it is recognized, for messages
     detect: Callable[[Path], bool]  # looks at names and first bytes only
     read: Callable[[Path, ReadOptions], SourceCapture]  # raises InputError
+    physical: bool = False  # whether its world has a known or at least a common unit; else any scale, as SfM gives
     sequences: bool = False  # whether it holds several frames, so that `ReadOptions.frame` has a meaning

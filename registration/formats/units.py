@@ -10,6 +10,7 @@ from registration.capture.triangulation import triangulate
 from registration.doctor.validation import EYE_DISTANCE_M, eye_distance
 from registration.errors import InputError
 from registration.formats.plan import ViewPlan
+from registration.formats.registry import find_format
 from registration.formats.source import SourceCapture
 from registration.types import Capture, View
 
@@ -52,7 +53,7 @@ def world_unit(source: SourceCapture, plans: Sequence[ViewPlan], given_m: float 
         return source.unit_m, None
     if (eyes := _eye_distance(source, plans)) is not None:
         return _from_eyes(eyes)
-    if source.scan is not None:
+    if source.scan is not None and find_format(source.format).physical:
         extent = float(np.ptp(read_scan(source.scan).vertices, axis=0).max())
         for name in _TRIED:
             if _HEAD_M[0] <= extent * UNITS_M[name] <= _HEAD_M[1]:

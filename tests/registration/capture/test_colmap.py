@@ -258,4 +258,4 @@ def test_a_fisheye_lens_is_refused_with_the_way_out(sparse: Path) -> None:
     edit("cameras.txt", "160.125", "160.125 0.1 0 0 0")(sparse)
     with pytest.raises(InputError, match="camera model is not supported") as caught:
         read_cameras(sparse)
-    assert "image_undistorter" in caught.value.fix and "masks" in caught.value.fix
+    assert "gnmreg capture import" in caught.value.fix and "masks" in caught.value.fix

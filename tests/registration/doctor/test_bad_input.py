@@ -85,7 +85,7 @@ def truncated_binary_model(root: Path) -> None:
     cut(root / "sparse" / "images.bin")
 
 
-@bad("The camera model is not supported", where="image cam3.png", got="OPENCV_FISHEYE", fix="image_undistorter")
+@bad("The camera model is not supported", where="image cam3.png", got="OPENCV_FISHEYE", fix="gnmreg capture import")
 def fisheye(root: Path) -> None:
     path = root / "sparse" / "cameras.txt"
     lines = data_lines(path)
