@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
+from registration.formats.photogrammetry_lenses import LENSES
 from registration.formats.source import Distortion
 
 Points = Float[np.ndarray, "P 2"]
@@ -135,4 +136,5 @@ MODELS: Mapping[str, DistortionModel] = {
     "fov": DistortionModel(names=("omega",), distort=_fov),
     "division": DistortionModel(names=("k",), distort=_division),
     "eucm": DistortionModel(names=("alpha", "beta"), distort=_eucm),
+    **{name: DistortionModel(names=names, distort=lens) for name, (names, lens) in LENSES.items()},
 }

@@ -14,13 +14,13 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from registration.formats import vhap
 from registration.formats.fields import Fields, read_object
 from registration.formats.files import find_image, stored_size, view_names
 from registration.formats.source import Distortion, Format, ReadOptions, SourceCapture, SourceView
 
 _TITLE = "transforms.json"
 _FILES = ("transforms.json", "transforms_train.json")
-_OTHERS = ("flame_param", "canonical_flame_param.npz")  # beside a VHAP export, which has files of the same name
 OPENGL_TO_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
 _LENSES = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE")
 _UNREAD = {
@@ -32,8 +32,7 @@ _UNREAD = {
 
 
 def _detect(path: Path) -> bool:
-    folder = path if path.is_dir() else path.parent
-    if any((folder / name).exists() for name in _OTHERS):
+    if vhap.is_export(path):
         return False
     if path.is_dir():
         return any((path / name).is_file() for name in _FILES)

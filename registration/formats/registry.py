@@ -4,10 +4,36 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from registration.errors import InputError
-from registration.formats import colmap_project, native_source, nerfstudio
+from registration.formats import (
+    blocks_exchange,
+    colmap_project,
+    facescape,
+    metashape_psx,
+    metashape_xml,
+    multiface,
+    native_source,
+    nerfstudio,
+    nersemble,
+    reality_csv,
+    reality_xmp,
+    vhap,
+)
 from registration.formats.source import Format, ReadOptions, SourceCapture
 
-FORMATS: tuple[Format, ...] = (native_source.FORMAT, colmap_project.FORMAT, nerfstudio.FORMAT)
+FORMATS: tuple[Format, ...] = (
+    native_source.FORMAT,
+    colmap_project.FORMAT,
+    nerfstudio.FORMAT,
+    blocks_exchange.FORMAT,
+    facescape.FORMAT,
+    metashape_xml.FORMAT,
+    metashape_psx.FORMAT,
+    multiface.FORMAT,
+    nersemble.FORMAT,
+    reality_csv.FORMAT,
+    reality_xmp.FORMAT,
+    vhap.FORMAT,
+)
 
 
 def find_format(name: str) -> Format:

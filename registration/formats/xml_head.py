@@ -1,0 +1,35 @@
+"""XML files recognized by the name of their first element, without reading them."""
+
+import re
+from pathlib import Path
+
+_FIRST = re.compile(rb"<([A-Za-z_][\w.:-]*)")
+_HEAD_BYTES = 4096
+
+
+def xml_file(path: Path, element: str, pattern: str = "*.xml") -> Path | None:
+    """Return the file whose first element has a name: the path itself, or the only such file in the folder `path`.
+
+    Args:
+        path: file or folder.
+        element: name of the first element, with the prefix that the file uses.
+        pattern: of the files in a folder.
+    """
+    if path.is_dir():
+        found = [file for file in sorted(path.glob(pattern)) if first_element(file) == element]
+        return found[0] if len(found) == 1 else None
+    return path if first_element(path) == element else None
+
+
+def first_element(file: Path) -> str | None:
+    """Return the name of the first element of an XML file, None if its first bytes have none."""
+    if not file.is_file():
+        return None
+    try:
+        with file.open("rb") as stream:
+            head = stream.read(_HEAD_BYTES)
+    except OSError:
+        return None
+    head = re.sub(rb"<!--.*?-->|<\?.*?\?>", b"", head, flags=re.DOTALL).lstrip(b"\xef\xbb\xbf \t\r\n")
+    found = _FIRST.match(head)
+    return found[1].decode("ascii") if found else None
