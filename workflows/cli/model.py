@@ -1,7 +1,7 @@
-"""`gnmreg model ...`: head models described, evaluated, built from public data and downloaded."""
+"""`gnmreg model ...`: head models described, evaluated, built from public data, found and downloaded."""
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 from tyro.conf import Positional, arg
 
@@ -57,11 +57,23 @@ def evaluate(
     return 0
 
 
-def fetch() -> int:
-    """Download Google's GNM head weights into the cache and print their path."""
-    from registration.model.fetch import fetch
+def fetch(source: Annotated[Literal["http", "huggingface", "kaggle"], arg(metavar="SOURCE")] = "http") -> int:
+    """Find or download Google's GNM head weights and print their path.
 
-    print(fetch())
+    The weights are (c) Google LLC, under the Apache License 2.0. Files on this machine are used first: in the cache
+    folders of Google's loader (GNM_CACHE_DIR, XDG_CACHE_HOME/gnm/models, ~/.cache/gnm/models), of the programs of
+    Hugging Face and Kaggle, and in our own. Otherwise 53 MB are downloaded, checked, and recorded with their digest.
+
+    Args:
+        source: Where to download from. http: Google's default address, whatever is newest there. huggingface: release
+            3.0 there, checked by its sha256; HF_ENDPOINT names a mirror. kaggle: the copy on Kaggle.
+    """
+    from registration.model.fetch import fetch, sources
+    from registration.progress import console_progress
+
+    with console_progress() as progress:
+        path = fetch(sources()[source], progress=progress)
+    print(path)
     return 0
 
 

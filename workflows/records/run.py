@@ -1,6 +1,7 @@
 """The input of `gnmreg stabilize`: subject folders as `gnmreg subject` writes them."""
 
 from collections.abc import Collection, Iterator, Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -10,7 +11,7 @@ from jaxtyping import Float
 from registration.capture.native import natural_key
 from registration.errors import InputError
 from registration.model import gnm_npz
-from registration.model.fetch import cached_path
+from registration.model.fetch import installed_files
 from registration.model.gnm_npz import GNMData
 from registration.stabilize.subject_meshes import SkullSkin, SubjectMeshes, subject_meshes
 from registration.storage.cache import cache_folder
@@ -100,9 +101,10 @@ def known_model(run: Path) -> Path:
         InputError: it is neither of them; there is no subject, or its record is malformed.
     """
     content = _read(_subject_folders(run)[0]).model
-    for file in (cached_path(), *sorted(cache_folder().glob("first-*/*.npz"))):
-        if file.is_file() and gnm_npz.content_hash(gnm_npz.read(file)) == content:
-            return file
+    for file in (*installed_files(), *sorted(cache_folder().glob("first-*/*.npz"))):
+        with suppress(InputError):  # a damaged file is not the one
+            if gnm_npz.content_hash(gnm_npz.read(file)) == content:
+                return file
     raise InputError(
         "The head model of these registrations is not in the cache",
         where=run,
