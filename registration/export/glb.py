@@ -15,7 +15,7 @@ from registration.export.gltf import ELEMENTS, VERTICES, GlbFile
 from registration.export.head_mesh import HeadMesh, unit_normals
 
 MAX_VERTICES = 2**24  # whole numbers that float32 holds
-_ROUGHNESS = {"skin": 0.6, "eyes": 0.15, "teeth": 0.3, "tongue": 0.4}  # for a viewer's lights
+ROUGHNESS = {"skin": 0.6, "eyes": 0.15, "teeth": 0.3, "tongue": 0.4}  # for a viewer's lights
 _STILL = 1e-3  # changes of unit normals below this are left out
 _DENSE_SHARE = 0.5  # of the rows; fewer that move are stored sparsely
 
@@ -122,7 +122,7 @@ def _only(values: Float[np.ndarray, "P 3"], rows: Int[np.ndarray, "R"]) -> Float
 
 
 def _material(name: str, *, textured: bool) -> dict[str, Any]:
-    surface: dict[str, Any] = {"metallicFactor": 0, "roughnessFactor": _ROUGHNESS.get(name, 0.6)}
+    surface: dict[str, Any] = {"metallicFactor": 0, "roughnessFactor": ROUGHNESS.get(name, 0.6)}
     if textured:
         surface["baseColorTexture"] = {"index": 0}
     return {"name": name, "pbrMetallicRoughness": surface, "doubleSided": name == "skin"}

@@ -1,7 +1,11 @@
 """What may be chosen about an export."""
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Annotated, Literal
+
+from tyro.conf import arg
+
+from registration.errors import InputError
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -11,8 +15,27 @@ class ExportOptions:
     Attributes:
         frame: head: the mesh is moved rigidly to where the model's own head is, +Y up, +Z out of the face. world: as
             captured.
-        accept_failed: Export failed registrations too.
+        failed: What to do with registrations that failed or are missing: refuse the export, skip them, or export those
+            that failed all the same.
+        sequence: Write the expressions of a subject as the frames of a sequence, in the natural order of their names.
+            A folder of registrations is a sequence anyway.
+        subject: The subject to export from a stabilized set of several.
+        fps: Frames per second of a sequence.
     """
 
     frame: Literal["head", "world"] = "head"
-    accept_failed: bool = False
+    failed: Literal["refuse", "skip", "export"] = "refuse"
+    sequence: bool = False
+    subject: Annotated[str | None, arg(metavar="NAME", help_behavior_hint="(default: the only one)")] = None
+    fps: Annotated[float, arg(metavar="F")] = 24.0
+
+    def __post_init__(self) -> None:
+        if not 0 < self.fps <= 1000:
+            fix = "choose another rate"
+            raise InputError(
+                "The frame rate is out of range",
+                where="--fps",
+                expected="a number above 0, at most 1000",
+                got=self.fps,
+                fix=fix,
+            )

@@ -1,6 +1,7 @@
 """Heads to export, from registrations and a model."""
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
+from dataclasses import replace
 
 import numpy as np
 from jaxtyping import Float, UInt8
@@ -14,6 +15,23 @@ from registration.geometry.topology import vertex_areas
 from registration.model import regions
 from registration.model.gnm_npz import GNMData
 from registration.types import Registration
+
+
+def head_of_model(data: GNMData, *, name: str, shapes: Mapping[str, Float[np.ndarray, "V 3"]]) -> HeadMesh:
+    """Return a model's template, without a texture.
+
+    Args:
+        data: the model.
+        name: of the mesh in the file.
+        shapes: name -> displacement of the template, metres.
+    """
+    return HeadMesh(
+        name=name,
+        vertices=data.template_vertex_positions.astype(np.float64),
+        topology=Topology.from_model(data),
+        shapes=shapes,
+        origin={"frame": "head"},
+    )
 
 
 def head_of_registration(
@@ -34,44 +52,74 @@ def head_of_registration(
     Raises:
         InputError: it failed, or has another topology.
     """
-    check_usable(registration, name, accept_failed=options.accept_failed)
+    check_usable(registration, name, options)
     topology = Topology.from_model(data, registration.corner_uvs)
     topology.check(registration.triangles, name)
     vertices = registration.vertices.astype(np.float64)
-    if options.frame == "head":
-        vertices = transform_points(T_head_world(vertices, data), vertices)
     return HeadMesh(
         name=name,
-        vertices=vertices,
+        vertices=transform_points(T_out_world(vertices, data, options), vertices),
         topology=topology,
         texture=srgb_bytes(registration.texture),
         origin={"frame": options.frame, "status": registration.status},
     )
 
 
-def check_usable(registration: Registration, where: object, *, accept_failed: bool) -> None:
+def with_expressions(
+    neutral: HeadMesh,
+    vertices: Iterable[tuple[str, Float[np.ndarray, "V 3"]]],
+    T_out_world: Float[np.ndarray, "4 4"],
+    options: ExportOptions,
+) -> HeadMesh:
+    """Return a neutral with a subject's expressions as shapes, or as frames if the options ask for a sequence.
+
+    Args:
+        neutral: the head at rest, in the exported frame.
+        vertices: name and vertices of each expression, metres, in the neutral's world, without motion of the head.
+        T_out_world: from the neutral's world to the exported frame.
+        options: of the export.
+    """
+    posed = {name: transform_points(T_out_world, points.astype(np.float64)) for name, points in vertices}
+    if options.sequence:
+        return with_frames(neutral, list(posed.values()), options)
+    return replace(neutral, shapes={name: points - neutral.vertices for name, points in posed.items()})
+
+
+def with_frames(head: HeadMesh, frames: list[Float[np.ndarray, "V 3"]], options: ExportOptions) -> HeadMesh:
+    """Return a head that moves: vertices of each frame in the exported frame; the first are those at rest."""
+    stacked = np.stack(frames).astype(np.float32)
+    return replace(
+        head, vertices=stacked[0].astype(np.float64), frames=stacked, shapes={}, frames_per_second=options.fps
+    )
+
+
+def check_usable(registration: Registration, where: object, options: ExportOptions) -> None:
     """Refuse a failed registration, and always one whose vertices are not finite. Raises InputError."""
     finite = bool(np.isfinite(registration.vertices).all())
-    if (registration.status == "failed" and not accept_failed) or not finite:
+    if (registration.status == "failed" and options.failed != "export") or not finite:
         raise InputError(
             "A registration failed",
             where=where,
             expected="converged or stopped",
             got=registration.reason if finite else f"{registration.reason}; vertices that are not finite",
-            fix="register it again" + (", or export it all the same with --accept-failed" if finite else ""),
+            fix="register it again" + (", or export it all the same with --failed export" if finite else ""),
         )
 
 
-def T_head_world(vertices: Float[np.ndarray, "V 3"], data: GNMData) -> Float[np.ndarray, "4 4"]:
-    """Align a head with the model's template by the skin on the skull; rigid, without scale.
+def T_out_world(vertices: Float[np.ndarray, "V 3"], data: GNMData, options: ExportOptions) -> Float[np.ndarray, "4 4"]:
+    """Return the rigid motion into the frame that is exported.
 
     Args:
-        vertices: metres, any world.
+        vertices: of a head, metres, its world.
         data: the model.
+        options: of the export.
 
     Returns:
-        p_head = T_head_world @ p_world.
+        For the frame "head" the alignment with the model's template by the skin on the skull, without scale; else the
+        identity.
     """
+    if options.frame == "world":
+        return np.eye(4)
     template = data.template_vertex_positions.astype(np.float64)
     weights = vertex_areas(template, data.triangles) * regions.skull_skin(data)
     return align(vertices[None].astype(np.float64), template, weights[None])[0]
@@ -81,20 +129,3 @@ def srgb_bytes(texture: Float[np.ndarray, "R R 3"]) -> UInt8[np.ndarray, "R R 3"
     """Return a linear texture as 8 bit sRGB; texels that are not finite are black."""
     finite = np.nan_to_num(np.asarray(texture, np.float64))
     return np.asarray(np.round(255 * linear_to_srgb(finite)), np.uint8)
-
-
-def head_of_model(data: GNMData, *, name: str, shapes: Mapping[str, Float[np.ndarray, "V 3"]]) -> HeadMesh:
-    """Return a model's template, without a texture.
-
-    Args:
-        data: the model.
-        name: of the mesh in the file.
-        shapes: name -> displacement of the template, metres.
-    """
-    return HeadMesh(
-        name=name,
-        vertices=data.template_vertex_positions.astype(np.float64),
-        topology=Topology.from_model(data),
-        shapes=shapes,
-        origin={"frame": "head"},
-    )

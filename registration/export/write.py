@@ -3,14 +3,19 @@
 import os
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from importlib.util import find_spec
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import numpy as np
 
 from registration.errors import InputError
+from registration.export.alembic import MODULE as ALEMBIC
+from registration.export.alembic import write_abc
 from registration.export.glb import glb_bytes, png_bytes
 from registration.export.head_mesh import HeadMesh
+from registration.export.usd import MODULE as USD_MODULE
+from registration.export.usd import write_usda, write_usdc, write_usdz
 from registration.storage.files import check_output_file, naming_full_disk
 from registration.storage.mesh import write_obj, write_ply
 
@@ -27,6 +32,8 @@ class Format:
     shapes: bool = False
     frames: bool = False
     companions: tuple[str, ...] = ()  # suffixes of further files
+    module: str | None = None  # that must be installed, and its package
+    package: str = ""
 
 
 def _write_obj(mesh: HeadMesh, file: Path, texture: str | None) -> None:
@@ -47,6 +54,13 @@ FORMATS: Mapping[str, Format] = {
     ".obj": Format(write=_write_obj, companions=(".mtl",)),
     ".ply": Format(write=_write_ply, texture=False, materials=False),
     ".glb": Format(write=_write_glb, quads=False, texture_beside=False, shapes=True),
+    ".usda": Format(write=write_usda, shapes=True, frames=True),
+    ".usd": Format(write=write_usda, shapes=True, frames=True),
+    ".usdc": Format(write=write_usdc, shapes=True, frames=True, module=USD_MODULE, package="usd-core"),
+    ".usdz": Format(
+        write=write_usdz, texture_beside=False, shapes=True, frames=True, module=USD_MODULE, package="usd-core"
+    ),
+    ".abc": Format(write=write_abc, frames=True, module=ALEMBIC, package=ALEMBIC),
 }
 
 
@@ -72,9 +86,19 @@ def check_out(file: Path, *, replace: bool) -> None:
         replace: replace files that are there.
 
     Raises:
-        InputError: no format has its suffix, it is a folder, or it or a file that belongs to it exists.
+        InputError: no format has its suffix, the package that the format needs is not installed, it is a folder, or it
+            or a file that belongs to it exists.
     """
     kind = format_of(file)
+    if kind.module is not None and find_spec(kind.module) is None:
+        others = ", ".join(suffix for suffix, other in FORMATS.items() if other.module is None)
+        raise InputError(
+            f"The package {kind.package} is not installed",
+            where=file,
+            expected=f"{kind.package}, which writes {file.suffix} files",
+            got="none",
+            fix=f"pip install {kind.package}, or choose one of {others}",
+        )
     check_output_file(file)
     suffixes = (file.suffix, *kind.companions, *([".png"] if kind.texture and kind.texture_beside else []))
     for path in (file.with_suffix(suffix) for suffix in suffixes):

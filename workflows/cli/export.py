@@ -19,14 +19,16 @@ def export(
     force: bool = False,
     how: ExportOptions = _DEFAULTS,
 ) -> int:
-    """Write a registration or a model as OBJ, PLY or GLB.
+    """Write registrations or a model as OBJ, PLY, GLB, USD or Alembic.
 
-    The format follows the suffix of OUT.
+    The format follows the suffix of OUT: .obj, .ply, .glb, .usda, .usd, .usdc, .usdz or .abc.
 
     Args:
-        source: A registration folder, or a head model's NPZ file.
+        source: A registration folder; a subject's folder that `gnmreg subject` wrote: the neutral, with the expressions
+            as shapes; a stabilized set, likewise; any other folder of registrations: a sequence; or a head model's NPZ
+            file.
         out: The file to write. Textures and materials that the format has in files of their own go beside it.
-        model: The head model of the registration; not needed if it is where it was then, or in the cache.
+        model: The head model of the registrations; not needed if it is where it was then, or in the cache.
         force: Replace files that exist.
         how: What is written.
     """

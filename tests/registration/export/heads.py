@@ -1,6 +1,8 @@
 """Registrations of the tiny head by formula, without a fit, and a plain reader of GLB files."""
 
 import json
+from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +14,7 @@ from registration.model.atlas import texture_atlas
 from registration.storage.registration_folder import save_registration
 from registration.types import Registration
 from tests.conftest import FIXTURES
+from workflows.records.subject import CaptureRow, SubjectRecord
 
 MODEL = FIXTURES / "tiny_gnm.npz"
 DATA = gnm_npz.read(MODEL)
@@ -44,6 +47,29 @@ def a_registration(expression: int | None = None, **changes: Any) -> Registratio
         provenance={"model": str(MODEL)},
     )
     return Registration(**{**fields, **changes})
+
+
+def a_subject(folder: Path, expressions: Mapping[str, int] = {"brow": 0, "jaw": 3}, **failed: str) -> Path:  # noqa: B006
+    """Write a subject's folder: a neutral, and expressions (name -> mode) whose heads are turned against it.
+
+    Args:
+        folder: to write.
+        expressions: by the folder's name; the label is the name with "_label".
+        failed: name -> status of further rows, without a registration.
+    """
+    a_folder(folder / "neutral")
+    rows = [CaptureRow(name="neutral", expression="neutral", status="converged", folder="neutral")]
+    for number, (name, mode) in enumerate(expressions.items(), 1):
+        registration = a_registration(mode)
+        turn = Rotation.from_rotvec([0, 0.05 * number, 0.02])
+        moved = turn.apply(registration.vertices - SHIFT) + SHIFT + 0.01 * number
+        save_registration(replace(registration, vertices=moved.astype(np.float32)), folder / name)
+        rows.append(CaptureRow(name=name, expression=f"{name}_label", status="converged", folder=name))
+    rows += [CaptureRow(name=name, expression=name, status=status, reason="why") for name, status in failed.items()]
+    model = gnm_npz.content_hash(DATA)
+    record = SubjectRecord(subject="anna", model=model, recipe="draft", neutral="neutral", rows=tuple(rows))
+    record.write(folder / "subject.json")
+    return folder
 
 
 def a_folder(path: Path, expression: int | None = None, **changes: Any) -> Path:

@@ -120,8 +120,8 @@ def test_a_failed_registration_is_refused_unless_accepted() -> None:
     failed = a_registration(status="failed", reason="the mesh moved")
     with pytest.raises(InputError, match="failed") as error:
         head_of_registration(failed, DATA, name="anna")
-    assert "--accept-failed" in error.value.fix and error.value.got == "the mesh moved"
-    accept = ExportOptions(accept_failed=True)
+    assert "--failed export" in error.value.fix and error.value.got == "the mesh moved"
+    accept = ExportOptions(failed="export")
     assert head_of_registration(failed, DATA, name="anna", options=accept).origin["status"] == "failed"
     broken = failed.vertices.copy()
     broken[3] = np.nan
@@ -132,3 +132,11 @@ def test_a_failed_registration_is_refused_unless_accepted() -> None:
 def test_another_topology_is_refused() -> None:
     with pytest.raises(InputError, match="another topology"):
         head_of_registration(a_registration(triangles=DATA.triangles[::-1].astype(np.int32)), DATA, name="anna")
+
+
+def test_a_missing_package_is_named_before_any_work(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("registration.export.write.find_spec", lambda name: None)
+    for suffix, package in ((".usdz", "usd-core"), (".abc", "alembic3d")):
+        with pytest.raises(InputError, match=package) as error:
+            check_out(tmp_path / f"head{suffix}", replace=False)
+        assert ".usda" in error.value.fix and ".usdz" not in error.value.fix

@@ -55,4 +55,4 @@ def test_a_failed_registration_needs_a_word(tmp_path: Path, capsys) -> None:
     failed = a_folder(tmp_path / "failed", status="failed", reason="the mesh moved")
     assert main(["export", str(failed), str(tmp_path / "head.glb")]) == 2
     assert "the mesh moved" in capsys.readouterr().err
-    assert main(["export", str(failed), str(tmp_path / "head.glb"), "--accept-failed"]) == 0
+    assert main(["export", str(failed), str(tmp_path / "head.glb"), "--failed", "export"]) == 0
