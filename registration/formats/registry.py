@@ -5,6 +5,7 @@ from pathlib import Path
 
 from registration.errors import InputError
 from registration.formats import (
+    bare_folder,
     blocks_exchange,
     colmap_project,
     facescape,
@@ -14,6 +15,7 @@ from registration.formats import (
     native_source,
     nerfstudio,
     nersemble,
+    opencv_yaml,
     reality_csv,
     reality_xmp,
     vhap,
@@ -24,6 +26,8 @@ FORMATS: tuple[Format, ...] = (
     native_source.FORMAT,
     colmap_project.FORMAT,
     nerfstudio.FORMAT,
+    opencv_yaml.FORMAT,
+    bare_folder.FORMAT,
     blocks_exchange.FORMAT,
     facescape.FORMAT,
     metashape_xml.FORMAT,
