@@ -80,6 +80,15 @@ class View:
 
 
 @dataclass(frozen=True, kw_only=True)
+class LabelCode:
+    """What the pixels of label maps are: positions in `Capture.classes`, or indices or colours that stand for them."""
+
+    indices: tuple[int, ...] = ()  # stored index -> position, -1: it has no name; (): the indices are the positions
+    colours: tuple[tuple[int, int, int, int], ...] = ()  # red, green, blue, position; (): maps in colour are refused
+    renamed: tuple[tuple[str, str], ...] = ()  # a class' name in the capture, and what it was taken for
+
+
+@dataclass(frozen=True, kw_only=True)
 class Capture:
     """One moment of one subject, recorded by several cameras."""
 
@@ -87,7 +96,8 @@ class Capture:
     subject: str
     expression: str
     views: tuple[View, ...]
-    classes: tuple[str, ...] = ()  # names of the label indices in `segmentation`
+    classes: tuple[str, ...] = ()  # names of the label indices in `segmentation`, each once
+    labels: LabelCode = LabelCode()
     tags: Mapping[str, Any] = field(default_factory=dict)
     scan: Path | None = None
     ground_truth: Path | None = None

@@ -79,6 +79,11 @@ def require_size(path: Path, role: str, width_px: int, height_px: int) -> Header
     return header
 
 
+def undecodable(path: Path, role: str) -> Refuse:
+    """Return what makes the error for a file whose pixels are damaged."""
+    return partial(InputError, f"The {role} cannot be decoded", where=path, fix="copy or write the file again")
+
+
 def require_complete(path: Path, role: str) -> None:
     """Refuse a truncated PNG or JPEG file. Reads a few bytes at the end, or the heads of a PNG's chunks.
 

@@ -42,7 +42,7 @@ def read_capture(root: Path, *, cameras_of: Callable[[Path], Mapping[str, Camera
             got="no such folder",
             fix="check the path",
         )
-    settings = read_settings(_inside(root, root / "capture.toml"))
+    settings = read_settings(_inside(root, root / "capture.toml"), partial(_inside, root))
     for path in (root / "sparse", *sorted((root / "sparse").rglob("*"))):
         _inside(root, path)
     cameras = cameras_of(root / "sparse")
@@ -55,6 +55,7 @@ def read_capture(root: Path, *, cameras_of: Callable[[Path], Mapping[str, Camera
         expression=settings.expression,
         views=views,
         classes=settings.classes,
+        labels=settings.labels,
         tags=settings.tags,
         scan=None if scan is None else _optional(root, scan),
         ground_truth=_optional(root, truth),

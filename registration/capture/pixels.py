@@ -6,21 +6,20 @@ needs a few hundred MB. Every result is the mean over the pixels of a block that
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
-from functools import cache, partial
+from functools import cache
 from pathlib import Path
 
 import cv2
 import numpy as np
 from jaxtyping import Float, UInt8
-from PIL import Image
 
-from registration.capture.headers import require_complete, require_size
+from registration.capture.headers import require_complete, require_size, undecodable
+from registration.capture.label_maps import read_labels
 from registration.capture.masks import subject_coverage
 from registration.capture.tiff import decode_tiff, is_tiff
 from registration.errors import InputError
 from registration.frames import opencv_intrinsics, srgb_to_linear
-from registration.storage.image_files import FORMATS, decode
-from registration.storage.reading import Refuse
+from registration.storage.image_files import decode
 from registration.types import Camera, Capture, View, ViewPixels
 
 STRIP_PIXELS = 2**21  # converted to float at a time: 25 MB of float32 RGB
@@ -60,7 +59,7 @@ def read_view(view: View, capture: Capture, *, downsample: int = 1) -> ViewPixel
     )
     coverage = None
     if view.segmentation is not None:
-        labels = read_labels(view.segmentation, camera, capture.classes)
+        labels = read_labels(view.segmentation, camera, capture.classes, capture.labels)
         coverage = _label_coverage(labels, strips, valid, len(capture.classes))
     reduced = downsampled_camera(camera, downsample)
     return ViewPixels(camera=reduced, rgb=rgb, mask=mask, normals=normals, label_coverage=coverage, valid=valid)
@@ -124,58 +123,16 @@ def read_normals(path: Path, camera: Camera) -> np.ndarray:
     return pixels
 
 
-def read_labels(path: Path, camera: Camera, classes: tuple[str, ...]) -> UInt8[np.ndarray, "H W"]:
-    """Read a label map, distorted: indices into `classes`. Raises InputError for an index without a name."""
-    header = require_size(path, "label map", camera.width_px, camera.height_px)
-    require_complete(path, "label map")
-    refuse = _undecodable(path, "label map")
-    try:
-        with Image.open(path, formats=FORMATS) as image:  # unlike OpenCV it does not convert palette indices to colours
-            mode, form = image.mode, image.format
-            plain = mode == "L" and header.png_bits == 8
-            labels = decode(path, cv2.IMREAD_UNCHANGED, refuse) if plain else np.array(image)
-    except InputError:
-        raise
-    except Exception as error:  # a damaged file makes Pillow raise nearly anything
-        raise refuse(expected="a whole, undamaged image", got=f"{type(error).__name__}: {error}") from None
-    if not plain:  # Pillow takes pixels that are missing for 0
-        decode(path, cv2.IMREAD_UNCHANGED, refuse)
-    if mode == "L" and header.png_bits in (2, 4):  # Pillow scales them to 8 bits
-        labels = labels // (255 // (2**header.png_bits - 1))
-    if form == "JPEG" or mode not in ("L", "P") or labels.dtype != np.uint8:
-        raise InputError(
-            "The label map is not a map of indices",
-            where=path,
-            expected="8 bit, one channel, without loss",
-            got="a JPEG, whose compression mixes indices" if form == "JPEG" else f"mode {mode}, {labels.dtype}",
-            fix="store the class index of each pixel in one 8 bit channel of a PNG",
-        )
-    highest = int(labels.max())
-    if highest >= len(classes):
-        raise InputError(
-            "A label index has no name",
-            where=path,
-            expected=f"indices below {len(classes)}: {', '.join(classes)}",
-            got=f"index {highest} at {int((labels == highest).sum())} pixels",
-            fix="name every index in [segmentation] classes of capture.toml; pixels to ignore (often 255) need one too",
-        )
-    return labels
-
-
 def _imread(path: Path, role: str, camera: Camera, flags: int) -> np.ndarray:
     require_size(path, role, camera.width_px, camera.height_px)
     require_complete(path, role)
-    refuse = _undecodable(path, role)
+    refuse = undecodable(path, role)
     with path.open("rb") as file:
         tiff = is_tiff(file.read(4))
     pixels = decode_tiff(path, refuse) if tiff else decode(path, flags, refuse)
     if pixels.shape[:2] != (camera.height_px, camera.width_px):
         raise refuse(expected="the size in its header", got=f"shape {pixels.shape}")
     return pixels
-
-
-def _undecodable(path: Path, role: str) -> Refuse:
-    return partial(InputError, f"The {role} cannot be decoded", where=path, fix="copy or write the file again")
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -47,15 +47,15 @@ def sample_views(capture: Capture) -> list[ViewSample]:
     """Decode all views. Raises InputError for a file that cannot be used, or an empty mask."""
     large = [view.name for view in capture.views if view.normals is not None and not _small(view.camera)]
     chosen = {large[int(i)] for i in np.linspace(0, len(large) - 1, LARGE_NORMAL_MAPS) if large}
-    return [_sample(view, capture.classes, decode_normals=view.name in chosen) for view in capture.views]
+    return [_sample(view, capture, decode_normals=view.name in chosen) for view in capture.views]
 
 
 def _small(camera: Camera) -> bool:
     return camera.width_px * camera.height_px <= MAX_DECODED_PIXELS
 
 
-def _sample(view: View, classes: tuple[str, ...], decode_normals: bool) -> ViewSample:
-    camera = view.camera
+def _sample(view: View, capture: Capture, decode_normals: bool) -> ViewSample:
+    camera, classes = view.camera, capture.classes
     step = max(1, math.ceil(math.sqrt(camera.width_px * camera.height_px / _SAMPLES)))
     some = slice(step // 2, None, step)
     width, height = len(range(camera.width_px)[some]), len(range(camera.height_px)[some])
@@ -72,7 +72,7 @@ def _sample(view: View, classes: tuple[str, ...], decode_normals: bool) -> ViewS
             )
         head, mask, coverage = (full > 127).any(1), full[some, some].copy(), float(full.mean() / 255)
     if view.segmentation is not None:
-        full = pixels.read_labels(view.segmentation, camera, classes)
+        full = pixels.read_labels(view.segmentation, camera, classes, capture.labels)
         # The head alone: with shoulders the heads of close-ups and of busts would have different resolutions.
         other = np.array([name in (BACKGROUND, NECK) for name in classes] + [True] * (256 - len(classes)))
         head, labels = (~cv2.LUT(full, other.astype(np.uint8)).astype(bool)).any(1), full[some, some].copy()

@@ -2,15 +2,16 @@
 
 import difflib
 import os
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
 
-from registration.capture.class_names import canonical
+from registration.capture.label_settings import read_labels_table
 from registration.errors import InputError
 from registration.storage.reading import parse_toml, read_bytes
+from registration.types import LabelCode
 
 UNITS_M = {"m": 1.0, "mm": 1e-3, "cm": 1e-2, "dm": 0.1, "km": 1e3, "in": 0.0254, "inch": 0.0254, "ft": 0.3048}
 _RESERVED = ("subject", "expression", "units", "segmentation")
@@ -22,12 +23,17 @@ class CaptureSettings:
 
     subject: str
     expression: str
-    classes: tuple[str, ...]  # known ones as `class_names.canonical` spells them
+    classes: tuple[str, ...]  # as `class_names.meaning` spells them, each once
+    labels: LabelCode
     tags: Mapping[str, Any]
 
 
-def read_settings(path: Path) -> CaptureSettings:
+def read_settings(path: Path, inside: Callable[[Path], Path] = Path) -> CaptureSettings:
     """Read `capture.toml` (docs/formats.md).
+
+    Args:
+        path: of the file.
+        inside: returns the path of a file that it names if it lies within the capture; raises InputError if not.
 
     Raises:
         InputError: the file is missing or no TOML, or a required key is missing, misspelt or malformed.
@@ -57,16 +63,18 @@ def read_settings(path: Path) -> CaptureSettings:
         if near is not None:
             fix = "rename the table to [segmentation]; if it is a tag, give it another name"
             raise refuse("A table of capture.toml is misspelt", "[segmentation]", f"[{near}]", fix)
+    classes, labels = _labels(path, settings.get("segmentation", {}), inside)
     return CaptureSettings(
         subject=settings["subject"],
         expression=settings["expression"],
-        classes=_classes(path, settings.get("segmentation", {})),
+        classes=classes,
+        labels=labels,
         tags={key: value for key, value in settings.items() if key not in _RESERVED},
     )
 
 
-def _classes(path: Path, segmentation: object) -> tuple[str, ...]:
-    """The names of the label indices. Raises InputError."""
+def _labels(path: Path, segmentation: object, inside: Callable[[Path], Path]) -> tuple[tuple[str, ...], LabelCode]:
+    """The classes of the label maps and the code of their pixels. Raises InputError."""
 
     def refuse(what: str, expected: str, got: object) -> InputError:
         return InputError(what, where=path, expected=expected, got=got, fix="see the capture folder in docs/formats.md")
@@ -75,13 +83,7 @@ def _classes(path: Path, segmentation: object) -> tuple[str, ...]:
         raise refuse("The segmentation classes are malformed", 'classes = ["background", ...]', segmentation)
     if "classes" not in segmentation and (near := _nearest("classes", segmentation, ("labels", "names"))) is not None:
         raise refuse("[segmentation] lacks the class names", 'classes = ["background", ...]', f"{near} = ...")
-    classes = segmentation.get("classes", [])
-    if not isinstance(classes, list) or not all(isinstance(name, str) for name in classes):
-        raise refuse("The segmentation classes are malformed", 'classes = ["background", ...]', segmentation)
-    names = tuple(canonical(name) for name in classes)
-    if len(set(names)) != len(names):
-        raise refuse("A segmentation class is named twice", "unique names", ", ".join(classes))
-    return names
+    return read_labels_table(path, segmentation, inside)
 
 
 def _misspelt(key: str, settings: Iterable[str]) -> str:

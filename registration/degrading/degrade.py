@@ -6,9 +6,11 @@ the capture only, not on the preset or on faults of other views.
 """
 
 import json
+import re
 import shutil
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from types import MappingProxyType
 
@@ -25,6 +27,7 @@ from registration.degrading.degradation import FAULTS, DegradationPreset
 from registration.doctor.validation import validate_capture
 from registration.errors import InputError, check_seed
 from registration.storage.files import atomic_directory
+from registration.storage.reading import parse_toml
 from registration.types import Camera, Capture, View
 
 MIN_VIEWS = 2  # of a capture
@@ -77,11 +80,9 @@ def degrade(
             )
             source_view = replace(view, normals=None) if view.name in without_normals else view
             errors = _ViewErrors(preset=preset, faults=frozenset(faults.get(view.name, ())), rngs=rngs[1:])
-            _write_view(temporary, source_view, capture.classes, errors)
+            _write_view(temporary, source_view, capture, errors)
         _write_cameras(temporary / "sparse", cameras, source / "sparse")
-        _write_settings(
-            temporary / "capture.toml", source / "capture.toml", _description(preset, seed, dropped, faults)
-        )
+        _write_settings(temporary / "capture.toml", capture, _description(preset, seed, dropped, faults))
         for file in (capture.scan, capture.ground_truth):
             if file is not None:
                 shutil.copyfile(file, temporary / file.name)
@@ -150,7 +151,7 @@ class _ViewErrors:
     rngs: list[np.random.Generator]  # of image, mask, normals, labels and landmarks
 
 
-def _write_view(root: Path, view: View, classes: tuple[str, ...], errors: _ViewErrors) -> None:
+def _write_view(root: Path, view: View, capture: Capture, errors: _ViewErrors) -> None:
     preset = errors.preset
     for_image, for_mask, for_normals, for_labels, for_landmarks = errors.rngs
     shift_px = degradation.SHIFT_PX if "shifted" in errors.faults else 0
@@ -163,7 +164,7 @@ def _write_view(root: Path, view: View, classes: tuple[str, ...], errors: _ViewE
             pixels.read_normals(view.normals, view.camera), preset, for_normals
         )
     if view.segmentation is not None:
-        labels = pixels.read_labels(view.segmentation, view.camera, classes)
+        labels = pixels.read_labels(view.segmentation, view.camera, capture.classes, capture.labels)
         files["segmentation"] = degradation.degraded_labels(labels, preset, for_labels)
     for folder, content in files.items():
         _write_png(root / folder / f"{view.name}.png", degradation.shifted(content, shift_px))
@@ -198,7 +199,16 @@ def _description(
     return "; ".join(parts)
 
 
-def _write_settings(path: Path, source: Path, description: str) -> None:
+def _write_settings(path: Path, capture: Capture, description: str) -> None:
     """Write the source's settings after the new tag: a top-level key must precede any table."""
-    settings = source.read_text("utf-8")
+    source = capture.root / "capture.toml"
+    settings = source.read_text("utf-8-sig")
+    if capture.labels.indices or capture.labels.colours:  # the copy's label maps hold positions in the classes
+        blocks = re.split(r"(?m)^(?=[ \t]*\[+[^,\[\]]+\]+[ \t]*(?:#.*)?$)", settings)
+        kept = [block for block in blocks if not re.match(r"\s*\[\s*segmentation\s*[.\]]", block)]
+        settings = f"{''.join(kept).rstrip()}\n\n[segmentation]\nclasses = {json.dumps(capture.classes)}\n"
+        parse_toml(
+            settings.encode(),
+            partial(InputError, "[segmentation] cannot be rewritten", where=source, fix="write it as a table"),
+        )
     path.write_text(f"{_TAG} = {json.dumps(description, ensure_ascii=False)}\n{settings}", "utf-8")

@@ -6,6 +6,7 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float
 
+from registration.capture import label_maps
 from registration.capture.class_names import BACKGROUND, KNOWN
 from registration.capture.samples import ViewSample
 from registration.capture.text import listed
@@ -106,12 +107,14 @@ def _check_label_order(capture: Capture, samples: Sequence[ViewSample]) -> None:
         moved = behind[1] > _MOST * behind.sum() > 0
     named = outside in KNOWN and outside != BACKGROUND and counts[0, counts[0].argmax()] > counts[1, counts[0].argmax()]
     if share > _MOST and (moved or named):
+        fits = label_maps.fitting_tables(capture.views)
+        looks = f'; the maps look like those of {" or ".join(fits)}: write table = "{fits[0]}"' if fits else ""
         raise InputError(
             "The labels' classes are in another order, or the background has no name",
             where=capture.root / "capture.toml",
             expected="background outside the masks",
             got=f"{outside} at {100 * share:.0f} % of the pixels outside the masks",
-            fix="check that classes[k] of [segmentation] is the name of index k, from 0 on",
+            fix=f"check that classes[k] of [segmentation] is the name of index k, from 0 on{looks}",
         )
 
 
@@ -157,12 +160,13 @@ def _exchanged_classes(capture: Capture, samples: Sequence[ViewSample]) -> list[
                 verdicts[view.name] = verdict
         exchanged = [name for name, verdict in verdicts.items() if verdict]
         if len(exchanged) > len(verdicts) / 2 and (len(exchanged) > 1 or len(capture.views) == 2):
+            side = ', or write left = "image" there ("subject" if it was)' if first == "left_eye" else ""
             raise InputError(
                 f"The labels {first} and {second} are exchanged",
                 where=capture.root / "segmentation",
                 expected=f"{first} where the landmarks show it; left is the subject's left",
                 got=f"it lies at the {second} in {len(exchanged)} of {len(verdicts)} views: {listed(exchanged, 5)}",
-                fix=f"exchange {first} and {second} in [segmentation] classes of capture.toml",
+                fix=f"exchange {first} and {second} in [segmentation] classes of capture.toml{side}",
             )
         if exchanged:
             warnings.append(f"{first} and {second} are exchanged in labels or landmarks: {listed(exchanged)}")

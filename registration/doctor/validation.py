@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from registration.capture import headers, triangulation
+from registration.capture import headers, label_maps, triangulation
 from registration.capture.class_names import BACKGROUND
 from registration.capture.samples import ViewSample, sample_views
 from registration.capture.scan import SCANS, Scan
@@ -73,6 +73,7 @@ def validate_capture(capture: Capture, *, use_scan: bool = True) -> Ledger:
     warnings += require_weight(capture, channels)
     warnings += exchanged.exchanged_views(capture, samples, points)
     warnings += landmark_checks.unnamed_schemes(capture)
+    warnings += label_maps.renamed_classes(capture)
     rows = [_scan_channel(capture, scan)]
     if scan is not None:
         warnings += scan_warnings(capture, scan, points)
@@ -137,12 +138,14 @@ def _check_headers(capture: Capture, view: View) -> None:
                 fix="write it with 16 bits",
             )
     if view.segmentation is not None and not capture.classes:
+        fits = label_maps.fitting_tables(capture.views)
+        looks = f'the maps look like those of {" or ".join(fits)}: write table = "{fits[0]}"' if fits else ""
         raise InputError(
             "The label maps have no class names",
             where=capture.root / "capture.toml",
-            expected='[segmentation] classes = ["background", ...]',
+            expected='[segmentation] classes = ["background", ...], or table = "..."',
             got="nothing",
-            fix="name every label index",
+            fix=looks or "name every label index, or the table of the program that wrote the maps",
         )
 
 

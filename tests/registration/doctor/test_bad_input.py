@@ -230,7 +230,7 @@ def no_classes(root: Path) -> None:
     path.write_text(path.read_text().split("[segmentation]")[0])
 
 
-@bad("The label map is not a map of indices", where="segmentation/cam2.png", got="RGB", fix="class index")
+@bad("The label map is in colours, and no colour has a name", where="cam2.png", got="RGB", fix="class index")
 def labels_in_colour(root: Path) -> None:
     path = root / "segmentation" / "cam2.png"
     Image.open(path).convert("RGB").save(path)

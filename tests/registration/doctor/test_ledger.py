@@ -51,8 +51,8 @@ def test_each_pixel_is_lost_to_one_reason(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     "names, fix",
     [
-        ("background face l_eye r_eye u_lip l_lip ear mouth neck", "rename face to skin, l_eye to left_eye"),
-        ("hintergrund haut a b c d e f g", "name the face's index skin"),
+        ("background skn left_eye right_eye upper_lip lower_lip ears mouth_interior neck", "rename skn to skin"),
+        ("hintergrund haut a b c d e f g", 'ignore = ["hintergrund", "haut", "a", '),
     ],
 )
 def test_classes_of_another_vocabulary_are_refused(tmp_path: Path, names: str, fix: str) -> None:
@@ -60,7 +60,8 @@ def test_classes_of_another_vocabulary_are_refused(tmp_path: Path, names: str, f
     faulty.classes(root, lambda _: names.split())
     with pytest.raises(InputError) as caught:
         faulty.warnings(root)
-    assert caught.value.what == "Nothing of segmentation/ counts" and fix in caught.value.fix
+    assert caught.value.what == "A segmentation class is unknown" and fix in caught.value.fix
+    assert "celebamask_hq, " in str(caught.value.expected) and "lapa" in str(caught.value.expected)
 
 
 @needs_shared
@@ -75,11 +76,15 @@ def test_other_spellings_of_classes_count(tmp_path: Path, style: object) -> None
 
 
 @needs_shared
-def test_an_unknown_class_of_the_face_is_warned_of(tmp_path: Path) -> None:
+def test_other_names_of_classes_are_told(tmp_path: Path) -> None:
     root = faulty.copy(tmp_path)
     faulty.classes(root, lambda names: ["face" if name == "skin" else name for name in names])
-    (warning,) = faulty.warnings(root).splitlines()
-    assert "60 % class face" in warning and "rename face to skin" in warning
+    assert faulty.warnings(root) == "classes with other names are read so, left is the subject's: face as skin"
+    faulty.classes(root, lambda names: ["haut" if name == "face" else name for name in names])
+    path = root / "capture.toml"
+    path.write_text(path.read_text() + 'ignore = ["haut"]\n')
+    found = channels(root)["segmentation"]
+    assert found.losses["class ignored haut"] > 0.5 * found.total and faulty.warnings(root) == ""  # it was said
 
 
 @needs_shared
