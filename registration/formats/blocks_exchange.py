@@ -23,7 +23,7 @@ from registration.formats.photographs import (
 )
 from registration.formats.source import Distortion, Format, ReadOptions, SourceCapture, SourceView
 from registration.formats.xml_files import Element, read_xml
-from registration.formats.xml_head import xml_file
+from registration.formats.xml_head import need_xml_file, xml_file
 
 _ROOT = "BlocksExchange"
 _DIRECTIONS = {"Right": (1, 0), "Left": (-1, 0), "Down": (0, 1), "Up": (0, -1)}  # in OpenCV's axes
@@ -44,7 +44,7 @@ def read(path: Path, options: ReadOptions) -> SourceCapture:
         InputError: the file is malformed, has several blocks, is in geographic coordinates, has a fisheye or spherical
             camera, no photograph has a whole pose, or an image is missing.
     """
-    file = xml_file(path, _ROOT) or path
+    file = need_xml_file(path, _ROOT)
     root = read_xml(file)
     if root.name != _ROOT:
         raise root.error(f"the element <{_ROOT}>", f"<{root.name}>")

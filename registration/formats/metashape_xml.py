@@ -6,7 +6,7 @@ from registration.formats.metashape_chunk import only_chunk, read_chunk
 from registration.formats.photographs import Photographs, scan_beside
 from registration.formats.source import Format, ReadOptions, SourceCapture
 from registration.formats.xml_files import read_xml
-from registration.formats.xml_head import xml_file
+from registration.formats.xml_head import need_xml_file, xml_file
 
 
 def _detect(path: Path) -> bool:
@@ -19,7 +19,7 @@ def read(path: Path, options: ReadOptions) -> SourceCapture:
     Raises:
         InputError: the file is missing or malformed, or as `registration.formats.metashape_chunk.read_chunk`.
     """
-    file = xml_file(path, "document") or path
+    file = need_xml_file(path, "document")
     document = read_xml(file)
     if document.name != "document":
         raise document.error("the element <document> of Metashape", f"<{document.name}>")

@@ -15,6 +15,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
+from registration.capture.text import listed
 from registration.errors import InputError
 from registration.formats.files import stored_size
 from registration.formats.photographs import (
@@ -73,6 +74,15 @@ def _file(path: Path) -> Path | None:
     return found[0] if len(found) == 1 else None
 
 
+def _only(path: Path) -> Path:
+    """The only CSV file in a folder, for the message about it; the path itself if it is no folder."""
+    files = sorted(path.glob("*.csv")) if path.is_dir() else [path]
+    if len(files) == 1:
+        return files[0]
+    got = listed([file.name for file in files], 5) or "none"
+    raise InputError("The CSV file to read is not known", where=path, expected="one CSV file", got=got, fix=_FIX)
+
+
 def _is_ours(file: Path) -> bool:
     if file.suffix.lower() != ".csv" or not file.is_file():
         return False
@@ -95,7 +105,7 @@ def read(path: Path, options: ReadOptions) -> SourceCapture:
     Raises:
         InputError: the file is missing or malformed, or an image is missing.
     """
-    file = _file(path) or path
+    file = _file(path) or _only(path)
     rows = list(_rows(file))
     if not rows:
         raise _refuse(file)(expected="a line for each camera", got="none")
