@@ -10,9 +10,11 @@ from rich.text import Text
 
 from registration import terminal
 from registration.frames import MM_PER_M
-from registration.model import gnm_npz, landmarks, regions
+from registration.model import fetch, gnm_npz, gnmw, jaw_order, landmarks, regions
 from registration.model.gnm_npz import GNMData
+from registration.model.gnmw import WebModel
 from registration.storage.files import check_output_file
+from registration.storage.hashing import hash_file
 
 COLOURS = {  # of the classes in images, linear
     "skin": (0.86, 0.70, 0.60),
@@ -27,7 +29,7 @@ _VIEWS = {"the subject's right": 75.0, "front": 0.0, "the subject's left": -75.0
 
 
 def describe(path: Path, picture: Path | None = None, console: Console | None = None) -> GNMData:
-    """Print dimensions, parts, joints, regions and landmark schemes of a model file.
+    """Print origin, digests, dimensions, parts, joints, regions and landmark schemes of a model file.
 
     Args:
         path: the model's NPZ file.
@@ -44,16 +46,40 @@ def describe(path: Path, picture: Path | None = None, console: Console | None = 
     schemes = landmarks.schemes_beside(path, data.template_vertex_positions)
     title = f"  GNM {data.variant} {data.version}  sha256 {gnm_npz.content_hash(data)[:12]}"
     console.print(Text.assemble((str(path), "bold"), title))
-    for table in (_dimensions(data), _parts(data), _joints(data), _regions(data)):
+    for table in (_file(Path(path), data), _dimensions(data), _parts(data), _joints(data), _regions(data)):
         console.print(table)
-    points = [f"{scheme.name} ({len(scheme.indices)} points)" for scheme in schemes.values()]
-    console.print(f"landmark schemes: {', '.join(points) or 'none beside the file'}")
-    if data.extra:
-        console.print(f"fields outside the schema, kept: {', '.join(data.extra)}")
+    console.print(f"landmark schemes: {', '.join(map(_scheme, schemes.values())) or 'none beside the file'}")
+    for remark in data.remarks:
+        console.print(Text(f"note: {remark}"))
     if picture is not None:
         draw(data, picture, schemes)
         console.print(f"picture: {picture}")
     return data
+
+
+def describe_web(path: Path, console: Console | None = None) -> WebModel:
+    """Print the contents of a GNMW file. Raises InputError if it is none."""
+    console = console or terminal.console()
+    model = gnmw.read(path)
+    console.print(Text.assemble((str(path), "bold"), f"  GNMW version {gnmw.VERSION}"))
+    table = _table("contents", "name", "count", "field")
+    for name, count, note in (
+        ("vertices", len(model.vertices), ""),
+        ("triangles", len(model.triangles), ""),
+        ("identity", len(model.identity_scales), _step(model.identity_scales)),
+        ("expression", len(model.expression_scales), _step(model.expression_scales)),
+    ):
+        table.add_row(name, f"{count:,}", note)
+    table.add_row("bytes", f"{Path(path).stat().st_size:,}", Text(f"sha256 {hash_file(Path(path))}", overflow="fold"))
+    console.print(table)
+    if model.extra:
+        console.print(Text(f"note: arrays that version {gnmw.VERSION} does not have: {', '.join(model.extra)}"))
+    console.print("No joints, vertex groups, names or texture coordinates: for display, not for registration.")
+    return model
+
+
+def _step(scales: Float[np.ndarray, "K"]) -> str:
+    return f"8 bits a value; the largest step is {MM_PER_M * scales.max():.4f} mm"
 
 
 def draw(data: GNMData, path: Path, schemes: dict[str, landmarks.LandmarkScheme]) -> None:
@@ -121,6 +147,45 @@ def _table(title: str, *columns: str) -> Table:
     for column in columns:
         table.add_column(column, justify="left" if column in ("name", "parent", "names", "field") else "right")
     return table
+
+
+def _scheme(scheme: landmarks.LandmarkScheme) -> str:
+    order = {True: ", 2-6 of the right jaw reversed in the file", False: ""}[scheme.reversed_in_file]
+    if scheme.name == jaw_order.SCHEME and not scheme.reversed_in_file:
+        order = ", the jaw in the corrected order"
+    return f"{scheme.name} ({len(scheme.indices)} points{order})"
+
+
+def _file(path: Path, data: GNMData) -> Table:
+    table = _table("file", "name", "field")
+    digest = hash_file(path)
+    source, licence = _origin(path, digest)
+    inside = [name for name in data.extra if name in gnm_npz.SCHEMA.names(path)]
+    for name, value in (
+        ("version", f"{data.version}, variant {data.variant}"),
+        ("fields", f"the {len(gnm_npz.AXES)} of version {gnm_npz.VERSION}"),
+        ("other fields", ", ".join(data.extra) or "none"),
+        ("of these in the second file", ", ".join(name for name in data.extra if name not in inside) or "none"),
+        ("size", f"{path.stat().st_size:,} bytes"),
+        ("sha256 of the file", digest),
+        ("content id", gnm_npz.content_hash(data)),
+        ("topology id", gnm_npz.topology_hash(data.triangles)),
+        ("source", source),
+        ("licence", licence),
+    ):
+        table.add_row(name, Text(value, overflow="fold"))
+    return table
+
+
+def _origin(path: Path, digest: str) -> tuple[str, str]:
+    """Where a model file comes from, and its licence, as far as that is known."""
+    if (record := fetch.source_record(path)) is not None:
+        return f"{record.get('source')}: {record.get('address')}", str(record.get("licence"))
+    if digest == fetch.SHA256:
+        return f"Google, release {gnm_npz.VERSION}", fetch.LICENCE
+    if path.with_name(f"{path.stem}.manifest.json").is_file():
+        return f"built; see {path.stem}.manifest.json", "that of the registrations it was built from"
+    return "not recorded", "not recorded"
 
 
 def _dimensions(data: GNMData) -> Table:

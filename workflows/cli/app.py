@@ -58,6 +58,7 @@ GROUPS: Mapping[str, Mapping[str, Command]] = {
         "model bootstrap": model.bootstrap,
         "model fetch": model.fetch,
         "model info": model.info,
+        "model export": model.export,
         "model evaluate": model.evaluate,
     },
     "Farm": {

@@ -8,16 +8,47 @@ from tyro.conf import Positional, arg
 from workflows.cli.options import Folder, OptionalFolder, OptionalImage, OptionalModel, Seed
 
 
-def info(file: Positional[Annotated[Path, arg(metavar="NPZ")]], /, out: OptionalImage = None) -> int:
-    """Describe a model file: dimensions, parts and regions.
+def info(file: Positional[Annotated[Path, arg(metavar="FILE")]], /, out: OptionalImage = None) -> int:
+    """Describe a model file: origin, digests, dimensions, parts and regions.
 
     Args:
-        file: The head model, a GNM NPZ file.
-        out: Image of the model to draw.
+        file: The head model, a GNM NPZ file; or a GNMW file for the web.
+        out: Image of the model to draw; not of a GNMW file.
     """
-    from registration.model.info import describe
+    from registration.errors import InputError
+    from registration.model import gnmw, info
 
-    describe(file, picture=out)
+    if file.suffix.lower() != gnmw.SUFFIX:
+        info.describe(file, picture=out)
+    elif out is None:
+        info.describe_web(file)
+    else:
+        fix = "omit --out, or give the model's NPZ file"
+        raise InputError("A GNMW file cannot be drawn", where=file, expected="a GNM NPZ file", got=file.name, fix=fix)
+    return 0
+
+
+def export(
+    model: Positional[Annotated[Path, arg(metavar="NPZ")]],
+    out: Positional[Annotated[Path, arg(metavar="FILE")]],
+    /,
+    extra_fields: bool = False,
+) -> int:
+    """Write a model for other programs: as GNMW for the web, or as official NPZ.
+
+    An NPZ file has exactly the fields that Google's loader accepts. A GNMW file holds the template, its triangles and
+    both bases with 8 bits a value; what that costs is printed.
+
+    Args:
+        model: The head model, a GNM NPZ file.
+        out: The file to write; its suffix, .gnmw or .npz, is the format.
+        extra_fields: Write fields outside the official ones into the same NPZ file, instead of a second one beside
+            it. Google's loader refuses such a file.
+    """
+    from registration.model.export import export_model
+
+    for line in export_model(model, out, extra_fields=extra_fields):
+        print(line)
     return 0
 
 
