@@ -50,6 +50,7 @@ class RegistrationInputs:
     recipe: Recipe
     neutral: Registration | None
     scan: Scan | None  # whose normals stand in for normal maps, or whose surface is fitted; None: neither
+    fits_scan: bool  # whether its surface is fitted
     digests: Mapping[str, str]  # input -> sha256
     config: Mapping[str, Any]  # the resolved options; decide the result together with the digests
     notes: tuple[str, ...]  # what is not used, or was read in another way than it is in the files
@@ -88,6 +89,7 @@ def read_inputs(
     schemes = read_schemes(model_path, data, options.landmark_files)
     landmarks = _triangulated(selected, schemes)
     _check_head_can_be_found(selected, landmarks)
+    scan = _scan_of_the_fit(selected, options)
     digests, config = _deciding(capture, data, schemes, start, options)
     return RegistrationInputs(
         capture=selected,
@@ -98,7 +100,8 @@ def read_inputs(
         landmarks=landmarks,
         recipe=recipe if start is None else expression_recipe(recipe),
         neutral=start,
-        scan=_scan_of_the_fit(selected, options),
+        scan=scan,
+        fits_scan=scan is not None and (options.use_scan == "always" or not any(v.normals for v in selected.views)),
         digests=digests,
         config=config,
         notes=(*data.remarks, *_reversed_files(capture, schemes)),

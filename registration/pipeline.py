@@ -6,6 +6,7 @@ from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -27,6 +28,7 @@ from registration.fit.problem import FitProblem, FitTrace, assess, refine
 from registration.fit.recipes import Stage
 from registration.fit.variables import InitialGuess, initial_guess_from
 from registration.fit.view_weights import ViewErrors
+from registration.geometry.nearest_planes import CloudPlanes, MeshPlanes, NearestPlanes
 from registration.geometry.surface_views import SurfaceViews
 from registration.inputs import RegistrationInputs, read_inputs
 from registration.model.atlas import texture_atlas
@@ -49,7 +51,7 @@ from registration.storage.registration_folder import (
 )
 from registration.targets.classes import class_map
 from registration.targets.pyramid import build_pyramid
-from registration.types import Parameters, Registration, Status
+from registration.types import Camera, Parameters, Registration, Status
 
 CONVERGED_MM = 0.05  # 95th percentile of vertex motion over the last tenth of the last stage
 MAX_LANDMARK_PX = 3.0  # median residual at 512 px of head height
@@ -160,10 +162,7 @@ def _context(inputs: RegistrationInputs, seed: int, device: torch.device, progre
     """Decode the views and collect the inputs of the fit."""
     classes, recipe, count = class_map(inputs.capture.classes), inputs.recipe, len(inputs.capture.views)
     capture = inputs.capture.cameras_relative_to(inputs.origin)
-    surface = None
-    if inputs.scan is not None and len(inputs.scan.triangles):
-        cameras = [view.camera for view in capture.views]
-        surface = SurfaceViews(inputs.scan.vertices - inputs.origin, inputs.scan.triangles, cameras)
+    surface, planes = _scan(inputs, [view.camera for view in capture.views])
     pyramid = build_pyramid(
         capture,
         classes,
@@ -184,7 +183,19 @@ def _context(inputs: RegistrationInputs, seed: int, device: torch.device, progre
         seed=seed,
         neutral=inputs.neutral,
         triangulated={name: points - inputs.origin for name, points in inputs.landmarks.items()},
+        scan=planes,
     )
+
+
+def _scan(inputs: RegistrationInputs, cameras: Sequence[Camera]) -> tuple[SurfaceViews | None, NearestPlanes | None]:
+    """The scan as a source of normals, if it is a mesh, and as a surface to fit, if it is to be."""
+    if inputs.scan is None:
+        return None, None
+    vertices, triangles = inputs.scan.vertices - inputs.origin, inputs.scan.triangles
+    surface = SurfaceViews(vertices, triangles, cameras) if len(triangles) else None
+    if not inputs.fits_scan:
+        return surface, None
+    return surface, CloudPlanes(vertices) if surface is None else MeshPlanes(surface)
 
 
 class _StepProgress:
@@ -289,11 +300,23 @@ def _collect(inputs: RegistrationInputs, fitted: _Fitted, comparison: Comparison
             "views_not_trusted": dict(problem.view_weights.notes),
             "notes": [*inputs.notes, *fitted.initial.notes],
             **({"warnings": list(inputs.ledger.warnings)} if inputs.ledger.warnings else {}),
+            **({} if inputs.scan is None else {"scan_in_fit": _scan_in_fit(inputs, problem)}),
             "residuals": comparison.residuals,
         },
         config=inputs.config,
         inputs=inputs.digests,
     )
+
+
+def _scan_in_fit(inputs: RegistrationInputs, problem: FitProblem) -> dict[str, Any]:
+    """What of the scan the fit has used: the views that have its normals, and the share of skin that lies near it."""
+    assert inputs.scan is not None
+    without = [view.name for view in inputs.capture.views if view.normals is None]
+    distance = problem.context.scan_distance
+    return {
+        "normals": len(without) if len(inputs.scan.triangles) else 0,
+        "surface": None if distance is None else distance.share,
+    }
 
 
 def _status(

@@ -11,12 +11,14 @@ from jaxtyping import Float, Int
 from registration.fit.recipes import Recipe
 from registration.fit.variables import skin_triangles, skin_vertices
 from registration.geometry.large_steps import normalised_laplacian, spacing
+from registration.geometry.nearest_planes import NearestPlanes
+from registration.losses.scan import ScanDistance
 from registration.losses.self_intersection import SelfIntersectionPenalty
 from registration.losses.uv_ssim import UVSSIM
 from registration.model.gnm import GNM
 from registration.model.gnm_npz import GNMData
 from registration.model.landmarks import LandmarkScheme
-from registration.model.regions import crossing_parts, offset_regions, vertex_classes
+from registration.model.regions import crossing_parts, head_skin, offset_regions, vertex_classes
 from registration.render.renderer import Renderer
 from registration.targets.classes import ClassMap
 from registration.types import Registration, Targets
@@ -41,6 +43,7 @@ class FitContext:
     neutral: Registration | None = None  # of the subject, if the capture shows an expression
     # Landmarks of the capture by scheme, triangulated over its views; world, metres; NaN where not possible.
     triangulated: Mapping[str, Float[np.ndarray, "L 3"]] = field(default_factory=dict)
+    scan: NearestPlanes | None = None  # whose surface is fitted; world, metres
 
     @property
     def device(self) -> torch.device:
@@ -88,6 +91,14 @@ class FitContext:
     def self_intersection(self) -> SelfIntersectionPenalty:
         """The penalty on intersections between parts of the head."""
         return SelfIntersectionPenalty(self.data, self.device)
+
+    @cached_property
+    def scan_distance(self) -> ScanDistance | None:
+        """The distance of the head's skin, as the cameras see it, from the scan, if one is fitted."""
+        if self.scan is None:
+            return None
+        rows = np.flatnonzero(head_skin(self.data))
+        return ScanDistance(self.scan, rows, self.data.triangles, self.pyramid[0].pixels.cameras)
 
     @cached_property
     def uv_ssim(self) -> UVSSIM | None:

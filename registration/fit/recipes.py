@@ -52,6 +52,8 @@ class Weights:
     contacts: float = 0.0  # per mm^2 of excess depth, summed over the vertices inside another part
     tongue: float = 1e-5  # the same of the tongue, which is mostly occluded: about as strong as its prior
     slide: float = 0.0  # dissimilarity of the neutral's texture and the unwrapped images; expressions only
+    scan: float = 0.0  # per m^2 of robust squared distance from the scan, where it is fitted
+    scan_scale_mm: float = 1.0  # distance at which the scan's pull fades: hair, holes filled by a program, noise
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -114,6 +116,10 @@ class Recipe:
 _POSE = (("root", 5e-3), ("joints", 5e-3), ("position", 1e-3), ("eyes", 1e-3))
 
 
+_SCAN = 3e4  # per m^2
+_COARSE_MM = 10.0  # smoothing beyond which the head's shape is still unknown, and closest points are wrong ones
+
+
 def _rates(*pairs: tuple[str, float], end: float = 0.05) -> tuple[tuple[str, Rate], ...]:
     return tuple((name, Rate(start=rate, end=rate * end, hold=0.5)) for name, rate in pairs)
 
@@ -137,7 +143,16 @@ def _offsets(
         level=level,
         lengths=Lengths(smoothing_mm=smoothing_mm, half_gain_mm=half_gain_mm),
         free=(("offsets", Rate(start=start, end=end)), ("eyes", Rate(start=start / 10, end=end / 10))),
-        weights=Weights(rgb=0.3, ssim=ssim, classes=0.1, landmarks=0.01, contacts=2e-4, slide=0.5),
+        weights=Weights(
+            rgb=0.3,
+            ssim=ssim,
+            classes=0.1,
+            landmarks=0.01,
+            contacts=2e-4,
+            slide=0.5,
+            scan=_SCAN if smoothing_mm < _COARSE_MM else 0.0,
+            scan_scale_mm=max(0.5, 0.3 * smoothing_mm),
+        ),
         texture=True,
     )
 

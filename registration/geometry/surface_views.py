@@ -61,21 +61,21 @@ class SurfaceViews:
                 longer.
             boundary_m: distance from the surface's borders, also those of holes, within which nothing is trusted.
         """
-        self._vertices = np.asarray(vertices, np.float64)
-        self._triangles = np.ascontiguousarray(triangles, np.int64)
-        self._caster = RayCaster(self._vertices, self._triangles)
-        faces = torch.from_numpy(self._triangles)
-        centred = self._vertices - self._vertices.mean(0)
+        self.vertices: Float[np.ndarray, "V 3"] = np.asarray(vertices, np.float64)
+        self.triangles: Int[np.ndarray, "F 3"] = np.ascontiguousarray(triangles, np.int64)
+        self._caster = RayCaster(self.vertices, self.triangles)
+        faces = torch.from_numpy(self.triangles)
+        centred = self.vertices - self.vertices.mean(0)
         normals = _smoothed(
-            vertex_normals(torch.from_numpy(centred), faces).numpy(), centred, self._triangles, smoothing_m
+            vertex_normals(torch.from_numpy(centred), faces).numpy(), centred, self.triangles, smoothing_m
         )
-        a, b, c = (centred[self._triangles[:, k]] for k in range(3))
+        a, b, c = (centred[self.triangles[:, k]] for k in range(3))
         self._plane = np.cross(b - a, c - a)  # of each face, twice its area long
         if self._seen_from_inside(cameras):
             normals, self._plane = -normals, -self._plane
         self.normals: Float[np.ndarray, "V 3"] = normals
-        border = _near_border(self._vertices, self._triangles, boundary_m)
-        self._at_border = np.asarray(border[self._triangles].any(1))  # faces
+        border = _near_border(self.vertices, self.triangles, boundary_m)
+        self.at_border = np.asarray(border[self.triangles].any(1))  # (F,)
 
     def view(self, camera: Camera) -> SurfaceView:
         """Render depth, normals and weights for one camera.
@@ -85,15 +85,15 @@ class SurfaceViews:
         """
         face, barycentric = self._caster.rasterize(camera)
         hit = face >= 0
-        corners, share = self._triangles[face[hit]], barycentric[hit]
-        point = np.einsum("pk,pkc->pc", share, self._vertices[corners])
+        corners, share = self.triangles[face[hit]], barycentric[hit]
+        point = np.einsum("pk,pkc->pc", share, self.vertices[corners])
         normal = np.einsum("pk,pkc->pc", share, self.normals[corners])
         normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-20)
         towards = camera.centre - point
         towards /= np.linalg.norm(towards, axis=1, keepdims=True)
         cosine = (normal * towards).sum(1)
         facing = np.einsum("pc,pc->p", self._plane[face[hit]], towards)
-        trusted = (cosine > _LEAST_COSINE) & (facing > 0) & ~self._at_border[face[hit]]
+        trusted = (cosine > _LEAST_COSINE) & (facing > 0) & ~self.at_border[face[hit]]
         depth, normals, weight = np.full(face.shape, np.inf), np.zeros((*face.shape, 3)), np.zeros(face.shape)
         depth[hit] = point @ camera.T_cam_world[2, :3] + camera.T_cam_world[2, 3]
         normals[hit], weight[hit] = normal, np.where(trusted, cosine, 0)
@@ -108,7 +108,7 @@ class SurfaceViews:
             small = camera.scaled(*(max(1, side * _VOTE_PX // size) for side in (camera.width_px, camera.height_px)))
             face = self._caster.rasterize(small)[0]
             seen = face[face >= 0]
-            towards = camera.centre - self._vertices[self._triangles[seen, 0]]
+            towards = camera.centre - self.vertices[self.triangles[seen, 0]]
             balance += int(np.sign((self._plane[seen] * towards).sum(1)).sum())
         return balance < 0
 

@@ -65,6 +65,7 @@ def remarks(registration: Assessed) -> list[str]:
         for view, why in figures.get("views_not_trusted", {}).items()
     ]
     lines += [f"{note[:1].upper()}{note[1:]}." for note in figures.get("notes", [])]
+    lines += _scan_in_fit(figures.get("scan_in_fit", {}))
     unmeasured = figures.get("unmeasured", {})
     lines += [
         f"{METRIC_TITLES[name]} is not measured: {unmeasured[name]}."
@@ -77,6 +78,16 @@ def remarks(registration: Assessed) -> list[str]:
         if row.get(BEYOND_KEY)
     ]
     return lines
+
+
+def _scan_in_fit(used: Mapping[str, Any]) -> list[str]:
+    """A line that says what of the scan the fit has used, if anything."""
+    views, share = used.get("normals"), used.get("surface")
+    parts = [f"its normals in the {views} views without normal maps"] if views else []
+    parts += [] if share is None else [f"its surface on {share:.0%} of the head's skin"]
+    if not parts:
+        return []
+    return [f"The scan took part in the fit: {', '.join(parts)}. Its distances do not judge the fit independently."]
 
 
 def _intersection(pair: str, count: int, worst_mm: float, view: str | None) -> str:

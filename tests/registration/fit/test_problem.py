@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 
+from registration.capture.scan import read_scan
 from registration.fit import problem as problem_module
 from registration.fit import terms
 from registration.fit.context import FitContext, ViewOrder
@@ -15,6 +16,8 @@ from registration.fit.problem import FitProblem, assess, refine
 from registration.fit.recipes import Recipe, Stage, preview
 from registration.fit.terms import StageContext, StepState, Term
 from registration.fit.variables import InitialGuess
+from registration.geometry.nearest_planes import MeshPlanes
+from registration.geometry.surface_views import SurfaceViews
 from registration.inputs import RegistrationInputs, read_inputs
 from registration.model.atlas import texture_atlas
 from registration.model.gnm import GNM
@@ -68,6 +71,21 @@ def test_stages_have_the_losses_of_their_weights_and_variables(context: FitConte
     assert set(trace.history[offsets.name]) == IMAGES | OFFSETS | {"rgb", "ssim", "eyes"}
     assert all(len(values) == 2 for losses in trace.history.values() for values in losses.values())
     assert set(trace.seconds) == {model.name, offsets.name}
+
+
+def test_a_scan_is_fitted_in_the_finer_stages_only(
+    context: FitContext, initial: InitialGuess, inputs: RegistrationInputs
+) -> None:
+    assert inputs.capture.scan is not None and inputs.scan is None  # there are normal maps
+    scan = read_scan(inputs.capture.scan)
+    cameras = [view.camera for view in inputs.capture.views]
+    planes = MeshPlanes(SurfaceViews(scan.vertices, scan.triangles, cameras))
+    stages = tuple(replace(stage, steps=2, level=1) for stage in preview().stages[:3])
+    problem = FitProblem(replace(context, scan=planes), initial)
+    trace = problem.run(stages)
+    assert ["scan" in trace.history[stage.name] for stage in stages] == [False, False, True]
+    assert 0 < trace.history[stages[2].name]["scan"][0] < 1
+    assert problem.context.scan_distance is not None and 0.2 < problem.context.scan_distance.share < 1
 
 
 def test_a_new_term_is_a_factory_in_the_list(

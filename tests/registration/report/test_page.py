@@ -187,7 +187,10 @@ def test_remarks_name_low_weights_exclusions_and_intersections():
         "views_not_trusted": {"cam03": "silhouette 35 px off the other views"},
         "intersections": {"pairs": {"tongue in gums": row, "ears in skin": {**row, "vertices_beyond_0.3mm": 0}}},
     }
+    figures["scan_in_fit"] = {"normals": 22, "surface": 0.813}
     page = render_report(some_inputs(registration=a_registration(figures=figures)))
+    used = "its normals in the 22 views without normal maps, its surface on 81% of the head"
+    assert f"<li>The scan took part in the fit: {used}" in page
     assert "<li>View cam03 disagrees with the others and counts little: silhouette 35 px off the other views." in page
     assert "<li>Landmarks 2-6 of scheme 68 do not fit" in page
     sentence = "2 vertices of the tongue lie inside the gums, worst 0.8 mm deeper than in the model itself"
