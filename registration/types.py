@@ -12,6 +12,7 @@ from jaxtyping import Bool, Float, Int, Shaped
 from torch import Tensor
 
 Status = Literal["converged", "stopped", "failed"]
+NormalsFrame = Literal["camera_opencv", "camera_opengl", "world"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -74,6 +75,7 @@ class View:
     image: Path
     mask: Path | None = None
     normals: Path | None = None
+    normals_frame: NormalsFrame = "camera_opencv"  # axes of the stored normals
     segmentation: Path | None = None
     landmarks: Mapping[str, Float[np.ndarray, "L 3"]] = field(default_factory=dict)  # scheme -> x_px y_px confidence
     colour: Colour = Colour()

@@ -11,7 +11,7 @@ from registration.capture.headers import require_size
 from registration.capture.image_names import image_file
 from registration.capture.landmark_files import read_landmarks
 from registration.capture.scan import find_scan
-from registration.capture.settings import read_settings
+from registration.capture.settings import CaptureSettings, read_settings
 from registration.errors import InputError
 from registration.storage.reading import open_file
 from registration.types import Camera, Capture, View
@@ -46,7 +46,7 @@ def read_capture(root: Path, *, cameras_of: Callable[[Path], Mapping[str, Camera
     for path in (root / "sparse", *sorted((root / "sparse").rglob("*"))):
         _inside(root, path)
     cameras = cameras_of(root / "sparse")
-    views = tuple(_read_view(root, name, cameras[name]) for name in sorted(cameras, key=natural_key))
+    views = tuple(_read_view(root, name, cameras[name], settings) for name in sorted(cameras, key=natural_key))
     _check_names(root, views)
     scan, truth = find_scan(root), root / "ground_truth.npz"
     return Capture(
@@ -67,7 +67,7 @@ def natural_key(name: str) -> list[tuple[int, int, str]]:
     return [(0, int(part), "") if part.isdecimal() else (1, 0, part) for part in re.split(r"(\d+)", name) if part]
 
 
-def _read_view(root: Path, file_name: str, camera: Camera) -> View:
+def _read_view(root: Path, file_name: str, camera: Camera, settings: CaptureSettings) -> View:
     relative = image_file(root, file_name)
     image = _inside(root, root / "images" / relative)
     require_size(image, "image", camera.width_px, camera.height_px)
@@ -78,6 +78,7 @@ def _read_view(root: Path, file_name: str, camera: Camera) -> View:
         image=image,
         mask=_channel(root, "masks", relative, *_MASK_SUFFIXES),
         normals=_channel(root, "normals", relative, ".png"),
+        normals_frame=settings.normals_frame,
         segmentation=_channel(root, "segmentation", relative, ".png"),
         landmarks={} if landmarks is None else read_landmarks(landmarks),
     )

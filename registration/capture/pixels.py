@@ -55,7 +55,7 @@ def read_view(view: View, capture: Capture, *, downsample: int = 1) -> ViewPixel
     normals = (
         None
         if view.normals is None
-        else _unit(_resample(read_normals(view.normals, camera), decode_normals, strips, valid))
+        else _unit(in_camera(_resample(read_normals(view.normals, camera), decode_normals, strips, valid), view))
     )
     coverage = None
     if view.segmentation is not None:
@@ -245,6 +245,14 @@ def decode_normals(raw: np.ndarray) -> Float[np.ndarray, "H W 3"]:
     normals = raw * np.float32(2 / 65535) - 1
     normals[background] = 0
     return normals
+
+
+def in_camera(normals: Float[np.ndarray, "*S 3"], view: View) -> Float[np.ndarray, "*S 3"]:
+    """Return normals of a view's map, in the axes that it is said to have, in the camera's frame (OpenCV's axes)."""
+    if view.normals_frame == "camera_opencv":
+        return normals
+    rotation = view.camera.T_cam_world[:3, :3] if view.normals_frame == "world" else np.diag([1.0, -1.0, -1.0])
+    return np.asarray(normals @ rotation.T.astype(normals.dtype), normals.dtype)
 
 
 def _unit(vectors: Float[np.ndarray, "H W 3"]) -> Float[np.ndarray, "H W 3"]:

@@ -79,7 +79,7 @@ def _sample(view: View, capture: Capture, decode_normals: bool) -> ViewSample:
     if _small(camera):
         grey = _reduced_grey(pixels.read_image(view.image, camera), width, height)
     if view.normals is not None and (_small(camera) or decode_normals):
-        normals = pixels.decode_normals(pixels.read_normals(view.normals, camera)[some, some])
+        normals = pixels.in_camera(pixels.decode_normals(pixels.read_normals(view.normals, camera)[some, some]), view)
     if mask is not None:
         subject = mask > 127
     elif labels is not None and BACKGROUND in classes:

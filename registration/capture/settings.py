@@ -6,15 +6,15 @@ from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 from registration.capture.label_settings import read_labels_table
 from registration.errors import InputError
 from registration.storage.reading import parse_toml, read_bytes
-from registration.types import LabelCode
+from registration.types import LabelCode, NormalsFrame
 
 UNITS_M = {"m": 1.0, "mm": 1e-3, "cm": 1e-2, "dm": 0.1, "km": 1e3, "in": 0.0254, "inch": 0.0254, "ft": 0.3048}
-_RESERVED = ("subject", "expression", "units", "segmentation")
+_RESERVED = ("subject", "expression", "units", "segmentation", "normals")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -26,6 +26,7 @@ class CaptureSettings:
     classes: tuple[str, ...]  # as `class_names.meaning` spells them, each once
     labels: LabelCode
     tags: Mapping[str, Any]
+    normals_frame: NormalsFrame = "camera_opencv"
 
 
 def read_settings(path: Path, inside: Callable[[Path], Path] = Path) -> CaptureSettings:
@@ -70,6 +71,7 @@ def read_settings(path: Path, inside: Callable[[Path], Path] = Path) -> CaptureS
         classes=classes,
         labels=labels,
         tags={key: value for key, value in settings.items() if key not in _RESERVED},
+        normals_frame=_normals_frame(path, settings.get("normals", {})),
     )
 
 
@@ -84,6 +86,22 @@ def _labels(path: Path, segmentation: object, inside: Callable[[Path], Path]) ->
     if "classes" not in segmentation and (near := _nearest("classes", segmentation, ("labels", "names"))) is not None:
         raise refuse("[segmentation] lacks the class names", 'classes = ["background", ...]', f"{near} = ...")
     return read_labels_table(path, segmentation, inside)
+
+
+def _normals_frame(path: Path, normals: object) -> NormalsFrame:
+    """The axes of the normal maps. Raises InputError."""
+    frames: tuple[NormalsFrame, ...] = get_args(NormalsFrame)
+    table = normals if isinstance(normals, dict) else {"normals": normals}
+    stated, unknown = table.get("frame", frames[0]), sorted(set(table) - {"frame"})
+    if stated not in frames or unknown:
+        raise InputError(
+            "The axes of the normals are stated wrongly",
+            where=path,
+            expected="[normals] with " + " or ".join(f'frame = "{frame}"' for frame in frames),
+            got=f"{unknown[0]} = ..." if unknown else repr(stated),
+            fix="see the capture folder in docs/formats.md",
+        )
+    return frames[frames.index(stated)]
 
 
 def _misspelt(key: str, settings: Iterable[str]) -> str:

@@ -17,7 +17,7 @@ from jaxtyping import Float
 from registration.capture.samples import ViewSample
 from registration.doctor.contradictions import overlap
 from registration.errors import InputError
-from registration.types import Camera
+from registration.types import Camera, NormalsFrame
 
 _MARGIN = 0.15  # by which other axes must agree better, of 2: 1 for facing and 1 at the outline
 _RIM = 2  # samples, width of the outline
@@ -45,13 +45,16 @@ class _Moments:
     world: Float[np.ndarray, "3 3"]
 
 
-def check_normal_axes(folder: Path, samples: Sequence[ViewSample], cameras: Sequence[Camera]) -> list[str]:
+def check_normal_axes(
+    folder: Path, samples: Sequence[ViewSample], cameras: Sequence[Camera], stated: NormalsFrame = "camera_opencv"
+) -> list[str]:
     """Compare the axes of all normal maps with those that agree best with the outlines and the viewing directions.
 
     Args:
         folder: of the normal maps, for messages.
         samples: of the views, as the next.
         cameras: of the views.
+        stated: the axes that the maps are said to have; samples are converted from these.
 
     Returns:
         Warnings about single views.
@@ -80,7 +83,7 @@ def check_normal_axes(folder: Path, samples: Sequence[ViewSample], cameras: Sequ
             expected="the camera's frame: x right, y down, z away from the camera, so that z < 0 where it sees",
             got=f"normals {_name(axes, world)}: these agree with outlines and viewing directions by "
             f"{_share(given + better)}, the camera's axes by {_share(given)}",
-            fix=_conversion(axes, world),
+            fix=_mend(axes, world, stated),
         )
     warnings = []
     for name, found in moments.items():
@@ -180,6 +183,17 @@ def _name(axes: tuple[int, ...], world: bool) -> str:
     if world:
         return "in the world's frame" + ("" if axes == (1, 2, 3) else f", as {_formula(axes)} of the capture's")
     return _NAMES.get(axes, f"as {_formula(axes)}")
+
+
+def _mend(axes: tuple[int, ...], world: bool, stated: NormalsFrame) -> str:
+    """The right statement in capture.toml, if there is one, or how to convert the maps."""
+    opposite: dict[NormalsFrame, NormalsFrame] = {"camera_opencv": "camera_opengl", "camera_opengl": "camera_opencv"}
+    frame = opposite.get(stated) if not world and axes == (1, -2, -3) else None
+    frame = "world" if world and stated == "camera_opencv" and axes == (1, 2, 3) else frame
+    statement = [] if frame is None else [f'write [normals] frame = "{frame}" into capture.toml']
+    if stated == "camera_opencv":
+        return ", or ".join([*statement, _conversion(axes, world)])
+    return (statement or [f'correct [normals] frame = "{stated}" in capture.toml'])[0]
 
 
 def _conversion(axes: tuple[int, ...], world: bool) -> str:

@@ -4,7 +4,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from registration.capture import native
+from registration.capture import native, pixels
 from registration.errors import InputError
 from tests.conftest import needs_shared
 from tests.registration.capture.small import make
@@ -83,3 +83,59 @@ def test_normals_of_a_ball_are_in_the_cameras_axes(tmp_path: Path) -> None:
     faulty.normals(root, lambda n: n * [1, -1, -1])
     with pytest.raises(InputError, match="other axes"):
         faulty.warnings(root)
+
+
+def stored_in(root: Path, frame: str) -> None:
+    """Convert the normal maps of a capture to other axes."""
+    for view in native.read_capture(root).views:
+        R = view.camera.T_cam_world[:3, :3]
+        faulty.normals(root, lambda n, R=R: n @ R if frame == "world" else n * [1, -1, -1], [view.name])
+
+
+def state(root: Path, frame: str) -> None:
+    with (root / "capture.toml").open("a", encoding="utf-8") as file:
+        file.write(f'\n[normals]\nframe = "{frame}"\n')
+
+
+@needs_shared
+@pytest.mark.parametrize("frame", ["camera_opengl", "world"])
+def test_stated_axes_are_converted(tmp_path: Path, frame: str) -> None:
+    root = faulty.copy(tmp_path)
+    stored_in(root, frame)
+    with pytest.raises(InputError, match="in other axes") as caught:
+        faulty.warnings(root)
+    assert f'write [normals] frame = "{frame}" into capture.toml' in caught.value.fix
+    state(root, frame)
+    assert faulty.warnings(root) == ""
+
+
+def test_converted_normals_are_those_of_the_camera(tmp_path: Path) -> None:
+    expected = native.read_capture(make(tmp_path / "camera"))
+    for frame in ("camera_opengl", "world"):
+        root = make(tmp_path / frame)
+        stored_in(root, frame)
+        state(root, frame)
+        found = native.read_capture(root)
+        for first, second in zip(expected.views, found.views, strict=True):
+            ours, theirs = (pixels.read_view(v, c).normals for v, c in ((first, expected), (second, found)))
+            np.testing.assert_allclose(ours, theirs, atol=1e-4)
+
+
+@needs_shared
+def test_axes_that_are_stated_wrongly_are_refused(tmp_path: Path) -> None:
+    root = faulty.copy(tmp_path)
+    state(root, "camera_opengl")
+    with pytest.raises(InputError, match="in other axes") as caught:
+        faulty.warnings(root)
+    assert caught.value.fix == 'write [normals] frame = "camera_opencv" into capture.toml'
+
+
+@pytest.mark.parametrize("table", ['[normals]\nframe = "opengl"', '[normals]\naxes = "world"', 'normals = "world"'])
+def test_a_statement_that_is_none_is_refused(tmp_path: Path, table: str) -> None:
+    root = make(tmp_path / "capture")
+    path = root / "capture.toml"
+    text = path.read_text(encoding="utf-8")
+    path.write_text(f"{table}\n{text}" if table.startswith("normals") else f"{text}\n{table}\n", encoding="utf-8")
+    with pytest.raises(InputError, match="stated wrongly") as caught:
+        native.read_capture(root)
+    assert 'frame = "camera_opengl"' in caught.value.expected
