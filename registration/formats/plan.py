@@ -67,8 +67,8 @@ def plan_views(source: SourceCapture) -> tuple[tuple[ViewPlan, ...], list[str]]:
 
 
 def _lens_name(view: SourceView) -> str:
-    names = [view.distortion.model] * (view.distortion.model != "none")
-    return " with ".join([*names, *["skew"] * (view.intrinsics[0, 1] != 0)])
+    parts = (view.distortion.model, "skew" if view.intrinsics[0, 1] else "none")
+    return " with ".join(part for part in parts if part != "none")
 
 
 def _plan(view: SourceView, notes: list[str]) -> ViewPlan:

@@ -4,7 +4,8 @@ Rays are traced through OpenCV's `undistortPoints`, pixel by pixel, so the image
 warp under test.
 """
 
-from dataclasses import replace
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import cv2
@@ -62,13 +63,25 @@ def distorted(cam: Camera, points: Float[np.ndarray, "P 3"]) -> Float[np.ndarray
     return cv2.projectPoints(points, rotation, cam.T_cam_world[:3, 3], cam.intrinsics, coefficients)[0][:, 0]
 
 
-def synthetic_view(name: str, cam: Camera) -> ViewArrays:
-    """A camera's view of the ball, with distortion; landmarks on the far side have confidence 0.2."""
-    y, x = np.mgrid[: cam.height_px, : cam.width_px] + 0.5
-    grid = np.stack([x, y], -1).reshape(-1, 1, 2)
+def undistorted(cam: Camera, pixels: Float[np.ndarray, "P 2"]) -> Float[np.ndarray, "P 2"]:
+    """Pixels on the plane z = 1 of the camera, by OpenCV."""
     coefficients = np.array(cam.distortion) if cam.distortion else None
     criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 200, 1e-12)
-    plane = cv2.undistortPoints(grid, cam.intrinsics, coefficients, criteria=criteria)[:, 0]
+    return cv2.undistortPoints(pixels[:, None], cam.intrinsics, coefficients, criteria=criteria)[:, 0]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Lens:
+    """How a view's pixels are traced and its landmarks are projected."""
+
+    plane: Callable[[Camera, Float[np.ndarray, "P 2"]], Float[np.ndarray, "P 2"]] = undistorted
+    project: Callable[[Camera, Float[np.ndarray, "P 3"]], Float[np.ndarray, "P 2"]] = distorted
+
+
+def synthetic_view(name: str, cam: Camera, lens: Lens = Lens()) -> ViewArrays:  # noqa: B008  frozen
+    """A camera's view of the ball, with distortion; landmarks on the far side have confidence 0.2."""
+    y, x = np.mgrid[: cam.height_px, : cam.width_px] + 0.5
+    plane = lens.plane(cam, np.stack([x, y], -1).reshape(-1, 2))
     rays = np.column_stack([plane, np.ones(len(plane))])
     rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
     centre = cam.T_cam_world[:3, 3]  # of the ball, camera frame
@@ -82,7 +95,7 @@ def synthetic_view(name: str, cam: Camera) -> ViewArrays:
     shape = (cam.height_px, cam.width_px)
     points = landmarks_68()
     facing = ((cam.centre - points) * points).sum(-1) > 0
-    landmarks = np.column_stack([distorted(cam, points), np.where(facing, 1.0, 0.2)])
+    landmarks = np.column_stack([lens.project(cam, points), np.where(facing, 1.0, 0.2)])
     return ViewArrays(
         name=name,
         camera=cam,
