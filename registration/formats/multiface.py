@@ -47,9 +47,21 @@ def _detect(path: Path) -> bool:
 def _root(path: Path) -> Path | None:
     """The entity's folder: the path, or two levels above a segment's folder."""
     for folder in (path, path.resolve().parent.parent):
-        if (folder / _KRT).is_file() and (folder / "images").is_dir():
+        if is_entity(folder):
             return folder
     return None
+
+
+def is_entity(path: Path) -> bool:
+    """Whether a folder is an entity's: with `KRT` and `images`."""
+    return (path / _KRT).is_file() and (path / "images").is_dir()
+
+
+def subject_of(entity: Path) -> str:
+    """Return the subject's number in the name of an entity's folder, or else the name."""
+    name = entity.resolve().name
+    found = _SUBJECT.fullmatch(name)
+    return found[1] if found else name
 
 
 def segments(path: Path) -> list[Path]:
@@ -87,11 +99,10 @@ def read(path: Path, options: ReadOptions) -> SourceCapture:
         )
     if (root / "tracked_mesh").is_dir():
         notes.append("tracked_mesh was left out: it is another model's registration, not a scan")
-    named = _SUBJECT.fullmatch(root.resolve().name)
     return SourceCapture(
         format=FORMAT.name,
         root=root,
-        subject=options.subject or (named[1] if named else root.resolve().name),
+        subject=options.subject or subject_of(root),
         expression=options.expression or segment.name,
         views=views,
         unit_m=_MM,

@@ -75,16 +75,22 @@ def read(path: Path, options: ReadOptions) -> SourceCapture:
     views = tuple(_view(camera, file, frame) for camera, (file, frame) in sorted(steps[chosen].items()))
     folder = files[0].parent
     notes = [f"time step {chosen} was read", "the FLAME parameters were not read"]
-    subject, _, expression = folder.resolve().name.partition("_")
+    subject, expression = names_of(folder)
     return SourceCapture(
         format=FORMAT.name,
         root=folder,
         subject=options.subject or subject,
-        expression=options.expression or expression.split("_")[0] or "neutral",
+        expression=options.expression or expression,
         views=views,
         unit_m=1.0,
         notes=tuple(notes),
     )
+
+
+def names_of(folder: Path) -> tuple[str, str]:
+    """Return subject and expression from the name of an export's folder, as 074_EMO-1_v16_DS4_whiteBg."""
+    subject, _, expression = folder.resolve().name.partition("_")
+    return subject, expression.split("_")[0] or "neutral"
 
 
 def _camera_id(frame: Fields) -> str:

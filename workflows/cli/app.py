@@ -43,6 +43,7 @@ GROUPS: Mapping[str, Mapping[str, Command]] = {
         "capture synth": capture.synth,
         "capture degrade": capture.degrade,
         "dataset synth": capture.synth_dataset,
+        "dataset import": importing.import_dataset,
     },
     "Register": {
         "register": register.register,
