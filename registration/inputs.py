@@ -101,7 +101,8 @@ def read_inputs(
         recipe=recipe if start is None else expression_recipe(recipe),
         neutral=start,
         scan=scan,
-        fits_scan=scan is not None and (options.use_scan == "always" or not any(v.normals for v in selected.views)),
+        fits_scan=scan is not None
+        and (options.use_scan == "always" or not any(view.has_normals for view in selected.views)),
         digests=digests,
         config=config,
         notes=(*data.remarks, *_reversed_files(capture, schemes)),
@@ -189,7 +190,7 @@ def _scan_of_the_fit(capture: Capture, options: RegisterOptions) -> Scan | None:
     """The scan if the fit uses its normals or its surface."""
     if capture.scan is None or options.use_scan == "never":
         return None
-    needed = options.use_scan == "always" or any(view.normals is None for view in capture.views)
+    needed = options.use_scan == "always" or not all(view.has_normals for view in capture.views)
     return read_scan(capture.scan) if needed else None
 
 

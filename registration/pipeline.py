@@ -311,7 +311,7 @@ def _collect(inputs: RegistrationInputs, fitted: _Fitted, comparison: Comparison
 def _scan_in_fit(inputs: RegistrationInputs, problem: FitProblem) -> dict[str, Any]:
     """What of the scan the fit has used: the views that have its normals, and the share of skin that lies near it."""
     assert inputs.scan is not None
-    without = [view.name for view in inputs.capture.views if view.normals is None]
+    without = [view.name for view in inputs.capture.views if not view.has_normals]
     distance = problem.context.scan_distance
     return {
         "normals": len(without) if len(inputs.scan.triangles) else 0,

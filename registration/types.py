@@ -76,9 +76,16 @@ class View:
     mask: Path | None = None
     normals: Path | None = None
     normals_frame: NormalsFrame = "camera_opencv"  # axes of the stored normals
+    depth: Path | None = None
+    depth_unit_m: float | None = None  # of the stored depths; None: metres, of floating-point numbers only
     segmentation: Path | None = None
     landmarks: Mapping[str, Float[np.ndarray, "L 3"]] = field(default_factory=dict)  # scheme -> x_px y_px confidence
     colour: Colour = Colour()
+
+    @property
+    def has_normals(self) -> bool:
+        """Whether a file gives normals: a map of them, or of depths."""
+        return self.normals is not None or self.depth is not None
 
 
 @dataclass(frozen=True, kw_only=True)

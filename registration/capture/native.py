@@ -7,6 +7,7 @@ from functools import partial
 from pathlib import Path, PurePosixPath
 
 from registration.capture.colmap import read_cameras
+from registration.capture.dense_maps import COLMAP_SUFFIXES, DEPTH_SUFFIXES
 from registration.capture.headers import require_size
 from registration.capture.image_names import image_file
 from registration.capture.landmark_files import read_landmarks
@@ -77,8 +78,10 @@ def _read_view(root: Path, file_name: str, camera: Camera, settings: CaptureSett
         camera=camera,
         image=image,
         mask=_channel(root, "masks", relative, *_MASK_SUFFIXES),
-        normals=_channel(root, "normals", relative, ".png"),
+        normals=_channel(root, "normals", relative, ".png", *COLMAP_SUFFIXES),
         normals_frame=settings.normals_frame,
+        depth=_channel(root, "depth", relative, *DEPTH_SUFFIXES),
+        depth_unit_m=settings.depth_unit_m,
         segmentation=_channel(root, "segmentation", relative, ".png"),
         landmarks={} if landmarks is None else read_landmarks(landmarks),
     )

@@ -13,6 +13,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float, UInt8
 
+from registration.capture.dense_maps import depth_normals, is_colmap_map, read_colmap_map, read_depth
 from registration.capture.headers import require_complete, require_size, undecodable
 from registration.capture.label_maps import read_labels
 from registration.capture.masks import subject_coverage
@@ -22,6 +23,8 @@ from registration.frames import opencv_intrinsics, srgb_to_linear
 from registration.storage.image_files import decode
 from registration.types import Camera, Capture, View, ViewPixels
 
+_MIN_SHARE = 0.75  # of a block's pixels with a depth
+_MAX_SPREAD = 0.01  # of a block's depths, of their mean: 5 mm at half a metre
 STRIP_PIXELS = 2**21  # converted to float at a time: 25 MB of float32 RGB
 _COLOUR = cv2.IMREAD_COLOR_RGB | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
 _AS_STORED = cv2.IMREAD_UNCHANGED | cv2.IMREAD_IGNORE_ORIENTATION
@@ -52,16 +55,16 @@ def read_view(view: View, capture: Capture, *, downsample: int = 1) -> ViewPixel
     valid = _valid(camera, strips)
     rgb = _resample(read_image(view.image, camera), _to_linear, strips, valid)
     mask = None if view.mask is None else _resample(read_mask(view.mask, camera), _to_coverage, strips, valid)
-    normals = (
-        None
-        if view.normals is None
-        else _unit(in_camera(_resample(read_normals(view.normals, camera), decode_normals, strips, valid), view))
-    )
+    reduced = downsampled_camera(camera, downsample)
+    normals = None
+    if view.normals is not None:
+        normals = _unit(in_camera(_resample(read_normals(view.normals, camera), decode_normals, strips, valid), view))
+    elif view.depth is not None:
+        normals = depth_normals(_block_depth(read_depth(view), strips, valid), _plane(reduced)).astype(np.float32)
     coverage = None
     if view.segmentation is not None:
         labels = read_labels(view.segmentation, camera, capture.classes, capture.labels)
         coverage = _label_coverage(labels, strips, valid, len(capture.classes))
-    reduced = downsampled_camera(camera, downsample)
     return ViewPixels(camera=reduced, rgb=rgb, mask=mask, normals=normals, label_coverage=coverage, valid=valid)
 
 
@@ -110,7 +113,9 @@ def read_mask(path: Path, camera: Camera) -> UInt8[np.ndarray, "H W"]:
 
 
 def read_normals(path: Path, camera: Camera) -> np.ndarray:
-    """Read a normal map as (H, W, 3) uint16, encoded and distorted."""
+    """Read a normal map as (H, W, 3) uint16, encoded, or float32, as it is; distorted."""
+    if is_colmap_map(path):
+        return read_colmap_map(path, "normal map", camera, 3)
     pixels = _imread(path, "normal map", camera, _COLOUR)
     if pixels.dtype != np.uint16:
         raise InputError(
@@ -211,6 +216,23 @@ def _resample(
     return result
 
 
+def _block_depth(
+    depth: Float[np.ndarray, "H W"], strips: list[_Strip], valid: Float[np.ndarray, "h w"]
+) -> Float[np.ndarray, "h w"]:
+    """Mean depth of the pixels of each block that have one; 0 where few have, or where they are of two surfaces."""
+    share = _resample(depth, lambda raw: (raw > 0).astype(np.float32), strips, valid)
+    total, squares = _resample(depth, np.positive, strips, valid), _resample(depth, np.square, strips, valid)
+    mean, square = total / np.maximum(share, 1e-3), squares / np.maximum(share, 1e-3)
+    spread = np.sqrt(np.maximum(square - mean**2, 0))
+    return np.where((share > _MIN_SHARE) & (spread < _MAX_SPREAD * mean), mean, 0)
+
+
+def _plane(camera: Camera) -> Float[np.ndarray, "h w 3"]:
+    """Rays through the pixels of a camera without distortion, with z = 1."""
+    y, x = np.mgrid[: camera.height_px, : camera.width_px] + 0.5
+    return np.stack([x, y, np.ones_like(x)], -1) @ np.linalg.inv(camera.intrinsics).T
+
+
 def _label_coverage(
     labels: UInt8[np.ndarray, "H W"], strips: list[_Strip], valid: Float[np.ndarray, "h w"], count: int
 ) -> Float[np.ndarray, "h w K"]:
@@ -241,6 +263,8 @@ def _to_coverage(raw: UInt8[np.ndarray, "H W"]) -> Float[np.ndarray, "H W"]:
 
 def decode_normals(raw: np.ndarray) -> Float[np.ndarray, "H W 3"]:
     """Return the vectors that `read_normals` has encoded, as stored: about unit length; 0 where there is none."""
+    if raw.dtype == np.float32:
+        return raw
     background = (raw[..., 0] | raw[..., 1] | raw[..., 2]) == 0
     normals = raw * np.float32(2 / 65535) - 1
     normals[background] = 0

@@ -45,7 +45,7 @@ class ViewSample:
 
 def sample_views(capture: Capture) -> list[ViewSample]:
     """Decode all views. Raises InputError for a file that cannot be used, or an empty mask."""
-    large = [view.name for view in capture.views if view.normals is not None and not _small(view.camera)]
+    large = [view.name for view in capture.views if view.has_normals and not _small(view.camera)]
     chosen = {large[int(i)] for i in np.linspace(0, len(large) - 1, LARGE_NORMAL_MAPS) if large}
     return [_sample(view, capture, decode_normals=view.name in chosen) for view in capture.views]
 
@@ -60,6 +60,7 @@ def _sample(view: View, capture: Capture, decode_normals: bool) -> ViewSample:
     some = slice(step // 2, None, step)
     width, height = len(range(camera.width_px)[some]), len(range(camera.height_px)[some])
     grey = mask = labels = normals = head = coverage = None
+    rays = _rays(camera, some)
     if view.mask is not None:
         full = pixels.read_mask(view.mask, camera)
         if not full.any():
@@ -80,6 +81,9 @@ def _sample(view: View, capture: Capture, decode_normals: bool) -> ViewSample:
         grey = _reduced_grey(pixels.read_image(view.image, camera), width, height)
     if view.normals is not None and (_small(camera) or decode_normals):
         normals = pixels.in_camera(pixels.decode_normals(pixels.read_normals(view.normals, camera)[some, some]), view)
+    elif view.depth is not None and (_small(camera) or decode_normals):
+        depth = pixels.read_depth(view)[some, some]
+        normals = pixels.depth_normals(depth, rays / rays[..., 2:])
     if mask is not None:
         subject = mask > 127
     elif labels is not None and BACKGROUND in classes:
@@ -90,7 +94,7 @@ def _sample(view: View, capture: Capture, decode_normals: bool) -> ViewSample:
     return ViewSample(
         name=view.name,
         step=step,
-        rays=_rays(camera, some),
+        rays=rays,
         grey=grey,
         mask=mask,
         labels=labels,

@@ -14,7 +14,7 @@ from registration.storage.reading import parse_toml, read_bytes
 from registration.types import LabelCode, NormalsFrame
 
 UNITS_M = {"m": 1.0, "mm": 1e-3, "cm": 1e-2, "dm": 0.1, "km": 1e3, "in": 0.0254, "inch": 0.0254, "ft": 0.3048}
-_RESERVED = ("subject", "expression", "units", "segmentation", "normals")
+_RESERVED = ("subject", "expression", "units", "segmentation", "normals", "depth")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -27,6 +27,7 @@ class CaptureSettings:
     labels: LabelCode
     tags: Mapping[str, Any]
     normals_frame: NormalsFrame = "camera_opencv"
+    depth_unit_m: float | None = None
 
 
 def read_settings(path: Path, inside: Callable[[Path], Path] = Path) -> CaptureSettings:
@@ -72,6 +73,7 @@ def read_settings(path: Path, inside: Callable[[Path], Path] = Path) -> CaptureS
         labels=labels,
         tags={key: value for key, value in settings.items() if key not in _RESERVED},
         normals_frame=_normals_frame(path, settings.get("normals", {})),
+        depth_unit_m=_depth_unit(path, settings.get("depth", {})),
     )
 
 
@@ -102,6 +104,22 @@ def _normals_frame(path: Path, normals: object) -> NormalsFrame:
             fix="see the capture folder in docs/formats.md",
         )
     return frames[frames.index(stated)]
+
+
+def _depth_unit(path: Path, depth: object) -> float | None:
+    """Metres per unit of the depth maps, None if it is not stated. Raises InputError."""
+    if depth == {}:
+        return None
+    unit = depth.get("unit") if isinstance(depth, dict) and len(depth) == 1 else None
+    if not isinstance(unit, str) or unit not in UNITS_M:
+        raise InputError(
+            "The unit of the depth maps is stated wrongly",
+            where=path,
+            expected=f"[depth] with unit = one of {', '.join(UNITS_M)}",
+            got=depth,
+            fix="see the capture folder in docs/formats.md",
+        )
+    return UNITS_M[unit]
 
 
 def _misspelt(key: str, settings: Iterable[str]) -> str:

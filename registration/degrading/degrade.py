@@ -20,6 +20,7 @@ from jaxtyping import Float
 
 from registration.capture import native, pixels, triangulation
 from registration.capture.colmap import read_points, write_model
+from registration.capture.dense_maps import is_colmap_map
 from registration.capture.native_writer import check_new
 from registration.capture.scan import read_scan
 from registration.degrading import degradation
@@ -94,6 +95,10 @@ def _check(capture: Capture, preset: DegradationPreset, faults: Mapping[str, Col
     if _TAG in capture.tags:
         got, fix = capture.tags[_TAG], "degrade the capture that it was made from"
         raise InputError("The capture is degraded already", where=where, expected="a clean capture", got=got, fix=fix)
+    if any(view.depth or (view.normals and is_colmap_map(view.normals)) for view in capture.views):
+        expected, fix = "normal maps as PNG, or none", "take the maps out of the source"
+        got = "depth maps or maps of COLMAP"
+        raise InputError("Dense maps cannot be degraded", where=where, expected=expected, got=got, fix=fix)
     names = [view.name for view in capture.views]
     for name, kinds in faults.items():
         if name not in names:

@@ -109,7 +109,7 @@ def _draw_tile(
     """The image of one view, at most `tile` (width, height) px."""
     full = view.camera
     reduction = max(full.width_px / tile[0], full.height_px / tile[1])
-    reduced = replace(view, normals=None, segmentation=None)
+    reduced = replace(view, normals=None, depth=None, segmentation=None)
     decoded = read_view(reduced, capture, downsample=max(1, math.floor(reduction)))
     scale = min(tile[0] / decoded.camera.width_px, tile[1] / decoded.camera.height_px)
     camera = decoded.camera.scaled(

@@ -78,7 +78,9 @@ def take_stock(
         samples: of its views.
         files: of its folders.
     """
-    totals = dict.fromkeys(("images", "masks", "normals", "segmentation"), 0)
+    mapped = {view.name: "depth" for view in capture.views if view.normals is None and view.depth is not None}
+    depth = ("depth",) if mapped else ()
+    totals = dict.fromkeys(("images", "masks", "normals", *depth, "segmentation"), 0)
     lost: dict[str, Counter[str]] = {name: Counter() for name in totals}
 
     def add(name: str, subject: Bool[np.ndarray, "h w"], losses: Sequence[_Loss]) -> None:
@@ -92,7 +94,7 @@ def take_stock(
         if sample.mask is not None:
             add("masks", sample.subject, inside)
         if sample.normals is not None:
-            add("normals", sample.subject, [*inside, *excluded, *normals])
+            add(mapped.get(sample.name, "normals"), sample.subject, [*inside, *excluded, *normals])
         if sample.labels is not None:
             add("segmentation", sample.subject, [*inside, *_label_losses(sample, capture.classes)])
     totals["landmarks"], lost["landmarks"] = _landmark_counts(capture)
@@ -119,7 +121,7 @@ def require_weight(capture: Capture, channels: Sequence[Channel]) -> list[str]:
     """
     warnings: list[str] = []
     named: set[str] = set()
-    order = ("masks", "segmentation", "landmarks", "normals", "images")  # a cause before what follows from it
+    order = ("masks", "segmentation", "landmarks", "normals", "depth", "images")  # a cause before what follows from it
     for channel in sorted(channels, key=lambda channel: order.index(channel.name)):
         if not channel.matched:
             continue

@@ -12,7 +12,13 @@ from registration.capture.text import listed
 from registration.errors import InputError
 from registration.types import Capture
 
-SUFFIXES = {"masks": ".png", "normals": ".png", "segmentation": ".png", "landmarks": ".json"}  # besides images/
+SUFFIXES = {
+    "masks": ".png",
+    "normals": ".png",
+    "depth": ".png",
+    "segmentation": ".png",
+    "landmarks": ".json",
+}  # besides images/
 _ROOT_FILES = ("capture.toml", *SCANS, "ground_truth.npz")
 _OTHER_FOLDERS = {
     "image": "images",
@@ -25,6 +31,8 @@ _OTHER_FOLDERS = {
     "silhouettes": "masks",
     "normal": "normals",
     "normal_maps": "normals",
+    "depths": "depth",
+    "depth_maps": "depth",
     "labels": "segmentation",
     "label": "segmentation",
     "seg": "segmentation",
@@ -53,7 +61,7 @@ class FolderFiles:
 
 
 def match_files(capture: Capture) -> dict[str, FolderFiles]:
-    """Match the files of images/, masks/, normals/, segmentation/ and landmarks/ with the views.
+    """Match the files of images/, masks/, normals/, depth/, segmentation/ and landmarks/ with the views.
 
     Raises:
         InputError: a folder has files, and none of them belongs to a view.

@@ -168,7 +168,7 @@ def _view_report(
         name=view.name,
         camera=camera,
         coverage=coverage,
-        normals=view.normals is not None,
+        normals=view.has_normals,
         labels=view.segmentation is not None,
         landmarks=count,
         residual_px=float(np.median(valid)) if len(valid) else float("nan"),

@@ -27,7 +27,7 @@ def scan_normals(capture: Capture, samples: Sequence[ViewSample], scan: Scan) ->
     Returns:
         The ledger's row, None if the scan gives no normals; and warnings.
     """
-    without = {view.name: view.camera for view in capture.views if view.normals is None}
+    without = {view.name: view.camera for view in capture.views if not view.has_normals}
     if not without:
         return None, []
     if not len(scan.triangles):

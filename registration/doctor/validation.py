@@ -7,6 +7,7 @@ from jaxtyping import Float
 
 from registration.capture import headers, label_maps, triangulation
 from registration.capture.class_names import BACKGROUND
+from registration.capture.dense_maps import is_colmap_map, read_colmap_map, read_depth
 from registration.capture.samples import ViewSample, sample_views
 from registration.capture.scan import SCANS, Scan
 from registration.doctor import (
@@ -128,6 +129,9 @@ def _check_camera(capture: Capture, view: View) -> None:
 
 def _check_headers(capture: Capture, view: View) -> None:
     for path, role in _files(view):
+        if is_colmap_map(path):
+            read_colmap_map(path, role, view.camera, 3)
+            continue
         header = headers.require_size(path, role, view.camera.width_px, view.camera.height_px)
         headers.require_complete(path, role)
         if role == "normal map" and header.png_bits != 16:
@@ -138,6 +142,8 @@ def _check_headers(capture: Capture, view: View) -> None:
                 got="no PNG" if header.png_bits is None else f"{header.png_bits} bits",
                 fix="write it with 16 bits",
             )
+    if view.depth is not None:
+        read_depth(view)
     if view.segmentation is not None and not capture.classes:
         fits = label_maps.fitting_tables(capture.views)
         looks = f'the maps look like those of {" or ".join(fits)}: write table = "{fits[0]}"' if fits else ""

@@ -26,7 +26,7 @@ from registration.errors import InputError
 from registration.model import gnm_npz
 from registration.model.landmarks import read_scheme
 from registration.storage.registration_folder import load_registration, read_manifest
-from registration.types import Camera
+from registration.types import Camera, View
 from tests.conftest import FIXTURES
 from tests.fixtures.malformed.sandbox import make_templates
 from tests.workflows.records.plan import PLAN
@@ -58,6 +58,9 @@ def valid(tmp_path_factory: pytest.TempPathFactory) -> Path:
     picture = np.random.default_rng(0).integers(0, 255, (SIZE[1], SIZE[0], 3), np.uint8)
     for suffix in ("jpg", "tif", "bmp", "webp"):
         cv2.imwrite(str(folder / f"picture.{suffix}"), cv2.GaussianBlur(picture, (0, 0), 4))
+    depths = np.full((SIZE[1], SIZE[0]), 0.5, np.float32)
+    (folder / "cam1.geometric.bin").write_bytes(f"{SIZE[0]}&{SIZE[1]}&1&".encode("ascii") + depths.tobytes())
+    np.save(folder / "cam1.npy", depths)
     rng = np.random.default_rng(1)
     rows = "".join(f"{x:.4f} {y:.4f} {z:.4f}\n" for x, y, z in rng.normal(size=(20, 3)))
     header = "ply\nformat ascii 1.0\nelement vertex 20\nproperty float x\nproperty float y\nproperty float z\n"
@@ -69,6 +72,10 @@ def valid(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def _camera() -> Camera:
     K = np.array([[200.0, 0, 60], [0, 200, 80], [0, 0, 1]])
     return Camera(width_px=SIZE[0], height_px=SIZE[1], intrinsics=K, T_cam_world=np.eye(4))
+
+
+def _view(depth: Path) -> View:
+    return View(name="cam1", camera=_camera(), image=depth, depth=depth, depth_unit_m=1e-3)
 
 
 CLASSES = ("background", "right", "left")
@@ -86,6 +93,8 @@ READERS: dict[str, tuple[str, Reader]] = {  # name -> the file that is mutated, 
     "mask": ("capture/masks/cam1.png", lambda file: pixels.read_mask(file, _camera())),
     "normals": ("capture/normals/cam1.png", lambda file: pixels.read_normals(file, _camera())),
     "labels": ("capture/segmentation/cam1.png", lambda file: pixels.read_labels(file, _camera(), CLASSES)),
+    "dense depths": ("cam1.geometric.bin", lambda file: pixels.read_depth(_view(file))),
+    "depths": ("cam1.npy", lambda file: pixels.read_depth(_view(file))),
     **{
         suffix: (f"picture.{suffix}", lambda file: pixels.read_image(file, _camera()))
         for suffix in ("jpg", "tif", "bmp", "webp")
