@@ -7,6 +7,7 @@ from jaxtyping import Bool, Float, Int
 
 from registration.capture.origin import capture_origin
 from registration.capture.pixels import undistort_landmarks
+from registration.model import jaw_order
 from registration.types import Camera, Capture, View
 
 MIN_CONFIDENCE = 0.5  # a 2D landmark is used above it
@@ -146,7 +147,8 @@ def reversed_jaw_points(points: Float[np.ndarray, "68 3"]) -> list[int]:
     """Find the jaw points (0 to 16 of the 68 scheme) whose order around the face is reversed.
 
     From the front, the jaw runs from the subject's right ear (0) over the chin (8) to the left ear (16): the angle
-    around the point between the brows increases.
+    around the point between the brows increases. The order of Google's first file (`registration.model.jaw_order`) is
+    no error: it is read in the scheme's.
 
     Args:
         points: triangulated landmarks, metres; NaN points are skipped.
@@ -154,6 +156,8 @@ def reversed_jaw_points(points: Float[np.ndarray, "68 3"]) -> list[int]:
     Returns:
         Indices of the points at steps of less than -2 degrees; empty if eyes or nose are missing.
     """
+    if jaw_order.is_reversed(points):
+        points = points[jaw_order.TURNED]
     right, left, brow, nose = points[36], points[45], points[27], points[33]
     x = left - right
     down = nose - brow

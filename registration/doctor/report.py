@@ -14,6 +14,7 @@ from rich.table import Table
 from rich.text import Text
 
 from registration.capture import native, triangulation
+from registration.capture.jaw_order import has_reversed_jaw
 from registration.capture.scan import Scan, read_scan, read_truth
 from registration.capture.text import listed
 from registration.doctor.contact_sheet import draw_contact_sheet
@@ -22,6 +23,7 @@ from registration.doctor.scan_checks import scan_facts
 from registration.doctor.validation import eye_distance, validate_capture
 from registration.frames import MM_PER_M, opencv_intrinsics
 from registration.geometry.meshlab import scan_topology
+from registration.model.jaw_order import SCHEME
 from registration.storage.files import check_output_file
 from registration.types import Camera, Capture, View
 
@@ -106,6 +108,8 @@ class CaptureReport:
             facts.append(f"classes: {', '.join(capture.classes)}")
         for scheme, (count, triangulated) in self.schemes.items():
             facts.append(f"landmarks {scheme}: {triangulated} of {count} triangulated")
+            if scheme == SCHEME and has_reversed_jaw(capture):
+                facts[-1] += "; points 2-6 of the right jaw are in reverse, and read in the scheme's order"
         if self.eye_distance_mm is not None:
             facts.append(f"outer eye corners: {self.eye_distance_mm:.1f} mm apart")
         if self.scan is not None:

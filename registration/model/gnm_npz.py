@@ -8,7 +8,8 @@ import hashlib
 import zipfile
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
-from pathlib import Path
+from pathlib import Path, PurePath
+from typing import TypeVar
 
 import numpy as np
 from jaxtyping import Float, Integer, Shaped
@@ -17,6 +18,8 @@ from registration.errors import InputError
 from registration.model import wrong_files
 from registration.storage.files import atomic_file
 from registration.storage.npz import Defect, Kind, NpzSchema
+
+AnyPath = TypeVar("AnyPath", bound=PurePath)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -161,9 +164,9 @@ def write(data: GNMData, path: Path, *, extra_inside: bool = False) -> None:
         extra_path(path).unlink(missing_ok=True)  # of a model that was here before
 
 
-def extra_path(path: Path) -> Path:
+def extra_path(path: AnyPath) -> AnyPath:
     """Return the path of a model's second file, with the fields outside the schema."""
-    return Path(path).with_suffix(".extra.npz")
+    return path.with_suffix(".extra.npz")
 
 
 def _read_extra(path: Path, inside: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:

@@ -13,6 +13,7 @@ import fsspec
 from fsspec.implementations.local import LocalFileSystem
 
 from registration.errors import InputError
+from registration.model.gnm_npz import extra_path
 from registration.storage.cache import cache_folder, make_cache_folder
 from workflows.ids import is_remote, redact, resolve_place
 
@@ -77,7 +78,7 @@ def fetch_folder(location: str, folder: Path) -> None:
 
 
 def fetch_model(location: str) -> Path:
-    """Return a model's file as a local path, with its landmark schemes next to it; downloads are cached.
+    """Return a model's file as a local path, with its second file and landmark schemes beside it; downloads are cached.
 
     Raises:
         InputError: there is no such file.
@@ -87,8 +88,9 @@ def fetch_model(location: str) -> Path:
         return Path(place)
     fs, path = filesystem(place)
     folder, _, name = path.rpartition("/")
+    own = (path, str(extra_path(PurePosixPath(path))))
     try:
-        infos = {p: i for p, i in fs.find(folder, maxdepth=1, detail=True).items() if p == path or _is_scheme(p)}
+        infos = {p: i for p, i in fs.find(folder, maxdepth=1, detail=True).items() if p in own or _is_scheme(p)}
     except FileNotFoundError:
         infos = {}
     if path not in infos:

@@ -23,7 +23,7 @@ from registration.capture.landmark_files import read_landmarks
 from registration.capture.scan import read_scan, read_truth
 from registration.capture.settings import read_settings
 from registration.errors import InputError
-from registration.model import gnm_npz
+from registration.model import gnm_npz, gnmw
 from registration.model.landmarks import read_scheme
 from registration.storage.registration_folder import load_registration, read_manifest
 from registration.types import Camera, View
@@ -65,6 +65,7 @@ def valid(tmp_path_factory: pytest.TempPathFactory) -> Path:
     rows = "".join(f"{x:.4f} {y:.4f} {z:.4f}\n" for x, y, z in rng.normal(size=(20, 3)))
     header = "ply\nformat ascii 1.0\nelement vertex 20\nproperty float x\nproperty float y\nproperty float z\n"
     faces = "element face 2\nproperty list uchar int vertex_indices\nend_header\n"
+    gnmw.write(gnmw.web_model(gnm_npz.read(folder / "tiny_gnm.npz")), folder / "tiny_gnm.gnmw")
     (folder / "text.ply").write_text(header + faces + rows + "3 0 1 2\n4 3 4 5 6\n")
     return folder
 
@@ -103,6 +104,7 @@ READERS: dict[str, tuple[str, Reader]] = {  # name -> the file that is mutated, 
     "text scan": ("text.ply", read_scan),
     "truth": ("capture/ground_truth.npz", read_truth),
     "model": ("tiny_gnm.npz", gnm_npz.read),
+    "model for the web": ("tiny_gnm.gnmw", gnmw.read),
     "scheme": ("head_sparse_68.txt", lambda file: read_scheme(file, np.zeros((3000, 3)))),
     "manifest": ("registration/manifest.json", lambda file: read_manifest(file.parent)),
     "history": ("registration/history.json", lambda file: load_registration(file.parent)),
