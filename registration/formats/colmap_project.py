@@ -19,6 +19,7 @@ _MODELS = ("", "sparse", "sparse/0", "dense/sparse", "dense/0/sparse", "colmap/s
 _IMAGES = ("images", "image", "imgs", "rgb", "input", "photos", "frames", "undistorted", "")
 _MASKS = ("masks", "mask", "colmap_masks")
 _SCANS = ("meshed-poisson.ply", "meshed-delaunay.ply", "fused.ply")
+_PARTS = ("sparse", "dense", "colmap", "distorted", "text")  # folders inside a project, and numbers
 _NEEDED = ("cameras", "images")
 
 
@@ -56,13 +57,19 @@ def read(path: Path, options: ReadOptions) -> SourceCapture:
     return SourceCapture(
         format=FORMAT.name,
         root=path,
-        subject=options.subject or roots[0].resolve().name,
+        subject=options.subject or _project_name(path),
         expression=options.expression or "neutral",
         views=views,
         unit_m=None,
         scan=scan,
         notes=tuple(notes),
     )
+
+
+def _project_name(path: Path) -> str:
+    """The name of the first folder, upwards, that is no usual part of a project."""
+    folders = [path.resolve(), *path.resolve().parents]
+    return next(folder.name for folder in folders if folder.name not in _PARTS and not folder.name.isdecimal())
 
 
 def _model_folder(path: Path) -> Path:
@@ -90,7 +97,7 @@ def _roots(path: Path, model: Path) -> list[Path]:
     top = path.absolute()
     for folder in (start, *start.parents):
         folders.append(folder)
-        inner = folder.name in ("sparse", "colmap", "distorted", "text") or folder.name.isdecimal()
+        inner = folder.name in _PARTS or folder.name.isdecimal()
         if not inner and (folder == top or not folder.is_relative_to(top)):
             break
     named = [folder for folder in folders if folder.name != "sparse" and not folder.name.isdecimal()]

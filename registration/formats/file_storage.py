@@ -3,6 +3,7 @@
 Matrices are made from their numbers, never allocated from the size that the file declares.
 """
 
+import math
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -39,9 +40,9 @@ def read_file_storage(file: Path) -> Fields:
         values = {name: _value(root.getNode(name)) for name in root.keys()} if root.isMap() else {}
         storage.release()
     except (cv2.error, SystemError, UnicodeDecodeError) as error:
-        got = str(error).strip().splitlines()[0][-160:] if str(error).strip() else type(error).__name__
+        got = str(error).strip().splitlines()[0][-160:] if isinstance(error, cv2.error) else "text that is none"
         raise refuse(expected="YAML as OpenCV writes it", got=got) from None
-    except ValueError as error:
+    except (ValueError, TypeError) as error:
         raise refuse(expected="matrices with as many numbers as rows x cols", got=error) from None
     return Fields(values=values, where=str(file), title=_TITLE, fix=_FIX)
 
@@ -58,7 +59,9 @@ def _too_deep(text: str) -> str | None:
 def _value(node: Any) -> Any:
     if node.isMap():
         parts = {name: _value(node.getNode(name)) for name in node.keys()}
-        return _matrix(parts) if {"rows", "cols", "data"} <= parts.keys() else parts
+        if {"rows", "cols", "data"} <= parts.keys():
+            return _matrix(parts["data"], (parts["rows"], parts["cols"]))
+        return _matrix(parts["data"], parts["sizes"]) if {"sizes", "data"} <= parts.keys() else parts
     if node.isSeq():
         return [_value(node.at(index)) for index in range(node.size())]
     if node.isInt() or node.isReal():
@@ -66,9 +69,11 @@ def _value(node: Any) -> Any:
     return node.string() if node.isString() else None
 
 
-def _matrix(parts: dict[str, Any]) -> np.ndarray:
-    data = np.asarray(parts["data"], np.float64)
-    rows, cols = int(parts["rows"]), int(parts["cols"])
-    if data.ndim != 1 or rows < 0 or cols < 0 or rows * cols == 0 or data.size % (rows * cols):
-        raise ValueError(f"{rows} x {cols} and {data.size} numbers")
-    return data.reshape(rows, cols, -1).squeeze(-1) if data.size == rows * cols else data.reshape(rows, cols, -1)
+def _matrix(data: Any, sizes: Any) -> np.ndarray:
+    """A matrix, or an array of more or fewer axes, of one or several channels."""
+    numbers = np.asarray(data, np.float64)
+    shape = tuple(int(size) for size in sizes)
+    count = math.prod(shape)
+    if numbers.ndim != 1 or min(shape, default=0) < 1 or not numbers.size or numbers.size % count:
+        raise ValueError(f"{' x '.join(map(str, shape))} and {numbers.size} numbers")
+    return numbers.reshape(shape) if numbers.size == count else numbers.reshape(*shape, -1)
