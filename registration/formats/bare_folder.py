@@ -3,7 +3,8 @@
     K                        (N, 3, 3) px; (3, 3) for all images with `shared_intrinsics = True`
     T_cam_world              (N, 4, 4) or (N, 3, 4), world to camera; or else
     T_world_cam              the same, camera to world
-    names                    (N,) image files, relative to images/ or to the folder
+    names                    (N,) image files, relative to images/ or to the folder; or cameras, each with a folder of
+                             numbered images or a video NAME.mp4 there or in videos/
     distortion               (N, 4), (N, 5) or (N, 8), OpenCV's k1 k2 p1 p2 [k3 [k4 k5 k6]]; optional
     sizes                    (N, 2) width and height of the calibrated images, px; optional
     axes                     "opencv" (x right, y down, z forward) or "opengl" (x right, y up, z backwards); optional
@@ -25,9 +26,10 @@ from registration.capture.landmark_files import read_landmarks
 from registration.capture.scan import SCANS
 from registration.errors import InputError
 from registration.formats.fields import number_array
-from registration.formats.files import find_image, stored_size, view_names
+from registration.formats.files import find_image, view_names
 from registration.formats.nerfstudio import OPENGL_TO_OPENCV
-from registration.formats.source import Distortion, Format, ReadOptions, SourceCapture, SourceView
+from registration.formats.recordings import FOLDERS, find_frame, frame_size
+from registration.formats.source import Distortion, Format, ReadOptions, SourceCapture, SourceView, VideoFrame
 from registration.storage.npz import NpzSchema
 from registration.storage.reading import open_file
 
@@ -70,7 +72,7 @@ def read(path: Path, options: ReadOptions) -> SourceCapture:
     arrays = _arrays(file)
     refuse = _refuse(file)
     names = _names(arrays, refuse)
-    images = [_image(folder, name, refuse) for name in names]
+    images = [_image(folder, name, options.frame, refuse) for name in names]
     count = len(images)
     for name in ("T_cam_world", "T_world_cam", "distortion", "sizes"):
         if name in arrays and len(arrays[name]) != count:
@@ -89,11 +91,11 @@ def read(path: Path, options: ReadOptions) -> SourceCapture:
             intrinsics=K,
             T_cam_world=pose,
             distortion=Distortion(model="opencv", coefficients=tuple(lens.tolist())),
-            mask=next((mask for suffix in _MASKS if (mask := folder / "masks" / f"{name}{suffix}").is_file()), None),
+            mask=_mask(folder, name, image),
             landmarks=read_landmarks(marks) if (marks := folder / "landmarks" / f"{name}.json").is_file() else {},
         )
         for name, image, size, K, pose, lens in zip(
-            view_names(images, folder), images, sizes, intrinsics, poses, lenses, strict=True
+            _view_names(names, images, folder), images, sizes, intrinsics, poses, lenses, strict=True
         )
     )
     return SourceCapture(
@@ -134,20 +136,40 @@ def _names(arrays: Mapping[str, np.ndarray], refuse: "partial[InputError]") -> l
     return [str(name) for name in names]
 
 
-def _image(folder: Path, name: str, refuse: "partial[InputError]") -> Path:
+def _view_names(names: list[str], images: list[Path | VideoFrame], folder: Path) -> list[str]:
+    """The names of the views: those of the files, or of the cameras of which frames were taken."""
+    files = [image for image in images if isinstance(image, Path)]
+    if len(files) < len(images) or any(image.parent.name == name for image, name in zip(files, names, strict=True)):
+        return names
+    return view_names(files, folder)
+
+
+def _mask(folder: Path, name: str, image: Path | VideoFrame) -> Path | None:
+    within = [f"{name}/{image.stem}"] if isinstance(image, Path) and image.parent.name == name else []
+    masks = [folder / "masks" / f"{part}{suffix}" for part in (*within, name) for suffix in _MASKS]
+    return next((mask for mask in masks if mask.is_file()), None)
+
+
+def _image(folder: Path, name: str, frame: int | None, refuse: "partial[InputError]") -> Path | VideoFrame:
     def error(entry: str, expected: object, got: object) -> InputError:
         return refuse(expected=f"{entry}: {expected}", got=got)
 
+    if (recorded := find_frame([folder / p for p in ("images", "", *FOLDERS)], name, frame, error)) is not None:
+        return recorded
+    if frame is not None:
+        raise error(name, f"a folder or a video of camera {name}, of which --frame takes one", "none")
     if (folder / "images" / name).is_file():
         return folder / "images" / name
     return find_image(folder, name, error, "names", suffixes=(".png", ".jpg", ".jpeg", ".tif", ".tiff"))
 
 
-def _sizes(arrays: Mapping[str, np.ndarray], images: list[Path], notes: list[str]) -> Float[np.ndarray, "N 2"]:
+def _sizes(
+    arrays: Mapping[str, np.ndarray], images: list[Path | VideoFrame], notes: list[str]
+) -> Float[np.ndarray, "N 2"]:
     if "sizes" in arrays:
         return arrays["sizes"]
     notes.append(f"{FILE} has no sizes: the sizes of the images were used")
-    return np.array([stored_size(image) for image in images], np.float64)
+    return np.array([frame_size(image) for image in images], np.float64)
 
 
 def _intrinsics(
@@ -207,4 +229,5 @@ FORMAT = Format(
     detect=_detect,
     read=read,
     physical=True,
+    sequences=True,
 )

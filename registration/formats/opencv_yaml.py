@@ -5,7 +5,7 @@ Poses are world to camera in OpenCV's axes, rotations as matrices or Rodrigues v
 https://chingswy.github.io/easymocap-public-doc/quickstart/calibration.html; other files do not state theirs.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -17,8 +17,8 @@ from registration.capture.native import natural_key
 from registration.errors import InputError
 from registration.formats.fields import Fields
 from registration.formats.file_storage import read_file_storage
-from registration.formats.files import stored_size
-from registration.formats.source import Distortion, Format, ReadOptions, SourceCapture, SourceView
+from registration.formats.recordings import FOLDERS, find_frame, frame_size
+from registration.formats.source import Distortion, Format, ReadOptions, SourceCapture, SourceView, VideoFrame
 
 _INTRI, _EXTRI = "intri.yml", "extri.yml"
 _SUFFIXES = (".yml", ".yaml")
@@ -142,7 +142,7 @@ def _one_of(fields: Fields, names: Sequence[str], what: str) -> str:
     return found[0]
 
 
-def _size(fields: Fields, image: Path, notes: list[str]) -> tuple[int, int]:
+def _size(fields: Fields, image: Path | VideoFrame, notes: list[str]) -> tuple[int, int]:
     for width, height in _SIZES:
         if width in fields or height in fields:
             return fields.size(width), fields.size(height)
@@ -151,7 +151,7 @@ def _size(fields: Fields, image: Path, notes: list[str]) -> tuple[int, int]:
             size = np.ravel(fields.array(name, (2,), (1, 2), (2, 1)))
             return int(size[0]), int(size[1])
     notes.append("the calibration has no image sizes: the sizes of the images were used")
-    return stored_size(image)
+    return frame_size(image)
 
 
 def _distortion(fields: Fields) -> Distortion:
@@ -198,35 +198,25 @@ def _rotation(fields: Fields, name: str) -> Float[np.ndarray, "3 3"]:
     return value if value.shape == (3, 3) else np.asarray(cv2.Rodrigues(np.ravel(value))[0])
 
 
-def _image(name: str, fields: Fields, path: Path, frame: int | None) -> Path:
-    """The image of a camera: one with its name, or one of its folder, by frame number."""
+def _image(name: str, fields: Fields, path: Path, frame: int | None) -> Path | VideoFrame:
+    """The image of a camera: one with its name, or one of its folder or video, by frame number."""
+    if (found := find_frame([path / place for place in (*_IMAGES, *FOLDERS)], name, frame, fields.error)) is not None:
+        return found
     for place in _IMAGES:
-        folder = path / place / name
-        if folder.is_dir():
-            return _frame(folder, fields, frame)
         for suffix in _IMAGE_SUFFIXES:
             if frame is None and (file := path / place / f"{name}{suffix}").is_file():
                 return file
     looked = ", ".join(place or "." for place in _IMAGES)
-    raise fields.error("", f"an image {name}.png, .jpg or .tif, or a folder {name}, in one of {looked}", "none")
+    expected = f"an image {name}.png, .jpg or .tif, a folder {name}, or a video {name}.mp4, in one of {looked}, videos"
+    raise fields.error("", expected, "none")
 
 
-def _frame(folder: Path, fields: Fields, frame: int | None) -> Path:
-    files = [file for file in folder.iterdir() if file.suffix in _IMAGE_SUFFIXES]
-    numbers: Mapping[int, Path] = {int(file.stem): file for file in files if file.stem.isdecimal()}
-    if frame is None and files:
-        return min(files, key=lambda file: natural_key(file.name))
-    if frame is None or frame not in numbers:
-        got = f"{min(numbers)} to {max(numbers)}" if numbers else f"{len(files)} images without numbers"
-        raise fields.error("", f"an image of frame {'0' if frame is None else frame} in {folder}", got)
-    return numbers[frame]
-
-
-def _mask(path: Path, name: str, image: Path) -> Path | None:
-    inside = image.parent.name == name
+def _mask(path: Path, name: str, image: Path | VideoFrame) -> Path | None:
+    inside = isinstance(image, Path) and image.parent.name == name
     for place in _MASKS:
         for suffix in _IMAGE_SUFFIXES:
-            mask = path / place / (f"{name}/{image.stem}{suffix}" if inside else f"{name}{suffix}")
+            stem = image.stem if isinstance(image, Path) else name
+            mask = path / place / (f"{name}/{stem}{suffix}" if inside else f"{name}{suffix}")
             if mask.is_file():
                 return mask
     return None

@@ -88,7 +88,7 @@ def import_dataset(
     selection: SelectionOptions = _ALL,
     jobs: Annotated[int, arg(metavar="N")] = 1,
 ) -> int:
-    """Convert a dataset of another program, such as NeRSemble or Multiface, to a native dataset.
+    """Convert a dataset in another layout, as NeRSemble or Multiface, to ours.
 
     Run again, the command resumes: complete captures are kept, failed ones are tried again.
 
