@@ -97,8 +97,10 @@ class FitContext:
         """The distance of the head's skin, as the cameras see it, from the scan, if one is fitted."""
         if self.scan is None:
             return None
+        finest = self.pyramid[0]
+        shown = finest.pixels.image((finest.rgb_weight > 0).float()[:, None])[..., 0].numpy() > 0  # no hair or clothes
         rows = np.flatnonzero(head_skin(self.data))
-        return ScanDistance(self.scan, rows, self.data.triangles, self.pyramid[0].pixels.cameras)
+        return ScanDistance(self.scan, rows, self.data.triangles, finest.pixels.cameras, list(shown))
 
     @cached_property
     def uv_ssim(self) -> UVSSIM | None:

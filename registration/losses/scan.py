@@ -8,7 +8,7 @@ from collections.abc import Sequence
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from registration.geometry.nearest_planes import NearestPlanes
@@ -29,6 +29,7 @@ class ScanDistance:
         rows: Int[np.ndarray, "P"],
         triangles: Int[np.ndarray, "F 3"],
         cameras: Sequence[Camera],
+        shown: Sequence[Bool[np.ndarray, "H W"]],
     ):
         """Nothing is assigned yet.
 
@@ -37,8 +38,10 @@ class ScanDistance:
             rows: the vertices that are compared, if a camera sees them.
             triangles: of the whole mesh, which hides vertices.
             cameras: those of the capture.
+            shown: the pixels of each camera that show the subject's skin, as far as that is known: not hair or clothes.
         """
-        self._planes, self._rows, self._triangles, self._cameras = planes, rows, triangles, tuple(cameras)
+        self._planes, self._rows, self._triangles = planes, rows, triangles
+        self._views = tuple(zip(cameras, shown, strict=True))
         self._assigned: tuple[Tensor, Tensor, Tensor] | None = None
 
     @property
@@ -47,7 +50,7 @@ class ScanDistance:
         return 0.0 if self._assigned is None else float(self._assigned[2].sum())
 
     def assign(self, vertices: Float[Tensor, "V 3"], scale_m: float) -> None:
-        """Assign planes to the vertices that are seen, near their plane, and turned like it.
+        """Assign planes to the vertices that are seen as skin, near their plane, and turned like it.
 
         Args:
             vertices: of the whole mesh; world, metres.
@@ -84,9 +87,11 @@ class ScanDistance:
         return (weight * squared * scale_m**2 / (scale_m**2 + squared)).sum()
 
     def _seen(self, points: Float[np.ndarray, "V 3"]) -> np.ndarray:
-        """Which of the rows at least one camera sees."""
+        """Which of the rows at least one camera sees, at a pixel that shows skin."""
         caster, seen = RayCaster(points, self._triangles), np.zeros(len(self._rows), bool)
-        for camera in self._cameras:
+        for camera, shown in self._views:
             left = np.flatnonzero(~seen)
-            seen[left] = caster.visible(points[self._rows[left]], camera)
+            left = left[caster.visible(points[self._rows[left]], camera)]
+            column, row = np.floor(camera.project(points[self._rows[left]])[0]).astype(np.int64).T
+            seen[left] = shown[row.clip(0, camera.height_px - 1), column.clip(0, camera.width_px - 1)]
         return seen

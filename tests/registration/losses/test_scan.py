@@ -12,6 +12,7 @@ from registration.losses.scan import ScanDistance
 from tests.registration.geometry.test_surface_views import RADIUS, a_camera, a_sphere
 
 CAMERAS = [a_camera(turn) for turn in (0.0, 2.1, 4.2)]
+SHOWN = [np.ones((camera.height_px, camera.width_px), bool) for camera in CAMERAS]
 
 
 class Plane:
@@ -32,7 +33,7 @@ def square(z: float = 0.0) -> tuple[Tensor, np.ndarray]:
 
 
 def distance_of(planes: NearestPlanes, vertices: Tensor, triangles: np.ndarray, scale_m: float = 1e-3) -> ScanDistance:
-    found = ScanDistance(planes, np.arange(len(vertices)), triangles, CAMERAS)
+    found = ScanDistance(planes, np.arange(len(vertices)), triangles, CAMERAS, SHOWN)
     found.assign(vertices, scale_m)
     return found
 
@@ -56,11 +57,17 @@ def test_what_is_left_out() -> None:
     assert distance_of(Plane(), moved, triangles).share == 0  # its planes are not trusted
     behind = torch.cat([vertices, vertices + torch.tensor([0, 0, 2e-3])])
     both = np.concatenate([triangles, triangles + len(vertices)])
-    only_front = ScanDistance(Plane(), np.arange(10), both, [CAMERAS[0]])
+    only_front = ScanDistance(Plane(), np.arange(10), both, CAMERAS[:1], SHOWN[:1])
     only_front.assign(behind, 1e-3)
     assert only_front.share == pytest.approx(0.5)  # the other half is hidden
-    unseen = ScanDistance(Plane(), np.arange(5), triangles, [])
+    unseen = ScanDistance(Plane(), np.arange(5), triangles, [], [])
     unseen.assign(vertices, 1e-3)
+    hair = [shown.copy() for shown in SHOWN]
+    for pixels in hair:
+        pixels[:, : pixels.shape[1] * 48 // 100] = False  # left of the middle vertex
+    half = ScanDistance(Plane(), np.arange(5), triangles, CAMERAS[:1], hair[:1])
+    half.assign(vertices, 1e-3)
+    assert half.share == pytest.approx(2 / 3)  # of the corners at the left a third of two triangles each
     assert unseen.share == 0 and unseen(vertices, 1e-3).item() == 0
 
 
@@ -104,7 +111,7 @@ def test_a_known_deformation_is_recovered_beside_a_hole_and_hair(cloud: bool) ->
         planes = MeshPlanes(SurfaceViews(scan, faces, CAMERAS))
     vertices, triangles = a_sphere(4)
     start = torch.tensor(vertices)
-    found = ScanDistance(planes, np.arange(len(vertices)), triangles, CAMERAS)
+    found = ScanDistance(planes, np.arange(len(vertices)), triangles, CAMERAS, SHOWN)
     variable = start.clone().requires_grad_()
     optimizer = torch.optim.Adam([variable], lr=1e-4)
     for step in range(60):
