@@ -222,7 +222,8 @@ def _check_model(data: gnm_npz.GNMData) -> None:
 def _check_head_can_be_found(capture: Capture, landmarks: Mapping[str, Float[np.ndarray, "L 3"]]) -> None:
     counts = {name: int(np.isfinite(points).all(1).sum()) for name, points in landmarks.items()}
     labelled = BACKGROUND in capture.classes and any(view.segmentation for view in capture.views)
-    if max(counts.values(), default=0) < MIN_LANDMARKS and not labelled and not any(v.mask for v in capture.views):
+    located = labelled or capture.head is not None or any(view.mask for view in capture.views)
+    if max(counts.values(), default=0) < MIN_LANDMARKS and not located:
         triangulated = [f"{count} triangulated of scheme {name}" for name, count in counts.items()]
         raise InputError(
             "The head cannot be located",

@@ -26,7 +26,7 @@ from registration.fit.initialization import (
 )
 from registration.fit.problem import FitProblem, FitTrace, assess, refine
 from registration.fit.recipes import Stage
-from registration.fit.variables import InitialGuess, initial_guess_from
+from registration.fit.variables import InitialGuess, initial_guess_from, pivot
 from registration.fit.view_weights import ViewErrors
 from registration.geometry.nearest_planes import CloudPlanes, MeshPlanes, NearestPlanes
 from registration.geometry.surface_views import SurfaceViews
@@ -57,6 +57,7 @@ CONVERGED_MM = 0.05  # 95th percentile of vertex motion over the last tenth of t
 MAX_LANDMARK_PX = 3.0  # median residual at 512 px of head height
 _NAMED_VIEW_RATIO = 2  # times MAX_LANDMARK_PX: views with a larger error are named
 _STAGE_VIEWS = 3
+_SCAN_TAGS = ("scan_hygiene", "scan_notes")  # of a capture that was made from a scan alone
 
 
 def register(
@@ -229,7 +230,7 @@ class _Snapshots:
 
 
 def _initial_guess(inputs: RegistrationInputs, context: FitContext, progress: Progress) -> InitialGuess:
-    """From landmarks if model and capture share a scheme, else from the neutral's pose or from the masks."""
+    """From landmarks if model and capture share a scheme, else from the neutral's pose, a given one, or the masks."""
     neutral = None
     if inputs.neutral is not None:
         parameters = _parameters(inputs.neutral, inputs.origin)
@@ -244,6 +245,10 @@ def _initial_guess(inputs: RegistrationInputs, context: FitContext, progress: Pr
         return from_landmarks(inputs.data, scheme, points, free_scale=free_scale, neutral=neutral)
     if neutral is not None and assess(context, neutral).overlap >= MIN_OVERLAP:
         return replace(neutral, notes=("no landmarks: starting from the neutral's pose",))
+    if (head := inputs.capture.head) is not None:
+        position = head.scale * head.rotation @ pivot(inputs.data) + head.translation - inputs.origin
+        note = "no landmarks: starting from the head's pose in capture.toml"
+        return InitialGuess(rotation=head.rotation, position=position, scale=head.scale, notes=(note,))
     progress.message("no landmarks of a scheme that the model has: estimating the head's pose from the masks")
     return from_masks(inputs.data, context.pyramid[-1], partial(assess, context), partial(refine, context))
 
@@ -299,6 +304,7 @@ def _collect(inputs: RegistrationInputs, fitted: _Fitted, comparison: Comparison
             "camera_gains": problem.appearance.gains.cpu().numpy().round(4).tolist(),
             "views_not_trusted": dict(problem.view_weights.notes),
             "notes": [*inputs.notes, *fitted.initial.notes],
+            **{name: inputs.capture.tags[name] for name in _SCAN_TAGS if name in inputs.capture.tags},
             **({"warnings": list(inputs.ledger.warnings)} if inputs.ledger.warnings else {}),
             **({} if inputs.scan is None else {"scan_in_fit": _scan_in_fit(inputs, problem)}),
             "residuals": comparison.residuals,

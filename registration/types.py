@@ -98,6 +98,15 @@ class LabelCode:
 
 
 @dataclass(frozen=True, kw_only=True)
+class HeadPose:
+    """Where the model's head is: world = scale * rotation @ model + translation."""
+
+    rotation: Float[np.ndarray, "3 3"]
+    translation: Float[np.ndarray, "3"]  # metres
+    scale: float = 1.0
+
+
+@dataclass(frozen=True, kw_only=True)
 class Capture:
     """One moment of one subject, recorded by several cameras."""
 
@@ -110,6 +119,8 @@ class Capture:
     tags: Mapping[str, Any] = field(default_factory=dict)
     scan: Path | None = None
     ground_truth: Path | None = None
+    photographs: bool = True  # whether the images' colours count; else they only help a person to see the views
+    head: HeadPose | None = None  # where a fit without landmarks starts
 
     def cameras_relative_to(self, origin: Float[np.ndarray, "3"]) -> "Capture":
         """The same capture with cameras in a world whose origin is at `origin`, metres; files keep the old world."""

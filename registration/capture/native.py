@@ -60,6 +60,8 @@ def read_capture(root: Path, *, cameras_of: Callable[[Path], Mapping[str, Camera
         tags=settings.tags,
         scan=None if scan is None else _optional(root, scan),
         ground_truth=_optional(root, truth),
+        photographs=settings.photographs,
+        head=settings.head,
     )
 
 

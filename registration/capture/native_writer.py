@@ -16,7 +16,7 @@ from registration.errors import InputError
 from registration.frames import linear_to_srgb
 from registration.storage.files import atomic_directory
 from registration.storage.mesh import write_ply
-from registration.types import Camera
+from registration.types import Camera, HeadPose
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -39,7 +39,9 @@ class CaptureDescription:
     subject: str
     expression: str
     classes: Sequence[str] = ()  # names of the label maps' indices
-    tags: Mapping[str, Any] = field(default_factory=dict)  # strings, numbers, booleans, or lists of these
+    tags: Mapping[str, Any] = field(default_factory=dict)  # strings, numbers, booleans, lists or tables of these
+    photographs: bool = True  # whether the images' colours count
+    head: HeadPose | None = None  # where a fit without landmarks starts
 
 
 def write_capture(
@@ -138,16 +140,23 @@ def _file(folder: Path, view: ViewArrays, suffix: str) -> Path:
 def write_settings(path: Path, description: CaptureDescription) -> None:
     """Write a `capture.toml`. Raises ValueError for a tag that is no string, number, boolean, or list of these."""
     settings = {"subject": description.subject, "expression": description.expression, "units": "m", **description.tags}
+    settings |= {} if description.photographs else {"photographs": False}
     lines = [f"{json.dumps(key)} = {_toml(value)}" for key, value in settings.items()]
     if description.classes:
         lines += ["", "[segmentation]", f"classes = {_toml(list(description.classes))}"]
+    if description.head is not None:
+        lines += ["", "[head]", f"rotation = {_toml(description.head.rotation.ravel().tolist())}"]
+        lines += [f"translation = {_toml(description.head.translation.tolist())}"]
+        lines += [f"scale = {_toml(description.head.scale)}"]
     path.write_text("\n".join(lines) + "\n", "utf-8")
 
 
 def _toml(value: Any) -> str:
-    """Return a TOML value; JSON writes these few types alike."""
+    """Return a TOML value; JSON writes these few types alike, but for tables."""
+    if isinstance(value, Mapping):
+        return "{ " + ", ".join(f"{json.dumps(key)} = {_toml(item)}" for key, item in value.items()) + " }"
     if isinstance(value, (str, bool, int, float)) or (
         isinstance(value, (list, tuple)) and all(isinstance(item, (str, bool, int, float)) for item in value)
     ):
         return json.dumps(value, ensure_ascii=False)
-    raise ValueError(f"a tag must be a string, number, boolean or a list of these, not {value!r}")
+    raise ValueError(f"a tag must be a string, number, boolean, or a list or table of these, not {value!r}")

@@ -8,13 +8,14 @@ from functools import partial
 from pathlib import Path
 from typing import Any, get_args
 
+from registration.capture.head_settings import read_head_pose, read_photographs
 from registration.capture.label_settings import read_labels_table
 from registration.errors import InputError
 from registration.storage.reading import parse_toml, read_bytes
-from registration.types import LabelCode, NormalsFrame
+from registration.types import HeadPose, LabelCode, NormalsFrame
 
 UNITS_M = {"m": 1.0, "mm": 1e-3, "cm": 1e-2, "dm": 0.1, "km": 1e3, "in": 0.0254, "inch": 0.0254, "ft": 0.3048}
-_RESERVED = ("subject", "expression", "units", "segmentation", "normals", "depth")
+_RESERVED = ("subject", "expression", "units", "segmentation", "normals", "depth", "photographs", "head")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -28,6 +29,8 @@ class CaptureSettings:
     tags: Mapping[str, Any]
     normals_frame: NormalsFrame = "camera_opencv"
     depth_unit_m: float | None = None
+    photographs: bool = True
+    head: HeadPose | None = None
 
 
 def read_settings(path: Path, inside: Callable[[Path], Path] = Path) -> CaptureSettings:
@@ -74,6 +77,8 @@ def read_settings(path: Path, inside: Callable[[Path], Path] = Path) -> CaptureS
         tags={key: value for key, value in settings.items() if key not in _RESERVED},
         normals_frame=_normals_frame(path, settings.get("normals", {})),
         depth_unit_m=_depth_unit(path, settings.get("depth", {})),
+        photographs=read_photographs(path, settings),
+        head=read_head_pose(path, settings),
     )
 
 

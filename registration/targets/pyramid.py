@@ -41,6 +41,7 @@ class _ViewCrop:
     landmarks: Mapping[str, Float[np.ndarray, "L 3"]]
     has_mask: bool
     has_classes: bool
+    has_colours: bool
     has_normals: bool  # from a file: colours count where these do
     head_px: float
 
@@ -125,6 +126,7 @@ def _view_crop(view: View, capture: Capture, mapping: ClassMap, downsample: int)
         landmarks=landmarks,
         has_mask=mask is not None,
         has_classes=pixels.label_coverage is not None,
+        has_colours=capture.photographs,
         has_normals=pixels.normals is not None,
         head_px=float(shape[0]),
     )
@@ -241,7 +243,7 @@ def _apply_weights(crop: _ViewCrop) -> dict[str, np.ndarray]:
     return {
         "normals": normals,
         "normal_weight": facing,
-        "rgb_weight": core * (facing if crop.has_normals else crop.incidence),
+        "rgb_weight": core * (facing if crop.has_normals else crop.incidence) * float(crop.has_colours),
         "mask_weight": _silhouette_weight(crop) * valid if crop.has_mask else 0 * valid,
         "class_weight": inside * (crop.classes.sum(-1) > 0.5),
     }

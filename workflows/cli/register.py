@@ -6,35 +6,42 @@ from typing import Annotated
 from tyro.conf import Positional, arg
 
 from registration.options import RegisterOptions
-from workflows.cli.options import CaptureFolder, Folder, ModelFile, OptionalCapture, OptionalRegistration
+from workflows.cli.options import Folder, ModelFile, OptionalCapture, OptionalRegistration
+from workflows.cli.scan_options import ScanOptions
 
-_DEFAULTS = RegisterOptions()
+_DEFAULTS, _NO_SCAN = RegisterOptions(), ScanOptions()
 
 
 def register(
-    capture: CaptureFolder,
+    capture: Positional[Annotated[Path | None, arg(metavar="[CAPTURE]", help_behavior_hint="")]] = None,
     /,
+    *,
     model: ModelFile,
     out: Folder,
     neutral: OptionalRegistration = None,
     force: bool = False,
+    scan: ScanOptions = _NO_SCAN,
     fit: RegisterOptions = _DEFAULTS,
 ) -> int:
-    """Fit the head model to one capture and write the registered mesh.
+    """Fit the head model to one capture, or to a scan, and write the registered mesh.
 
     Args:
-        capture: The capture folder.
+        capture: The capture folder; none with --scan.
         model: The head model, a GNM NPZ file.
         out: The registration folder to write; one that gnmreg wrote before is replaced.
         neutral: Start from this registration of the same subject's neutral and keep its identity.
         force: Register again although the folder holds the result of the same input.
+        scan: A scan without photographs instead of a capture.
         fit: How the capture is registered.
     """
     from registration.evaluate.console_table import print_assessment
     from registration.pipeline import register
     from registration.progress import console_progress
 
+    scan.check(capture)
     with console_progress() as progress:
+        if capture is None:
+            capture, fit = scan.capture(model, out, fit, progress)
         result = register(capture, model, out, fit, neutral=neutral, force=force, progress=progress)
     print_assessment(result.figures)
     print(f"{result.status}: {result.reason}\n{out}")
