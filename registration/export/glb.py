@@ -129,7 +129,9 @@ def _material(name: str, *, textured: bool) -> dict[str, Any]:
 
 
 def _extras(mesh: HeadMesh) -> dict[str, object]:
-    names = {"targetNames": list(mesh.shapes)} if mesh.shapes else {}  # where glTF's readers look for them
+    names: dict[str, object] = {"targetNames": list(mesh.shapes)} if mesh.shapes else {}  # where readers look for them
+    if mesh.shape_figures:
+        names["shapeFigures"] = mesh.shape_figures
     return {**names, "vertexCount": mesh.topology.vertex_count, **mesh.origin}
 
 

@@ -76,6 +76,7 @@ class HeadMesh:
     texture: UInt8[np.ndarray, "R R 3"] | None = None  # sRGB, row 0 at v = 1
     unseen: UInt8[np.ndarray, "R R"] | None = None  # 255 where no camera saw the texel and it was filled
     shapes: Mapping[str, Float[np.ndarray, "V 3"]] = field(default_factory=dict)  # name -> displacement at weight 1
+    shape_figures: Mapping[str, Mapping[str, float]] = field(default_factory=dict)  # name -> how well it was solved
     frames: Float[np.ndarray, "T V 3"] | None = None  # vertices of each frame
     frames_per_second: float = 24.0
     origin: Mapping[str, object] = field(default_factory=dict)  # JSON values: what it is and where it comes from

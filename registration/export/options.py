@@ -17,6 +17,8 @@ class ExportOptions:
             captured.
         failed: What to do with registrations that failed or are missing: refuse the export, skip them, or export those
             that failed all the same.
+        arkit: Add ARKit's 52 blend shapes to a model or to a registered neutral, solved in the model's expression
+            basis; those that it cannot express are named and left out.
         sequence: Write the expressions of a subject as the frames of a sequence, in the natural order of their names.
             A folder of registrations is a sequence anyway.
         subject: The subject to export from a stabilized set of several.
@@ -25,6 +27,7 @@ class ExportOptions:
 
     frame: Literal["head", "world"] = "head"
     failed: Literal["refuse", "skip", "export"] = "refuse"
+    arkit: bool = False
     sequence: bool = False
     subject: Annotated[str | None, arg(metavar="NAME", help_behavior_hint="(default: the only one)")] = None
     fps: Annotated[float, arg(metavar="F")] = 24.0

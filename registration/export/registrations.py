@@ -7,6 +7,7 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from registration.errors import InputError
+from registration.export.arkit import NAMES, arkit_shapes
 from registration.export.head_mesh import HeadMesh, Topology
 from registration.export.options import ExportOptions
 from registration.frames import linear_to_srgb, transform_points
@@ -15,6 +16,8 @@ from registration.geometry.topology import vertex_areas
 from registration.model import regions
 from registration.model.gnm_npz import GNMData
 from registration.types import Registration
+
+_WEAKEST = 5  # shapes that are printed
 
 
 def head_of_model(data: GNMData, *, name: str, shapes: Mapping[str, Float[np.ndarray, "V 3"]]) -> HeadMesh:
@@ -63,6 +66,32 @@ def head_of_registration(
         texture=srgb_bytes(registration.texture),
         origin={"frame": options.frame, "status": registration.status},
     )
+
+
+def with_arkit(head: HeadMesh, data: GNMData, options: ExportOptions, scale: float = 1.0) -> tuple[HeadMesh, list[str]]:
+    """Return a head with ARKit's shapes instead of others, and notes for people.
+
+    Args:
+        head: without expression, in the frame of the options.
+        data: its model.
+        options: of the export.
+        scale: of the registration, by which the model's expressions are scaled too.
+
+    Raises:
+        InputError: as `arkit_shapes`.
+    """
+    T_head_out = T_out_world(head.vertices, data, replace(options, frame="head"))
+    solved = arkit_shapes(data, transform_points(T_head_out, head.vertices) / scale)
+    shapes = {name: scale * moves @ T_head_out[:3, :3] for name, moves in solved.displacements.items()}
+    figures = {
+        name: {"coverage": round(shape.coverage, 4), "residual_mm": round(shape.residual_mm, 4)}
+        for name, shape in solved.shapes.items()
+    }
+    notes = [f"{len(shapes)} of ARKit's {len(NAMES)} shapes; share of the motion that the model's basis makes:"]
+    weakest = sorted(solved.shapes, key=lambda name: solved.shapes[name].coverage)[:_WEAKEST]
+    notes += [f"  {name}: {solved.shapes[name].coverage:.2f}" for name in weakest]
+    notes += [f"not in the model's basis, left out: {name} ({s.coverage:.2f})" for name, s in solved.missing.items()]
+    return replace(head, shapes=shapes, shape_figures=figures), notes
 
 
 def with_expressions(

@@ -134,6 +134,10 @@ def _shapes(mesh: HeadMesh) -> Iterator[str]:
         change = unit_normals(mesh.vertices + shape, mesh.topology.triangles) - mesh.normals
         rows = np.flatnonzero((np.abs(shape).max(1) > 0) | (np.abs(change).max(1) > _STILL))
         yield f'\n        def BlendShape "{name}" (\n'
+        figures = "".join(
+            f"                double {k} = {v:.6g}\n" for k, v in mesh.shape_figures.get(title, {}).items()
+        )
+        yield f"            customData = {{\n{figures}            }}\n" if figures else ""
         yield f"            displayName = {_quoted(title)}\n        )\n        {{\n"
         yield f"            uniform vector3f[] offsets = {_tuples(shape[rows])}\n"
         yield f"            uniform vector3f[] normalOffsets = {_tuples(change[rows])}\n"

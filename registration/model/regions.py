@@ -257,6 +257,33 @@ def head_regions(data: GNMData) -> dict[str, Bool[np.ndarray, "V"]]:
     return {name: members & head_skin(data) for name, members in regions.items()}
 
 
+_FACE_AREAS = ("upper_lip", "lower_lip", "upper_lip_region", "lower_lip_region", "chin_region", "nose_region")
+_LEFT_AREAS = ("brow", "cheek", "infraorbital", "zygomatic")
+
+
+def face_areas(data: GNMData) -> dict[str, Bool[np.ndarray, "V"]]:
+    """Areas of the exterior that the muscles of the face move: of the middle, and those on the subject's left.
+
+    upper_lip, lower_lip, upper_lip_region, lower_lip_region, chin, nose, middle_brow; left_brow, left_cheek,
+    left_infraorbital, left_zygomatic.
+    """
+    names = {name.removesuffix("_region") if name[:5] in ("chin_", "nose_") else name: name for name in _FACE_AREAS}
+    names |= {"middle_brow": "middle_brow_region"} | {f"left_{area}": f"left_{area}_region" for area in _LEFT_AREAS}
+    return {area: (group(data, name) > _INSIDE) & exterior(data) for area, name in names.items()}
+
+
+def eye_sockets(data: GNMData) -> Bool[np.ndarray, "V"]:
+    """The inside of the eyelids and the sockets behind them, up to the lids' edges."""
+    return (group(data, "eye_sockets") > _INSIDE) & ~exterior(data)
+
+
+def expression_modes(data: GNMData) -> dict[str, Int[np.ndarray, "K"]]:
+    """The indices of the expression components by what they move: the regions of the basis, and the tongue."""
+    names = data.expression_names.tolist()
+    modes = {region: indices for region, (indices, _) in expression_regions(data).items()}
+    return modes | {"tongue": np.array([k for k, name in enumerate(names) if name.startswith("tongue")], np.int64)}
+
+
 _EXPRESSION_GROUPS = {  # region of an expression component's name -> the group that holds its soft mask
     "left_eye_region": "expression_basis_left_eye",
     "right_eye_region": "expression_basis_right_eye",

@@ -16,6 +16,7 @@ from registration.export.registrations import (
     check_usable,
     head_of_model,
     head_of_registration,
+    with_arkit,
     with_expressions,
     with_frames,
 )
@@ -59,11 +60,18 @@ def read_source(
             model is not found.
     """
     if source.is_file():
-        return ExportSource(head=head_of_model(gnm_npz.read(source), name=source.stem, shapes={}))
+        data = gnm_npz.read(source)
+        head = head_of_model(data, name=source.stem, shapes={})
+        return _with_arkit(head, data, options) if options.arkit else ExportSource(head=head)
     if is_registration(source):
         registration = load_registration(source)
+        if options.arkit and "neutral" in registration.inputs:
+            raise _no_arkit(source, "a registered expression")
         data = find_model(registration, model, source)
-        return ExportSource(head=head_of_registration(registration, data, name=source.name, options=options))
+        head = head_of_registration(registration, data, name=source.name, options=options)
+        return _with_arkit(head, data, options, float(registration.scale)) if options.arkit else ExportSource(head=head)
+    if options.arkit and source.is_dir():
+        raise _no_arkit(source, "a folder of registrations")
     if is_subject_folder(source):
         return _subject(source, model, options)
     if stabilized_folder.is_stabilized(source):
@@ -77,6 +85,21 @@ def read_source(
         expected="a registration folder, a subject's folder, a stabilized set, a folder of registrations, or a model",
         got="a run of several subjects" if run else "other contents" if source.is_dir() else "no such file or folder",
         fix="give the folder of one of its subjects" if run else "give a folder that gnmreg wrote",
+    )
+
+
+def _with_arkit(head: HeadMesh, data: GNMData, options: ExportOptions, scale: float = 1.0) -> ExportSource:
+    shaped, notes = with_arkit(head, data, options, scale)
+    return ExportSource(head=shaped, notes=tuple(notes))
+
+
+def _no_arkit(where: Path, got: str) -> InputError:
+    return InputError(
+        "ARKit's shapes are added to a neutral",
+        where=where,
+        expected="a model, or the registration of a neutral",
+        got=got,
+        fix="give the folder of the neutral's registration, or leave out --arkit",
     )
 
 
