@@ -12,6 +12,7 @@ import numpy as np
 import torch
 from jaxtyping import Float
 
+from registration.capture.visual_hull import outside_masks
 from registration.evaluate.audit import audit_penetration
 from registration.evaluate.evaluation import RegistrationEvaluation, evaluate_registration, without_scan
 from registration.evaluate.verdict import judge
@@ -193,10 +194,11 @@ def _scan(inputs: RegistrationInputs, cameras: Sequence[Camera]) -> tuple[Surfac
     if inputs.scan is None:
         return None, None
     vertices, triangles = inputs.scan.vertices - inputs.origin, inputs.scan.triangles
-    surface = SurfaceViews(vertices, triangles, cameras) if len(triangles) else None
+    foreign = outside_masks(inputs.capture, inputs.scan.vertices)
+    surface = SurfaceViews(vertices, triangles, cameras, foreign=foreign) if len(triangles) else None
     if not inputs.fits_scan:
         return surface, None
-    return surface, CloudPlanes(vertices) if surface is None else MeshPlanes(surface)
+    return surface, CloudPlanes(vertices[~foreign]) if surface is None else MeshPlanes(surface)
 
 
 class _StepProgress:

@@ -5,10 +5,11 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from registration.capture.samples import ViewSample
 from registration.capture.scan import Scan
+from registration.capture.visual_hull import outside_masks
 from registration.doctor.ledger import Channel
 from registration.geometry.surface_views import SurfaceViews
 from registration.types import Camera, Capture
@@ -33,12 +34,14 @@ def scan_normals(capture: Capture, samples: Sequence[ViewSample], scan: Scan) ->
     if not len(scan.triangles):
         cloud = "the scan is a point cloud, whose normals are not known; export it as a mesh"
         return None, [f"{len(without)} of {len(capture.views)} views have no normals: {cloud}"]
-    surface = SurfaceViews(scan.vertices, scan.triangles, [view.camera for view in capture.views])
+    foreign = outside_masks(capture, scan.vertices)
+    cameras = [view.camera for view in capture.views]
+    surface = SurfaceViews(scan.vertices, scan.triangles, cameras, foreign=foreign)
     total, losses = 0, Counter[str]()
     for sample in samples:
         if (camera := without.get(sample.name)) is not None:
             total += int(sample.subject.sum())
-            losses += _losses(sample, surface, camera)
+            losses += _losses(sample, surface, foreign[scan.triangles].any(1), camera)
     counted = total - losses.total()
     row = Channel(
         name="scan normals",
@@ -56,19 +59,16 @@ def scan_normals(capture: Capture, samples: Sequence[ViewSample], scan: Scan) ->
     return row, []
 
 
-def _losses(sample: ViewSample, surface: SurfaceViews, camera: Camera) -> Counter[str]:
-    """Reason -> how many of the subject's pixels it costs."""
+def _losses(sample: ViewSample, surface: SurfaceViews, foreign: Bool[np.ndarray, "F"], camera: Camera) -> Counter[str]:
+    """Reason -> how many of the subject's pixels it costs; `foreign` faces lie outside the masks."""
     height, width = sample.subject.shape
     small = replace(camera.scaled(width, height), distortion=())
     view = surface.view(small)
     row, column = _pixels(sample.rays, small)
     weight, hit = view.weight[row, column] > 0, view.face[row, column] >= 0
-    return Counter(
-        {
-            "no surface": int((sample.subject & ~hit).sum()),
-            "at an edge or grazing": int((sample.subject & hit & ~weight).sum()),
-        }
-    )
+    outside = hit & foreign[view.face[row, column]]
+    reasons = {"no surface": ~hit, "outside other masks": outside, "at an edge or grazing": hit & ~outside & ~weight}
+    return Counter({reason: int((sample.subject & lost).sum()) for reason, lost in reasons.items()})
 
 
 def _pixels(rays: Float[np.ndarray, "h w 3"], camera: Camera) -> tuple[Int[np.ndarray, "h w"], Int[np.ndarray, "h w"]]:

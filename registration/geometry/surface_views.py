@@ -48,6 +48,7 @@ class SurfaceViews:
         triangles: Int[np.ndarray, "F 3"],
         cameras: Sequence[Camera],
         *,
+        foreign: Bool[np.ndarray, "V"] | None = None,
         smoothing_m: float = 5e-4,
         boundary_m: float = 2e-3,
     ):
@@ -57,6 +58,7 @@ class SurfaceViews:
             vertices: finite.
             triangles: vertex indices, at least one.
             cameras: those that tell outside from inside.
+            foreign: vertices that are not trusted, though they hide others.
             smoothing_m: standard deviation over which normals are averaged along the surface; no effect where edges are
                 longer.
             boundary_m: distance from the surface's borders, also those of holes, within which nothing is trusted.
@@ -75,6 +77,7 @@ class SurfaceViews:
             normals, self._plane = -normals, -self._plane
         self.normals: Float[np.ndarray, "V 3"] = normals
         border = _near_border(self.vertices, self.triangles, boundary_m)
+        border |= False if foreign is None else foreign
         self.at_border = np.asarray(border[self.triangles].any(1))  # (F,)
 
     def view(self, camera: Camera) -> SurfaceView:
