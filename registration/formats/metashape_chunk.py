@@ -28,6 +28,7 @@ _FISHEYES = {
     "equisolid_fisheye": "equisolid_brown",
 }
 _TO_COLMAP = "undistort the photographs in Metashape and export the cameras again, or export to COLMAP"
+_EARTH_M, _EARTH_TOLERANCE_M = 6.371e6, 5e4  # from the origin of geocentric coordinates to the ground
 _UNIT = re.compile(r'UNIT\["[^"]*",\s*([0-9.eE+-]+)')
 
 
@@ -66,9 +67,9 @@ def read_chunk(chunk: Element, photographs: Photographs, root: Path, paths: dict
             aligned, or an image is missing.
     """
     lenses = {e.attribute("id"): e for e in chunk.need("sensors").all("sensor")}
-    world = _world(chunk)
     cameras = {e.attribute("id"): e for e in chunk.need("cameras").descendants("camera")}
-    component, others = _main_component(chunk, list(cameras.values()))
+    component, others = _main_component(list(cameras.values()))
+    world = _world(chunk, component)
     read: dict[str, Lens] = {}
     images: list[Path] = []
     found: list[tuple[Lens, Float[np.ndarray, "4 4"]]] = []
@@ -82,7 +83,7 @@ def read_chunk(chunk: Element, photographs: Photographs, root: Path, paths: dict
         if T_chunk_master is None:
             unaligned.append(label)
             continue
-        if component is not None and camera.attributes.get("component_id", component) != component:
+        if camera.attributes.get("component_id", component) != component:
             continue
         sensor = camera.attribute("sensor_id")
         if sensor not in lenses:
@@ -136,12 +137,10 @@ class _World:
         return np.linalg.inv(T_world_cam)
 
 
-def _world(chunk: Element) -> _World:
-    """The chunk's transform; of a georeferenced chunk only its scale."""
-    transform = chunk.find("transform")
-    if transform is None:
-        component = next(iter(chunk.descendants("component")), None)
-        transform = component.find("transform") if component is not None else None
+def _world(chunk: Element, component: str | None) -> _World:
+    """The transform of the cameras' component, or else the chunk's; of a georeferenced chunk only its scale."""
+    own = [e for e in chunk.descendants("component") if e.attributes.get("id") == component]
+    transform = (own[0].find("transform") if own else None) or chunk.find("transform")
     reference = chunk.find("reference")
     system = reference.text.strip() if reference is not None else ""
     if transform is None or transform.find("scale") is None:
@@ -150,24 +149,27 @@ def _world(chunk: Element) -> _World:
     scale = transform.value("scale")
     if scale <= 0:
         raise transform.error("a scale above 0", scale)
-    if system and not system.upper().startswith("LOCAL_CS"):
-        note = f"the chunk is georeferenced ({system[:40]}): its own frame times its scale in metres is used"
+    translation = np.zeros(3) if (e := transform.find("translation")) is None else e.numbers(3)
+    geocentric = abs(float(np.linalg.norm(translation)) - _EARTH_M) < _EARTH_TOLERANCE_M
+    if geocentric or (system and not system.upper().startswith("LOCAL_CS")):
+        note = (
+            f"the chunk is georeferenced ({system[:40] or 'geocentric'}): its own frame times its scale is used, in m"
+        )
         return _World(rotation=np.eye(3), translation=np.zeros(3), scale=scale, unit_m=1.0, local=False, notes=(note,))
     found = _UNIT.search(system)
     rotation = np.eye(3) if (e := transform.find("rotation")) is None else e.numbers(9).reshape(3, 3)
     check_rotation(rotation, transform.refuse(), "rotation")
-    translation = np.zeros(3) if (e := transform.find("translation")) is None else e.numbers(3)
     unit = float(found[1]) if found else 1.0
     return _World(rotation=rotation, translation=translation, scale=scale, unit_m=unit, local=True)
 
 
-def _main_component(chunk: Element, cameras: Sequence[Element]) -> tuple[str | None, list[str]]:
-    """The component with most aligned cameras, and labels of the aligned cameras in others."""
+def _main_component(cameras: Sequence[Element]) -> tuple[str | None, list[str]]:
+    """The component with most aligned cameras, None without components; labels of the aligned cameras in others."""
     aligned = [c for c in cameras if c.find("transform") is not None and "component_id" in c.attributes]
     members: dict[str, list[str]] = {}
     for camera in aligned:
         members.setdefault(camera.attributes["component_id"], []).append(camera.attributes.get("label", "?"))
-    if len(members) < 2:
+    if not members:
         return None, []
     main = max(members, key=lambda name: len(members[name]))
     return main, [label for name, labels in members.items() if name != main for label in labels]

@@ -100,6 +100,31 @@ def test_a_georeferenced_chunk_keeps_its_frame_in_metres(tmp_path: Path) -> None
     np.testing.assert_allclose(-side.T_cam_world[:3, :3].T @ side.T_cam_world[:3, 3], [2.5, 0, 0], atol=1e-12)
 
 
+def test_cameras_of_other_components_and_their_transforms_do_not_count(tmp_path: Path) -> None:
+    """As Metashape 2 writes georeferenced chunks: a transform for each component, labels that are paths."""
+    write(tmp_path)
+    text = (tmp_path / "cameras.xml").read_text("utf-8")
+    ground = "<translation>-2499366.429888 -4256836.520906 4029217.965003</translation><scale>12.5</scale>"
+    components = (
+        "<components><component id='3'><transform><scale>9</scale></transform></component><component id='7'>"
+        f"<transform><rotation>1 0 0 0 1 0 0 0 1</rotation>{ground}</transform></component></components>"
+    )
+    text = text.replace("<cameras", components + "<cameras").replace(
+        'sensor_id="0" label="front"', 'sensor_id="0" component_id="7" label="D:\\shoot\\front.jpg"'
+    )
+    third = f'<camera id="2" sensor_id="0" component_id="7" label="/home/a/photos/side.jpg"><transform>{TURNED}'
+    text = text.replace('sensor_id="0" label="side.JPG"', 'sensor_id="0" component_id="3" label="lost"')
+    (tmp_path / "cameras.xml").write_text(
+        text.replace("</cameras>", third + "</transform></camera></cameras>"), "utf-8"
+    )
+    source = read(tmp_path)
+    assert [view.name for view in source.views] == ["front", "side"] and source.unit_m == 1.0
+    assert any("georeferenced (geocentric)" in note for note in source.notes)
+    assert any("another component, whose world is another: lost" in note for note in source.notes)
+    side = source.views[1]
+    np.testing.assert_allclose(-side.T_cam_world[:3, :3].T @ side.T_cam_world[:3, 3], [62.5, 0, 0], atol=1e-9)
+
+
 def test_a_slave_has_its_masters_pose_and_its_sensors_offset(tmp_path: Path) -> None:
     slave = "<rotation>1 0 0 0 1 0 0 0 1</rotation><location>0.1 0 0</location>"
     source = read(write(tmp_path, slave=slave, second='sensor_id="0" master_id="0" label="side">'))
