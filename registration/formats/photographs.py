@@ -121,7 +121,8 @@ def scan_beside(folder: Path) -> Path | None:
 def check_rotation(R: Float[np.ndarray, "3 3"], error: Error, entry: str) -> None:
     """Refuse a matrix that is no rotation: mirrored, scaled or skewed. Raises InputError."""
     if np.abs(R).max() > 2 or np.abs(R @ R.T - np.eye(3)).max() > _ROTATION:
-        raise error(entry, "a rotation matrix", f"rows {R.round(4).tolist()}")
+        rows = " / ".join(" ".join(f"{value:.4g}" for value in row) for row in R)
+        raise error(entry, "a rotation matrix", f"rows {rows}")
     if np.linalg.det(R) < 0:
         raise error(entry, "a rotation matrix", "a mirroring one, of determinant -1")
 
