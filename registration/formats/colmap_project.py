@@ -10,6 +10,7 @@ from pathlib import Path, PurePosixPath
 import numpy as np
 
 from registration.capture.colmap import PosedImage, read_images
+from registration.capture.dense_maps import COLMAP_SUFFIXES
 from registration.errors import InputError
 from registration.formats.colmap_lenses import lens_of
 from registration.formats.source import Format, ReadOptions, SourceCapture, SourceView
@@ -142,6 +143,8 @@ def _view(name: str, image: PosedImage, folder: Path, roots: Sequence[Path]) -> 
         T_cam_world=image.T_cam_world,
         distortion=distortion,
         mask=_mask(roots, name),
+        normals=_dense_map(folder, "normal_maps", name),
+        depth=_dense_map(folder, "depth_maps", name),
     )
 
 
@@ -149,6 +152,12 @@ def _mask(roots: Sequence[Path], name: str) -> Path | None:
     """COLMAP's name of a mask is the image's and .png; other programs replace the suffix."""
     names = (f"{name}.png", PurePosixPath(name).with_suffix(".png").as_posix(), name)
     places = [root / folder / mask for root in roots for folder in _MASKS for mask in names]
+    return next((file for file in places if file.is_file()), None)
+
+
+def _dense_map(images: Path, kind: str, name: str) -> Path | None:
+    """A map of the dense reconstruction in `stereo`, beside the undistorted images; of both kinds the filtered one."""
+    places = [images.parent / "stereo" / kind / f"{name}{suffix}" for suffix in COLMAP_SUFFIXES]
     return next((file for file in places if file.is_file()), None)
 
 

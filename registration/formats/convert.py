@@ -17,6 +17,7 @@ from registration.capture.native import read_capture
 from registration.capture.native_writer import CaptureDescription, check_new, write_settings
 from registration.capture.scan import SCAN, SCANS, read_scan
 from registration.errors import InputError
+from registration.formats.geometry_channels import kept_normals, write_depth, written_normals
 from registration.formats.plan import ViewPlan, plan_views
 from registration.formats.source import SourceCapture, SourceView, VideoFrame
 from registration.formats.undistort import scaled_world, turned
@@ -78,7 +79,7 @@ def import_capture(
     with atomic_directory(target) as temporary:
         for number, plan in enumerate(plans):
             progress.update(number, len(plans), "views imported")
-            cameras[_write_view(temporary, plan, source.classes)] = scaled_world(plan.camera, unit_m)
+            cameras[_write_view(temporary, plan, source.classes, unit_m)] = scaled_world(plan.camera, unit_m)
         progress.update(len(plans), len(plans), "views imported")
         write_model(temporary / "sparse", cameras, np.zeros((0, 3)))
         description = CaptureDescription(
@@ -92,7 +93,7 @@ def import_capture(
     return Imported(root=target, format=source.format, views=len(plans), unit_m=unit_m, notes=tuple(notes))
 
 
-def _write_view(root: Path, plan: ViewPlan, classes: tuple[str, ...]) -> str:
+def _write_view(root: Path, plan: ViewPlan, classes: tuple[str, ...], unit_m: float) -> str:
     """Write the files of a view. Returns its image's name."""
     view = plan.view
     suffix = view.image.suffix if plan.as_it_is and isinstance(view.image, Path) else ".png"
@@ -109,11 +110,13 @@ def _write_view(root: Path, plan: ViewPlan, classes: tuple[str, ...]) -> str:
             mask = pixels.read_mask(view.mask, camera)
             _write_png(_target(root / "masks", view), mask if plan.lens is None else plan.lens.image(mask))
     if view.normals is not None:
-        normals = _target(root / "normals", view)
-        if plan.lens is None:
-            _copy(view.normals, normals)
+        suffix_of_normals = kept_normals(plan)
+        if suffix_of_normals is not None:
+            _copy(view.normals, _target(root / "normals", view, suffix_of_normals))
         else:
-            _write_png(normals, _normals(plan, pixels.read_normals(view.normals, camera)))
+            _write_png(_target(root / "normals", view), written_normals(plan))
+    if view.depth is not None:
+        write_depth(_target(root / "depth", view, ".npy"), plan, unit_m)
     if view.segmentation is not None:
         labels = _target(root / "segmentation", view)
         if plan.lens is None:
@@ -172,16 +175,6 @@ def _video_frame(view: SourceView, frame: VideoFrame) -> np.ndarray:
     return np.ascontiguousarray(image[..., ::-1])
 
 
-def _normals(plan: ViewPlan, encoded: np.ndarray) -> np.ndarray:
-    """A normal map through the lens: vectors are averaged, not codes, and keep the camera's frame."""
-    assert plan.lens is not None
-    normals = plan.lens.image(pixels.decode_normals(encoded))
-    length = np.linalg.norm(normals, axis=-1, keepdims=True)
-    result = np.round((normals / np.maximum(length, 1e-6) + 1) / 2 * 65535).astype(np.uint16)
-    result[length[..., 0] < 0.5] = 0  # background, or across an edge of depth
-    return result
-
-
 def _source_camera(view: SourceView) -> Camera:
     return Camera(
         width_px=view.width_px, height_px=view.height_px, intrinsics=view.intrinsics, T_cam_world=view.T_cam_world
@@ -226,7 +219,7 @@ def _view_record(source: SourceCapture, plan: ViewPlan) -> dict[str, Any]:
     view = plan.view
     video = view.image if isinstance(view.image, VideoFrame) else None
     image = view.image.file if isinstance(view.image, VideoFrame) else view.image
-    files = {part: getattr(view, part) for part in ("mask", "normals", "segmentation")}
+    files = {part: getattr(view, part) for part in ("mask", "normals", "depth", "segmentation")}
     named = {part: _name(source, file) for part, file in files.items() if file is not None}
     record: dict[str, Any] = {"image": _name(source, image), **named}
     if video is not None:

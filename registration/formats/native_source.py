@@ -61,6 +61,9 @@ def _view(view: View, lens: Distortion) -> SourceView:
         colour=view.colour,
         mask=view.mask,
         normals=view.normals,
+        normals_frame=view.normals_frame,
+        depth=view.depth,
+        depth_unit_m=view.depth_unit_m,
         segmentation=view.segmentation,
         landmarks=view.landmarks,
     )

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
+from registration.capture.dense_maps import is_colmap_map
 from registration.capture.headers import require_complete, require_size
 from registration.errors import InputError
 from registration.formats.distortions import MODELS
@@ -74,7 +75,7 @@ def _lens_name(view: SourceView) -> str:
 def _plan(view: SourceView, notes: list[str]) -> ViewPlan:
     stored_px, turn = _size(view, notes)
     for part, role in _CHANNELS.items():
-        if (file := getattr(view, part)) is not None:
+        if (file := getattr(view, part)) is not None and not is_colmap_map(file):
             require_size(file, role, view.width_px, view.height_px)
             require_complete(file, role)
     lens = None if is_native(view) else undistortion(view)

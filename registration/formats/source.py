@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from registration.types import Colour
+from registration.types import Colour, NormalsFrame
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -40,7 +40,10 @@ class SourceView:
     distortion: Distortion = Distortion(model="none")
     colour: Colour = Colour()
     mask: Path | None = None
-    normals: Path | None = None  # in the native encoding
+    normals: Path | None = None  # in the native encoding, or a map of COLMAP's dense reconstruction
+    normals_frame: NormalsFrame = "camera_opencv"  # axes of the stored normals
+    depth: Path | None = None  # along the optical axis, of a kind that native captures have
+    depth_unit_m: float | None = None  # metres per stored unit; None: the values are lengths of the world
     segmentation: Path | None = None
     landmarks: Mapping[str, Float[np.ndarray, "L 3"]] = field(default_factory=dict)  # x_px y_px confidence, distorted
 
