@@ -105,7 +105,7 @@ def read_inputs(
         and (options.use_scan == "always" or not any(view.has_normals for view in selected.views)),
         digests=digests,
         config=config,
-        notes=(*data.remarks, *_reversed_files(capture, schemes)),
+        notes=(*_of_the_scan(capture), *data.remarks, *_reversed_files(capture, schemes)),
     )
 
 
@@ -184,6 +184,12 @@ def _select_views(capture: Capture, count: int | None) -> Capture:
         raise InputError("Too few views", where="views", expected="at least 2", got=count, fix="use at least two views")
     selected = select_spread_views([view.camera for view in capture.views], count)
     return replace(capture, views=tuple(capture.views[i] for i in selected))
+
+
+def _of_the_scan(capture: Capture) -> tuple[str, ...]:
+    """What was found in the scan that a capture was made from (`scan_capture.make`)."""
+    notes = capture.tags.get("scan_notes", ())
+    return tuple(map(str, notes)) if isinstance(notes, (list, tuple)) else ()
 
 
 def _scan_of_the_fit(capture: Capture, options: RegisterOptions) -> Scan | None:

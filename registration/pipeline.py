@@ -58,7 +58,6 @@ CONVERGED_MM = 0.05  # 95th percentile of vertex motion over the last tenth of t
 MAX_LANDMARK_PX = 3.0  # median residual at 512 px of head height
 _NAMED_VIEW_RATIO = 2  # times MAX_LANDMARK_PX: views with a larger error are named
 _STAGE_VIEWS = 3
-_SCAN_TAGS = ("scan_hygiene", "scan_notes")  # of a capture that was made from a scan alone
 
 
 def register(
@@ -306,7 +305,7 @@ def _collect(inputs: RegistrationInputs, fitted: _Fitted, comparison: Comparison
             "camera_gains": problem.appearance.gains.cpu().numpy().round(4).tolist(),
             "views_not_trusted": dict(problem.view_weights.notes),
             "notes": [*inputs.notes, *fitted.initial.notes],
-            **{name: inputs.capture.tags[name] for name in _SCAN_TAGS if name in inputs.capture.tags},
+            **{name: inputs.capture.tags[name] for name in ("scan_hygiene",) if name in inputs.capture.tags},
             **({"warnings": list(inputs.ledger.warnings)} if inputs.ledger.warnings else {}),
             **({} if inputs.scan is None else {"scan_in_fit": _scan_in_fit(inputs, problem)}),
             "residuals": comparison.residuals,

@@ -54,7 +54,7 @@ class ScanOptions:
     def capture(
         self, model: Path, out: Path, fit: RegisterOptions, progress: "Progress"
     ) -> tuple[Path, RegisterOptions]:
-        """Make the capture of the scan, or find it made of the same files, and say what was found.
+        """Make the capture of the scan, or find it made of the same files; its registration says what was found.
 
         Args:
             model: the head model.
@@ -82,7 +82,5 @@ class ScanOptions:
         data = gnm_npz.read(model)
         root = self.scan_capture or out.with_name(f"{out.name}_capture")
         made = make_capture(source, root, data, read_schemes(model, data, fit.landmark_files), progress)
-        for note in made.notes:
-            progress.message(note)
         progress.message(f"the capture of the scan: {made.root}")
         return made.root, replace(fit, use_scan="always") if fit.use_scan == "auto" else fit
