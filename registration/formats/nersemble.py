@@ -106,10 +106,14 @@ def read(path: Path, options: ReadOptions) -> SourceCapture:
         raise params.error("world_2_cam", f"poses of the cameras {listed(unknown, 4)}", listed(list(poses), 4))
     colours = _colours(layout.colours, used)
     alphas = _alpha_maps(layout.sequence, frame)
-    views = []
+    views, resized = [], []
     for serial in used:
         image = images[serial]
         width_px, height_px = _size(image)
+        mask = alphas.get(serial)
+        if mask is not None and stored_size(mask) != (width_px, height_px):  # as version 1 has beside smaller images
+            resized.append(mask.name)
+            mask = None
         views.append(
             SourceView(
                 name=f"cam_{serial}",
@@ -119,10 +123,13 @@ def read(path: Path, options: ReadOptions) -> SourceCapture:
                 intrinsics=_scaled(K, size_px, (width_px, height_px), params),
                 T_cam_world=poses[serial],
                 colour=colours.get(serial, Colour()),
-                mask=alphas.get(serial),
+                mask=mask,
             )
         )
-    notes = (f"frame {frame} was read", *left_out(unknown, f"not in {_PARAMS}"))
+    notes = [f"frame {frame} was read", *left_out(unknown, f"not in {_PARAMS}")]
+    if resized:
+        names = listed(resized, 3)
+        notes.append(f"{len(resized)} alpha maps were left out, not of their image's size: {names}; resize them to it")
     return SourceCapture(
         format=FORMAT.name,
         root=layout.sequence,
@@ -130,7 +137,7 @@ def read(path: Path, options: ReadOptions) -> SourceCapture:
         expression=options.expression or layout.sequence.name,
         views=tuple(views),
         unit_m=1.0,
-        notes=notes,
+        notes=tuple(notes),
     )
 
 

@@ -81,6 +81,15 @@ def test_nersemble_1_has_half_sized_images_alpha_maps_and_affine_colours(tmp_pat
     np.testing.assert_allclose(np.array(view.colour.matrix) @ [*rgb, 1], theirs, atol=1e-12)
 
 
+def test_alpha_maps_of_another_size_are_left_out_and_named(tmp_path: Path) -> None:
+    sequence = nersemble(tmp_path) / "sequences" / "EXP-1-head"
+    image(sequence / "alpha_maps" / "cam_222200042_000000.png", 110, 160)
+    image(sequence / "alpha_maps" / "cam_222200044_000000.png", 220, 320)
+    source = read_source(sequence, ReadOptions())
+    assert [view.mask is not None for view in source.views] == [True, False]
+    assert any("cam_222200044_000000.png; resize" in note for note in source.notes)
+
+
 @pytest.mark.parametrize(
     ("changed", "part"),
     [
