@@ -11,6 +11,8 @@ from typing import Any
 
 from registration.errors import InputError
 from registration.model import gnm_npz
+from registration.model.gnm_npz import GNMData
+from registration.model.landmarks import read_scheme
 from registration.progress import NullProgress, Progress
 from registration.storage.cache import cache_folder, make_cache_folder
 from registration.storage.download import DownloadError, download
@@ -23,6 +25,9 @@ LICENCE = "Apache-2.0"
 SHA256 = "61d78bbfb4ad8e0b38495804a4caef3214d3df00f8c3f68761e63b41ce3747eb"
 RECORD_KIND, RECORD_SCHEMA = "gnm-model-source", 1
 _MAX_BYTES = 2**30  # of a download
+# The scheme of 68 points, which the hubs do not have; one order of the right jaw or the other, both are read.
+LANDMARKS = "https://raw.githubusercontent.com/google/GNM/main/gnm/shape/data/landmarks/head_sparse_68.txt"
+_MAX_LANDMARK_BYTES = 2**20
 _REVISION = "c01e90d298d82301f9fd18f54806be751775cb7c"  # of the repository on Hugging Face, with that file
 
 
@@ -34,6 +39,7 @@ class Source:
     address: str  # of the file
     page: str  # for people
     sha256: str | None = None  # of the file, if the address names one version of it
+    landmarks: str | None = None  # address of the scheme of 68 points
 
 
 def sources() -> Mapping[str, Source]:
@@ -42,12 +48,24 @@ def sources() -> Mapping[str, Source]:
     kaggle = os.environ.get("KAGGLE_API_ENDPOINT", "https://www.kaggle.com").rstrip("/")
     handle, page = "google/gnm-v3", "https://huggingface.co/google/gnm-v3"
     found = (
-        Source(name="http", address=f"https://huggingface.co/{handle}/resolve/main/{FILE}", page=page),
-        Source(name="huggingface", address=f"{hub}/{handle}/resolve/{_REVISION}/{FILE}", page=page, sha256=SHA256),
+        Source(
+            name="http",
+            address=f"https://huggingface.co/{handle}/resolve/main/{FILE}",
+            page=page,
+            landmarks=LANDMARKS,
+        ),
+        Source(
+            name="huggingface",
+            address=f"{hub}/{handle}/resolve/{_REVISION}/{FILE}",
+            page=page,
+            sha256=SHA256,
+            landmarks=LANDMARKS,
+        ),
         Source(
             name="kaggle",
             address=f"{kaggle}/api/v1/models/{handle}/other/gnm_head_v3_0/1/download/gnm_head.npz",
             page="https://www.kaggle.com/models/google/gnm-v3",
+            landmarks=LANDMARKS,
         ),
     )
     return {source.name: source for source in found}
@@ -101,6 +119,9 @@ def fetch(source: Source | None = None, *, progress: Progress | None = None) -> 
                 raise
             progress.message(f"not used: {path}: {error.got}")
             continue
+        if not list(path.parent.glob("head_sparse_*.txt")):
+            fix = f"give `--landmarks 68=FILE`, or place {LANDMARKS} there"
+            progress.message(f"there is no landmark scheme beside {path}: {fix}")
         return path
     return _download(source or sources()["http"], progress)
 
@@ -146,7 +167,7 @@ def _download(source: Source, progress: Progress) -> Path:
                 fix=f"try again; if it stays, {by_hand}",
             )
         try:
-            gnm_npz.read(temporary)
+            data = gnm_npz.read(temporary)
         except InputError as error:
             fix = f"try another --source, or {by_hand}"
             raise InputError(
@@ -156,4 +177,19 @@ def _download(source: Source, progress: Progress) -> Path:
     write_json(_record_path(path), {**record, "sha256": digest, "bytes": size, "licence": LICENCE})
     if digest != SHA256:
         progress.message(f"the file differs from the release that this version knows: sha256 {digest}")
+    _download_landmarks(source, path, data, progress)
     return path
+
+
+def _download_landmarks(source: Source, model: Path, data: GNMData, progress: Progress) -> None:
+    """Place the scheme of 68 points beside the model; if that fails, a message says so: the model can be used."""
+    if source.landmarks is None:
+        return
+    path = model.with_name("head_sparse_68.txt")
+    try:
+        with atomic_file(path) as temporary:
+            download(source.landmarks, temporary, max_bytes=_MAX_LANDMARK_BYTES)
+            read_scheme(temporary, data.template_vertex_positions, "68")
+    except (DownloadError, InputError) as error:
+        got = error.got if isinstance(error, InputError) else error
+        progress.message(f"the landmark scheme cannot be had ({got}): place {source.landmarks} at {path}")

@@ -3,6 +3,7 @@ import json
 import socket
 import threading
 from collections.abc import Iterator
+from dataclasses import replace
 from functools import partial
 from http.server import BaseHTTPRequestHandler, SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
@@ -164,8 +165,8 @@ def test_googles_caches_come_first(cache, tmp_path, monkeypatch):
     places[0].write_bytes(MODEL[:1000])
     told = Messages()
     assert fetch.fetch(progress=told) == places[1]
-    (text,) = told.texts
-    assert str(places[0]) in text and "cut short" in text
+    assert str(places[0]) in told.texts[0] and "cut short" in told.texts[0]
+    assert str(places[1]) in told.texts[1] and "no landmark scheme" in told.texts[1]
 
 
 def test_a_damaged_file_in_our_cache_is_an_error(cache):
@@ -228,6 +229,27 @@ def test_another_file_than_the_address_names_is_refused(cache, site):
     assert fetch.fetch(at(site[0], sha256=hashlib.sha256(MODEL).hexdigest())) == cache
 
 
+def test_the_landmark_scheme_comes_with_the_model(cache, site):
+    address, served = site
+    served.write_bytes(MODEL)
+    source = replace(at(address), landmarks=f"{address}/v3_0/head_sparse_68.txt")
+    told = Messages()
+    assert fetch.fetch(source, progress=told) == cache
+    assert any("cannot be had (404" in text and "head_sparse_68.txt" in text for text in told.texts)
+    told = Messages()
+    fetch.fetch(source, progress=told)
+    (text,) = told.texts
+    assert "there is no landmark scheme beside" in text
+    for content, there in ((b"<html>", False), ((HERE / "head_sparse_68.txt").read_bytes(), True)):
+        cache.unlink()
+        (served.parent / "head_sparse_68.txt").write_bytes(content)
+        fetch.fetch(source)
+        assert cache.with_name("head_sparse_68.txt").is_file() == there
+    told = Messages()
+    fetch.fetch(source, progress=told)
+    assert told.texts == []
+
+
 def test_a_file_that_is_too_large_is_refused(cache, site, monkeypatch):
     site[1].write_bytes(MODEL)
     monkeypatch.setattr(fetch, "_MAX_BYTES", 1000)
@@ -257,6 +279,7 @@ def test_the_command(cache, tmp_path, monkeypatch, capsys):
     for address in serving(partial(Quiet, directory=str(site))):
         monkeypatch.setenv("HF_ENDPOINT", address)
         monkeypatch.setenv("KAGGLE_API_ENDPOINT", address)
+        monkeypatch.setattr(fetch, "LANDMARKS", f"{address}/head_sparse_68.txt")
         assert main(["model", "fetch", "--source", "huggingface"]) == 2  # it is not the released file
         assert "expected: sha256 61d78bbf" in capsys.readouterr().err
         assert main(["model", "fetch", "--source", "kaggle"]) == 0
