@@ -1,13 +1,14 @@
 """Heads to export, from registrations and a model."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import Float, Int, UInt8
 
 from registration.errors import InputError
 from registration.export.arkit import NAMES, arkit_shapes
+from registration.export.fill import fill_unseen
 from registration.export.head_mesh import HeadMesh, Topology
 from registration.export.options import ExportOptions
 from registration.frames import linear_to_srgb, transform_points
@@ -66,6 +67,42 @@ def head_of_registration(
         texture=srgb_bytes(registration.texture),
         origin={"frame": options.frame, "status": registration.status},
     )
+
+
+def with_filled_texture(
+    head: HeadMesh,
+    registration: Registration,
+    mirror: Int[np.ndarray, "V"],
+    others: Sequence[tuple[str, Registration]] = (),
+) -> tuple[HeadMesh, list[str]]:
+    """Return a head with the texels filled that no camera saw, and notes for people.
+
+    Args:
+        head: of the registration.
+        registration: whose texture and confidence count.
+        mirror: of the model.
+        others: name and registration of others of the subject, the preferred first.
+
+    Raises:
+        InputError: another one has another topology, or another atlas.
+    """
+    for name, other in others:
+        head.topology.check(other.triangles, name)
+        if not np.array_equal(other.corner_uvs, registration.corner_uvs):
+            raise InputError(
+                "A registration has another texture atlas",
+                where=name,
+                expected="the uvs of the one that is filled",
+                got="others",
+                fix="register both with one model and one release of this program",
+            )
+    filled = fill_unseen(registration, head.topology, mirror, [other for _, other in others])
+    origins = [*(name for name, _ in others), "the other side", "their surroundings", "nothing: their colours are kept"]
+    shares = [
+        f"{100 * share:.1f} % {name}" for name, share in zip(origins, filled.shares.values(), strict=True) if share
+    ]
+    note = f"texels that no camera saw are filled from: {', '.join(shares)}" if shares else "cameras saw every texel"
+    return replace(head, texture=srgb_bytes(filled.texture), unseen=filled.unseen), [note]
 
 
 def with_arkit(head: HeadMesh, data: GNMData, options: ExportOptions, scale: float = 1.0) -> tuple[HeadMesh, list[str]]:

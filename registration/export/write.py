@@ -78,16 +78,17 @@ def format_of(file: Path) -> Format:
     return found
 
 
-def check_out(file: Path, *, replace: bool) -> None:
+def check_out(file: Path, *, replace: bool, filled: bool = False) -> None:
     """Refuse, before any work, a file that cannot be written.
 
     Args:
         file: where the export goes.
         replace: replace files that are there.
+        filled: a filled texture is written, with the mask of what was filled.
 
     Raises:
         InputError: no format has its suffix, the package that the format needs is not installed, it is a folder, or it
-            or a file that belongs to it exists.
+            or a file that belongs to it exists, or it cannot hold the texture that is to be filled.
     """
     kind = format_of(file)
     if kind.module is not None and find_spec(kind.module) is None:
@@ -100,8 +101,16 @@ def check_out(file: Path, *, replace: bool) -> None:
             fix=f"pip install {kind.package}, or choose one of {others}",
         )
     check_output_file(file)
+    if filled and not kind.texture:
+        raise InputError(
+            "The format has no texture to fill",
+            where=file,
+            expected=f"one of {', '.join(suffix for suffix, other in FORMATS.items() if other.texture)}",
+            got=file.suffix,
+            fix="choose one of them, or leave out --fill and --fill-from",
+        )
     suffixes = (file.suffix, *kind.companions, *([".png"] if kind.texture and kind.texture_beside else []))
-    for path in (file.with_suffix(suffix) for suffix in suffixes):
+    for path in (*(file.with_suffix(suffix) for suffix in suffixes), *([mask_file(file)] if filled else [])):
         check_output_file(path)
         if path.exists() and not replace:
             raise InputError(
@@ -111,6 +120,11 @@ def check_out(file: Path, *, replace: bool) -> None:
                 got="a file",
                 fix="add --force to replace it",
             )
+
+
+def mask_file(file: Path) -> Path:
+    """Return the image beside an exported file that is white where the texture was filled."""
+    return file.with_name(f"{file.stem}_unseen.png")
 
 
 def check_fits(mesh: HeadMesh, file: Path) -> None:
@@ -157,6 +171,8 @@ def write(mesh: HeadMesh, file: Path) -> list[Path]:
         kind.write(mesh, Path(folder) / file.name, texture)
         if beside and mesh.texture is not None:
             (Path(folder) / file.with_suffix(".png").name).write_bytes(png_bytes(mesh.texture))
+        if mesh.unseen is not None:
+            (Path(folder) / mask_file(file).name).write_bytes(png_bytes(mesh.unseen))
         names = sorted((path.name for path in Path(folder).iterdir()), key=lambda name: (name == file.name, name))
         for name in names:  # the file that names the others comes last
             os.replace(Path(folder) / name, file.with_name(name))

@@ -35,7 +35,7 @@ def export(
     from registration.export.write import check_out, left_out, write
     from workflows.records.export_source import read_source
 
-    check_out(out, replace=force)
+    check_out(out, replace=force, filled=how.fills)
     found = read_source(source, model, how)
     files = write(found.head, out)
     for note in found.notes:

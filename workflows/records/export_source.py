@@ -18,6 +18,7 @@ from registration.export.registrations import (
     head_of_registration,
     with_arkit,
     with_expressions,
+    with_filled_texture,
     with_frames,
 )
 from registration.frames import transform_points
@@ -59,19 +60,14 @@ def read_source(
         InputError: it is nothing of this kind, it cannot be read, a registration failed, topologies differ, or the
             model is not found.
     """
+    if options.subject is not None and not stabilized_folder.is_stabilized(source):
+        raise _needless("--subject", source, "a stabilized set")
     if source.is_file():
-        data = gnm_npz.read(source)
-        head = head_of_model(data, name=source.stem, shapes={})
-        return _with_arkit(head, data, options) if options.arkit else ExportSource(head=head)
+        return _model(source, model, options)
     if is_registration(source):
-        registration = load_registration(source)
-        if options.arkit and "neutral" in registration.inputs:
-            raise _no_arkit(source, "a registered expression")
-        data = find_model(registration, model, source)
-        head = head_of_registration(registration, data, name=source.name, options=options)
-        return _with_arkit(head, data, options, float(registration.scale)) if options.arkit else ExportSource(head=head)
+        return _registration(source, model, options)
     if options.arkit and source.is_dir():
-        raise _no_arkit(source, "a folder of registrations")
+        raise _needless("--arkit", source, "a model, or the registration of a neutral")
     if is_subject_folder(source):
         return _subject(source, model, options)
     if stabilized_folder.is_stabilized(source):
@@ -88,18 +84,54 @@ def read_source(
     )
 
 
+def _model(file: Path, model: Path | None, options: ExportOptions) -> ExportSource:
+    for option, given in (("--fill", options.fills), ("--sequence", options.sequence), ("--model", model is not None)):
+        if given:
+            raise _needless(option, file, "registrations")
+    data = gnm_npz.read(file)
+    head = head_of_model(data, name=file.stem, shapes={})
+    return _with_arkit(head, data, options) if options.arkit else ExportSource(head=head)
+
+
+def _registration(folder: Path, model: Path | None, options: ExportOptions) -> ExportSource:
+    registration = load_registration(folder)
+    if options.sequence:
+        raise _needless("--sequence", folder, "a subject's folder or a stabilized set")
+    if options.arkit and "neutral" in registration.inputs:  # of which it is an expression
+        raise _needless("--arkit", folder, "a model, or the registration of a neutral")
+    data = find_model(registration, model, folder)
+    found = _textured(registration, data, folder.name, options)
+    if not options.arkit:
+        return found
+    shaped = _with_arkit(found.head, data, options, float(registration.scale))
+    return ExportSource(head=shaped.head, notes=(*found.notes, *shaped.notes))
+
+
+def _textured(registration: Registration, data: GNMData, name: str, options: ExportOptions) -> ExportSource:
+    """A registration's head, its texture filled if the options say so."""
+    head = head_of_registration(registration, data, name=name, options=options)
+    if not options.fills:
+        return ExportSource(head=head)
+    others = [(str(folder), load_registration(folder)) for folder in options.fill_from]
+    for folder, other in others:
+        check_usable(other, folder, options)
+    filled, notes = with_filled_texture(head, registration, data.mirror_indices.astype(np.int64), others)
+    return ExportSource(head=filled, notes=tuple(notes))
+
+
 def _with_arkit(head: HeadMesh, data: GNMData, options: ExportOptions, scale: float = 1.0) -> ExportSource:
     shaped, notes = with_arkit(head, data, options, scale)
     return ExportSource(head=shaped, notes=tuple(notes))
 
 
-def _no_arkit(where: Path, got: str) -> InputError:
+def _needless(option: str, where: Path, expected: str) -> InputError:
+    """The error for an option that has no meaning for a source."""
     return InputError(
-        "ARKit's shapes are added to a neutral",
+        f"{option} has no meaning for this source",
         where=where,
-        expected="a model, or the registration of a neutral",
-        got=got,
-        fix="give the folder of the neutral's registration, or leave out --arkit",
+        expected=expected,
+        got="another source",
+        fix=f"leave out {option}, or give {expected}",
     )
 
 
@@ -110,7 +142,8 @@ def _subject(folder: Path, model: Path | None, options: ExportOptions) -> Export
     names, notes = _usable(record, folder, options)
     neutral = load_registration(folder / record.neutral)
     data = find_model(neutral, model, folder / record.neutral)
-    head = head_of_registration(neutral, data, name=record.subject, options=options)
+    rest = _textured(neutral, data, record.subject, options)
+    head, notes = rest.head, (*notes, *rest.notes)
     if not names:
         return ExportSource(head=head, notes=(*notes, "the subject has no expressions"))
     skin = SkullSkin.from_model(data)
@@ -156,6 +189,8 @@ def _stabilized(folder: Path, model: Path | None, options: ExportOptions) -> Exp
     number = _chosen(manifest.subjects, options.subject, folder)
     subject = stabilized_folder.read_subject(folder, number)
     found = _neutral_registration(folder.parent, subject.subject, manifest.inputs)
+    if found is None and options.fills:
+        raise _needless("--fill", folder, "a stabilized set in the folder of its registrations")
     if found is None:
         data = find_model(None, model, folder, content=manifest.inputs.get("model"))
         head = head_of_model(data, name=subject.subject, shapes={})
@@ -163,7 +198,8 @@ def _stabilized(folder: Path, model: Path | None, options: ExportOptions) -> Exp
     else:
         neutral = load_registration(found)
         data = find_model(neutral, model, found)
-        head, notes = head_of_registration(neutral, data, name=subject.subject, options=options), ()
+        rest = _textured(neutral, data, subject.subject, options)
+        head, notes = rest.head, rest.notes
     if len(subject.neutral) != head.topology.vertex_count:
         raise InputError(
             "The model has another topology than the stabilized set",
@@ -212,7 +248,9 @@ def _sequence(folders: list[Path], model: Path | None, options: ExportOptions) -
             continue
         if head is None:
             data = find_model(registration, model, folder)
-            head = head_of_registration(registration, data, name=folder.parent.name, options=options)
+            rest = _textured(registration, data, folder.parent.name, options)
+            head = rest.head
+            notes += rest.notes
             T = T_out_world(registration.vertices, data, options)
             notes.append(f"the texture is that of {folder.name}, the first frame")
         check_usable(registration, folder, options)

@@ -61,8 +61,8 @@ def test_a_failed_registration_needs_a_word(tmp_path: Path, capsys) -> None:
 def test_arkit_needs_a_neutral_of_a_model_with_lids(folder: Path, tmp_path: Path, capsys) -> None:
     smile = a_folder(tmp_path / "smile", 3, inputs={"model": "ab" * 32, "neutral": "cd" * 32})
     for source, message in (
-        (smile, "ARKit's shapes are added to a neutral"),
-        (tmp_path, "ARKit's shapes are added to a neutral"),
+        (smile, "--arkit has no meaning for this source"),
+        (tmp_path, "--arkit has no meaning for this source"),
         (folder, "by which ARKit's shapes are defined"),  # the tiny head has no edges of the lids
     ):
         assert main(["export", str(source), str(tmp_path / "head.glb"), "--arkit"]) == 2
