@@ -9,6 +9,7 @@ from pathlib import Path
 
 from registration.capture.tiff import is_tiff, read_tiff_header, refuse_tiff
 from registration.errors import InputError
+from registration.storage.exr_files import exr_size, is_exr
 from registration.storage.image_files import MAX_PIXELS, image_size, too_many_pixels
 from registration.storage.reading import Refuse, open_file
 
@@ -23,6 +24,7 @@ class Header:
     width_px: int
     height_px: int
     png_bits: int | None  # bits per channel; None where the file is not a PNG
+    floating: bool = False  # floating-point numbers: an image in linear light
 
 
 def read_header(path: Path, role: str) -> Header:
@@ -43,16 +45,24 @@ def read_header(path: Path, role: str) -> Header:
             got="no such file",
             fix="add the file, or remove its view from the COLMAP model",
         )
-    fix = "convert it to PNG, JPEG or TIFF; if it is one, write it again: its header is damaged"
+    fix = "convert it to PNG, JPEG, TIFF or OpenEXR; if it is one, write it again: its header is damaged"
     refuse = partial(InputError, f"The {role} is not a readable image", where=path, fix=fix)
     with open_file(path, refuse) as file:
         start = file.read(26)
-    width_px, height_px = _tiff_size(path, role, refuse) if is_tiff(start) else image_size(path, refuse)
+    floating = is_exr(start)
+    if is_tiff(start):
+        width_px, height_px, floating = _tiff_size(path, role, refuse)
+    elif floating:
+        width_px, height_px = exr_size(path, refuse)
+    else:
+        width_px, height_px = image_size(path, refuse)
+    if floating and role != "image":
+        raise refuse_tiff(path, role, "floating-point numbers")
     bits = start[24] if start.startswith(_PNG_SIGNATURE) and len(start) == 26 else None
-    return Header(width_px=width_px, height_px=height_px, png_bits=bits)
+    return Header(width_px=width_px, height_px=height_px, png_bits=bits, floating=floating)
 
 
-def _tiff_size(path: Path, role: str, refuse: Refuse) -> tuple[int, int]:
+def _tiff_size(path: Path, role: str, refuse: Refuse) -> tuple[int, int, bool]:
     with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
         try:
             header = read_tiff_header(data)
@@ -62,7 +72,7 @@ def _tiff_size(path: Path, role: str, refuse: Refuse) -> tuple[int, int]:
         raise too_many_pixels(path, f"{header.width_px} x {header.height_px}")
     if header.defect is not None:
         raise refuse_tiff(path, role, header.defect)
-    return header.width_px, header.height_px
+    return header.width_px, header.height_px, header.floating
 
 
 def require_size(path: Path, role: str, width_px: int, height_px: int) -> Header:

@@ -7,7 +7,9 @@ from functools import partial
 from pathlib import Path, PurePosixPath
 
 from registration.capture.colmap import read_cameras
+from registration.capture.colour import require_encoding
 from registration.capture.dense_maps import COLMAP_SUFFIXES, DEPTH_SUFFIXES
+from registration.capture.file_colour import conversion_of
 from registration.capture.headers import require_size
 from registration.capture.image_names import image_file
 from registration.capture.landmark_files import read_landmarks
@@ -49,6 +51,7 @@ def read_capture(root: Path, *, cameras_of: Callable[[Path], Mapping[str, Camera
     cameras = cameras_of(root / "sparse")
     views = tuple(_read_view(root, name, cameras[name], settings) for name in sorted(cameras, key=natural_key))
     _check_names(root, views)
+    settings.colours.require_views(root / "capture.toml", [view.name for view in views])
     scan, truth = find_scan(root), root / "ground_truth.npz"
     return Capture(
         root=root,
@@ -73,10 +76,14 @@ def natural_key(name: str) -> list[tuple[int, int, str]]:
 def _read_view(root: Path, file_name: str, camera: Camera, settings: CaptureSettings) -> View:
     relative = image_file(root, file_name)
     image = _inside(root, root / "images" / relative)
-    require_size(image, "image", camera.width_px, camera.height_px)
+    name = str(relative.with_suffix(""))
+    colour = settings.colours.of(name)
+    if require_size(image, "image", camera.width_px, camera.height_px).floating:
+        require_encoding(image, colour)
+    conversion_of(image, colour)
     landmarks = _channel(root, "landmarks", relative, ".json")
     return View(
-        name=str(relative.with_suffix("")),
+        name=name,
         camera=camera,
         image=image,
         mask=_channel(root, "masks", relative, *_MASK_SUFFIXES),
@@ -86,6 +93,7 @@ def _read_view(root: Path, file_name: str, camera: Camera, settings: CaptureSett
         depth_unit_m=settings.depth_unit_m,
         segmentation=_channel(root, "segmentation", relative, ".png"),
         landmarks={} if landmarks is None else read_landmarks(landmarks),
+        colour=colour,
     )
 
 

@@ -11,12 +11,13 @@ import numpy as np
 from jaxtyping import Bool, Float, UInt8, UInt16
 
 from registration.capture.colmap import write_model
+from registration.capture.colour_settings import colours_to_toml
 from registration.capture.scan import Scan
 from registration.errors import InputError
 from registration.frames import linear_to_srgb
 from registration.storage.files import atomic_directory
 from registration.storage.mesh import write_ply
-from registration.types import Camera, HeadPose
+from registration.types import Camera, Colour, HeadPose
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -42,6 +43,7 @@ class CaptureDescription:
     tags: Mapping[str, Any] = field(default_factory=dict)  # strings, numbers, booleans, lists or tables of these
     photographs: bool = True  # whether the images' colours count
     head: HeadPose | None = None  # where a fit without landmarks starts
+    colours: Mapping[str, Colour] = field(default_factory=dict)  # view's name -> of its image; the rest is sRGB
 
 
 def write_capture(
@@ -148,6 +150,7 @@ def write_settings(path: Path, description: CaptureDescription) -> None:
         lines += ["", "[head]", f"rotation = {_toml(description.head.rotation.ravel().tolist())}"]
         lines += [f"translation = {_toml(description.head.translation.tolist())}"]
         lines += [f"scale = {_toml(description.head.scale)}"]
+    lines += colours_to_toml(description.colours)
     path.write_text("\n".join(lines) + "\n", "utf-8")
 
 

@@ -13,20 +13,24 @@ import cv2
 import numpy as np
 from jaxtyping import Float, UInt8
 
+from registration.capture.colour import require_encoding
 from registration.capture.dense_maps import depth_normals, is_colmap_map, read_colmap_map, read_depth
+from registration.capture.file_colour import conversion_of
 from registration.capture.headers import require_complete, require_size, undecodable
 from registration.capture.label_maps import read_labels
 from registration.capture.masks import subject_coverage
 from registration.capture.tiff import decode_tiff, is_tiff
 from registration.errors import InputError
 from registration.frames import opencv_intrinsics, srgb_to_linear
+from registration.storage.exr_files import is_exr, read_exr
 from registration.storage.image_files import decode
-from registration.types import Camera, Capture, View, ViewPixels
+from registration.types import Camera, Capture, Colour, View, ViewPixels
 
 _MIN_SHARE = 0.75  # of a block's pixels with a depth
 _MAX_SPREAD = 0.01  # of a block's depths, of their mean: 5 mm at half a metre
 STRIP_PIXELS = 2**21  # converted to float at a time: 25 MB of float32 RGB
 _COLOUR = cv2.IMREAD_COLOR_RGB | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
+_SRGB = Colour()
 _AS_STORED = cv2.IMREAD_UNCHANGED | cv2.IMREAD_IGNORE_ORIENTATION
 
 
@@ -53,7 +57,7 @@ def read_view(view: View, capture: Capture, *, downsample: int = 1) -> ViewPixel
         )
     strips = list(_strips(camera, downsample))
     valid = _valid(camera, strips)
-    rgb = _resample(read_image(view.image, camera), _to_linear, strips, valid)
+    rgb = _resample(read_image(view.image, camera, view.colour), _to_linear, strips, valid)
     mask = None if view.mask is None else _resample(read_mask(view.mask, camera), _to_coverage, strips, valid)
     reduced = downsampled_camera(camera, downsample)
     normals = None
@@ -93,9 +97,24 @@ def undistort_landmarks(view: View, scheme: str) -> Float[np.ndarray, "L 3"]:
     return landmarks
 
 
-def read_image(path: Path, camera: Camera) -> np.ndarray:
-    """Read an image as (H, W, 3) uint8 or uint16 sRGB, distorted. Grey is repeated; alpha and EXIF are ignored."""
+def read_image(path: Path, camera: Camera, colour: Colour = _SRGB) -> np.ndarray:
+    """Read an image as (H, W, 3) uint8 or uint16 sRGB, distorted. Grey is repeated; alpha and EXIF are ignored.
+
+    Args:
+        path: of the file.
+        camera: its size.
+        colour: what its values mean; a profile in the file counts, too (`file_colour.conversion_of`). An image that is
+            sRGB keeps its values, any other becomes 16 bit sRGB.
+
+    Raises:
+        InputError: the file is missing, damaged, of another size, or its colours cannot be converted.
+    """
+    if require_size(path, "image", camera.width_px, camera.height_px).floating:
+        require_encoding(path, colour)
+    conversion = conversion_of(path, colour)
     pixels = _imread(path, "image", camera, _COLOUR)
+    if conversion is not None and pixels.dtype in (np.uint8, np.uint16, np.float32):
+        return conversion.to_srgb(path, pixels)
     if pixels.dtype not in (np.uint8, np.uint16):
         raise InputError(
             "The image has an unusable pixel type",
@@ -133,8 +152,11 @@ def _imread(path: Path, role: str, camera: Camera, flags: int) -> np.ndarray:
     require_complete(path, role)
     refuse = undecodable(path, role)
     with path.open("rb") as file:
-        tiff = is_tiff(file.read(4))
-    pixels = decode_tiff(path, refuse) if tiff else decode(path, flags, refuse)
+        start = file.read(4)
+    if is_tiff(start):
+        pixels = decode_tiff(path, refuse)
+    else:
+        pixels = read_exr(path, refuse) if is_exr(start) else decode(path, flags, refuse)
     if pixels.shape[:2] != (camera.height_px, camera.width_px):
         raise refuse(expected="the size in its header", got=f"shape {pixels.shape}")
     return pixels

@@ -78,7 +78,7 @@ def _sample(view: View, capture: Capture, decode_normals: bool) -> ViewSample:
         other = np.array([name in (BACKGROUND, NECK) for name in classes] + [True] * (256 - len(classes)))
         head, labels = (~cv2.LUT(full, other.astype(np.uint8)).astype(bool)).any(1), full[some, some].copy()
     if _small(camera):
-        grey = _reduced_grey(pixels.read_image(view.image, camera), width, height)
+        grey = _reduced_grey(pixels.read_image(view.image, camera, view.colour), width, height)
     if view.normals is not None and (_small(camera) or decode_normals):
         normals = pixels.in_camera(pixels.decode_normals(pixels.read_normals(view.normals, camera)[some, some]), view)
     elif view.depth is not None and (_small(camera) or decode_normals):

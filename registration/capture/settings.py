@@ -8,6 +8,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any, get_args
 
+from registration.capture.colour_settings import ColourSettings, read_colours
 from registration.capture.head_settings import read_head_pose, read_photographs
 from registration.capture.label_settings import read_labels_table
 from registration.errors import InputError
@@ -15,7 +16,7 @@ from registration.storage.reading import parse_toml, read_bytes
 from registration.types import HeadPose, LabelCode, NormalsFrame
 
 UNITS_M = {"m": 1.0, "mm": 1e-3, "cm": 1e-2, "dm": 0.1, "km": 1e3, "in": 0.0254, "inch": 0.0254, "ft": 0.3048}
-_RESERVED = ("subject", "expression", "units", "segmentation", "normals", "depth", "photographs", "head")
+_RESERVED = ("subject", "expression", "units", "segmentation", "normals", "depth", "photographs", "head", "colour")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -26,6 +27,7 @@ class CaptureSettings:
     expression: str
     classes: tuple[str, ...]  # as `class_names.meaning` spells them, each once
     labels: LabelCode
+    colours: ColourSettings
     tags: Mapping[str, Any]
     normals_frame: NormalsFrame = "camera_opencv"
     depth_unit_m: float | None = None
@@ -63,17 +65,18 @@ def read_settings(path: Path, inside: Callable[[Path], Path] = Path) -> CaptureS
         by = f"scale the COLMAP model, the scan and the ground truth by {factor:g}, and " if factor else ""
         scale = f"{'' if factor == 1 else by}write "
         raise refuse("The units are not metres", 'units = "m"', got, f'{scale}units = "m"; see docs/formats.md')
-    if "segmentation" not in settings:
-        near = _nearest("segmentation", [key for key, value in settings.items() if isinstance(value, dict)])
-        if near is not None:
-            fix = "rename the table to [segmentation]; if it is a tag, give it another name"
-            raise refuse("A table of capture.toml is misspelt", "[segmentation]", f"[{near}]", fix)
+    tables = [key for key, value in settings.items() if isinstance(value, dict)]
+    for name in ("segmentation", "colour"):
+        if name not in settings and (near := _nearest(name, tables)) is not None:
+            fix = f"rename the table to [{name}]; if it is a tag, give it another name"
+            raise refuse("A table of capture.toml is misspelt", f"[{name}]", f"[{near}]", fix)
     classes, labels = _labels(path, settings.get("segmentation", {}), inside)
     return CaptureSettings(
         subject=settings["subject"],
         expression=settings["expression"],
         classes=classes,
         labels=labels,
+        colours=read_colours(path, settings.get("colour", {})),
         tags={key: value for key, value in settings.items() if key not in _RESERVED},
         normals_frame=_normals_frame(path, settings.get("normals", {})),
         depth_unit_m=_depth_unit(path, settings.get("depth", {})),

@@ -19,6 +19,7 @@ from registration.storage.reading import Refuse
 
 _WIDTH, _HEIGHT, _BITS, _PHOTOMETRIC, _ORIENTATION = 256, 257, 258, 262, 274
 _SAMPLES, _PLANAR, _EXTRA_SAMPLES, _SAMPLE_FORMAT = 277, 284, 338, 339
+_PROFILE = 34675
 _TYPES = {1: "B", 3: "H", 4: "I", 16: "Q"}  # of whole numbers in a directory
 _AS_STORED = {_ORIENTATION: 1, _EXTRA_SAMPLES: 1}  # top left; alpha that is not to be multiplied
 _COLOURS = {0: "grey", 1: "grey", 2: "RGB", 3: "palette", 5: "CMYK", 6: "YCbCr"}
@@ -32,6 +33,9 @@ class TiffHeader:
     width_px: int
     height_px: int
     bits: int  # per sample
+    floating: bool  # 32 bit numbers of linear light
+    grey: bool
+    profile_at: tuple[int, int] | None  # offset and length of the ICC profile, bytes
     defect: str | None  # why its pixels cannot be used; None: they can
     display_tags: tuple[tuple[int, str, int], ...]  # offset, format and neutral value of tags that change the pixels
 
@@ -63,8 +67,12 @@ def read_tiff_header(data: bytes | bytearray | mmap.mmap) -> TiffHeader:
     step, first, inline, form = (20, start + 8, 8, "HHQ") if big else (12, start + 2, 4, "HHI")
     values: dict[int, tuple[int, ...]] = {}
     tags = []
+    profile_at = None
     for entry in range(first, first + step * count, step):
         tag, kind, length = unpack(form, entry)
+        if tag == _PROFILE and kind in (1, 7) and length > inline:
+            profile_at = (unpack("Q" if big else "I", entry + step - inline)[0], length)
+            continue
         if kind not in _TYPES or not 0 < length <= _MAX_ENTRIES:
             continue
         at = entry + step - inline
@@ -80,6 +88,9 @@ def read_tiff_header(data: bytes | bytearray | mmap.mmap) -> TiffHeader:
         width_px=values[_WIDTH][0],
         height_px=values[_HEIGHT][0],
         bits=values.get(_BITS, (1,))[0],
+        floating=values.get(_SAMPLE_FORMAT, (1,))[0] == 3,
+        grey=values.get(_PHOTOMETRIC, (1,))[0] in (0, 1),
+        profile_at=profile_at,
         defect=_defect(lambda tag, default: values.get(tag, (default,))),
         display_tags=tuple(tags),
     )
@@ -88,17 +99,18 @@ def read_tiff_header(data: bytes | bytearray | mmap.mmap) -> TiffHeader:
 def _defect(values: Callable[[int, int], tuple[int, ...]]) -> str | None:
     bits, formats = set(values(_BITS, 1)), set(values(_SAMPLE_FORMAT, 1))
     (colours, *_), (planar, *_) = values(_PHOTOMETRIC, 1), values(_PLANAR, 1)
-    if formats - {1, 4}:
+    floating = formats == {3} and bits == {32} and colours in (1, 2)
+    if formats - {1, 4} and not floating:
         kind = "floating-point" if 3 in formats else "signed or complex"
         return f"{kind} numbers of {max(bits)} bits"
-    if len(bits) > 1 or not bits <= {1, 4, 8, 16}:
+    if not floating and (len(bits) > 1 or not bits <= {1, 4, 8, 16}):
         return f"{'/'.join(map(str, sorted(bits)))} bits per channel"
     if colours not in _COLOURS or (bits == {16} and colours not in (1, 2)):
         return f"{max(bits)} bit pixels of colour space {_COLOURS.get(colours, f'number {colours}')}"
     if (samples := values(_SAMPLES, 1)[0]) > 4:
         return f"{samples} channels"
-    if bits == {16} and planar == 2 and samples > 1:
-        return "16 bit channels one after another (planar)"
+    if max(bits) > 8 and planar == 2 and samples > 1:
+        return f"{max(bits)} bit channels one after another (planar)"
     return None
 
 
@@ -109,7 +121,7 @@ def refuse_tiff(path: Path, role: str, got: object) -> InputError:
         where=path,
         expected="8 or 16 bits per channel, whole numbers; grey or RGB, channels interleaved",
         got=got,
-        fix="convert it to 8 or 16 bit sRGB; floating-point and linear images must be encoded as sRGB",
+        fix="convert it to 8 or 16 bit sRGB, or to floating-point numbers of 32 bits in linear light",
     )
 
 
@@ -121,7 +133,7 @@ def decode_tiff(path: Path, refuse: Refuse) -> np.ndarray:
         refuse: makes the error.
 
     Returns:
-        (H, W, 3) RGB, uint8 or uint16.
+        (H, W, 3) RGB, uint8, uint16 or float32.
 
     Raises:
         InputError: it cannot be decoded, not even in part.

@@ -29,7 +29,7 @@ from registration.doctor.validation import validate_capture
 from registration.errors import InputError, check_seed
 from registration.storage.files import atomic_directory
 from registration.storage.reading import parse_toml
-from registration.types import Camera, Capture, View
+from registration.types import Camera, Capture, Colour, View
 
 MIN_VIEWS = 2  # of a capture
 _TAG = "spoiled"  # key in the copy's capture.toml
@@ -160,7 +160,7 @@ def _write_view(root: Path, view: View, capture: Capture, errors: _ViewErrors) -
     preset = errors.preset
     for_image, for_mask, for_normals, for_labels, for_landmarks = errors.rngs
     shift_px = degradation.SHIFT_PX if "shifted" in errors.faults else 0
-    image = pixels.read_image(view.image, view.camera)
+    image = pixels.read_image(view.image, view.camera, view.colour)
     files = {"images": degradation.degraded_image(image, preset, errors.faults, for_image)}
     if view.mask is not None:
         files["masks"] = degradation.degraded_mask(pixels.read_mask(view.mask, view.camera), preset, for_mask)
@@ -208,12 +208,20 @@ def _write_settings(path: Path, capture: Capture, description: str) -> None:
     """Write the source's settings after the new tag: a top-level key must precede any table."""
     source = capture.root / "capture.toml"
     settings = source.read_text("utf-8-sig")
+    changed = set()
     if capture.labels.indices or capture.labels.colours:  # the copy's label maps hold positions in the classes
+        changed.add("segmentation")
+    if any(view.colour != Colour() for view in capture.views):  # the copy's images are sRGB
+        changed.add("colour")
+    if changed:
         blocks = re.split(r"(?m)^(?=[ \t]*\[+[^,\[\]]+\]+[ \t]*(?:#.*)?$)", settings)
-        kept = [block for block in blocks if not re.match(r"\s*\[\s*segmentation\s*[.\]]", block)]
-        settings = f"{''.join(kept).rstrip()}\n\n[segmentation]\nclasses = {json.dumps(capture.classes)}\n"
-        parse_toml(
-            settings.encode(),
-            partial(InputError, "[segmentation] cannot be rewritten", where=source, fix="write it as a table"),
-        )
+        own = re.compile(rf"\s*\[\s*(?:{'|'.join(sorted(changed))})\s*[.\]]")
+        settings = "".join(block for block in blocks if not own.match(block)).rstrip() + "\n"
+        if "segmentation" in changed:
+            settings += f"\n[segmentation]\nclasses = {json.dumps(capture.classes)}\n"
+        fix = f"write {' and '.join(sorted(changed))} as tables of their own"
+        refuse = partial(InputError, "capture.toml cannot be rewritten", where=source, fix=fix)
+        kept = parse_toml(settings.encode(), refuse)
+        if "colour" in changed and "colour" in kept:
+            raise refuse(expected="[colour] as a table", got="colour = ...")
     path.write_text(f"{_TAG} = {json.dumps(description, ensure_ascii=False)}\n{settings}", "utf-8")

@@ -79,11 +79,15 @@ def import_capture(
     with atomic_directory(target) as temporary:
         for number, plan in enumerate(plans):
             progress.update(number, len(plans), "views imported")
-            cameras[_write_view(temporary, plan, source.classes, unit_m)] = scaled_world(plan.camera, unit_m)
+            cameras[_write_view(temporary, plan, source, unit_m)] = scaled_world(plan.camera, unit_m)
         progress.update(len(plans), len(plans), "views imported")
         write_model(temporary / "sparse", cameras, np.zeros((0, 3)))
         description = CaptureDescription(
-            subject=source.subject, expression=source.expression, classes=source.classes, tags=source.tags
+            subject=source.subject,
+            expression=source.expression,
+            classes=source.classes,
+            tags=source.tags,
+            colours={plan.view.name: plan.view.colour for plan in plans if not _is_decoded(plan)},
         )
         write_settings(temporary / "capture.toml", description)
         notes += _write_scan(temporary, source.scan, unit_m)
@@ -93,7 +97,7 @@ def import_capture(
     return Imported(root=target, format=source.format, views=len(plans), unit_m=unit_m, notes=tuple(notes))
 
 
-def _write_view(root: Path, plan: ViewPlan, classes: tuple[str, ...], unit_m: float) -> str:
+def _write_view(root: Path, plan: ViewPlan, source: SourceCapture, unit_m: float) -> str:
     """Write the files of a view. Returns its image's name."""
     view = plan.view
     suffix = view.image.suffix if plan.as_it_is and isinstance(view.image, Path) else ".png"
@@ -119,10 +123,11 @@ def _write_view(root: Path, plan: ViewPlan, classes: tuple[str, ...], unit_m: fl
         write_depth(_target(root / "depth", view, ".npy"), plan, unit_m)
     if view.segmentation is not None:
         labels = _target(root / "segmentation", view)
-        if plan.lens is None:
+        if plan.lens is None and not (source.labels.indices or source.labels.colours):
             _copy(view.segmentation, labels)
         else:
-            _write_png(labels, plan.lens.labels(pixels.read_labels(view.segmentation, camera, classes)))
+            stored = pixels.read_labels(view.segmentation, camera, source.classes, source.labels)
+            _write_png(labels, stored if plan.lens is None else plan.lens.labels(stored))
     if view.landmarks:
         moved = {name: _landmarks(plan, rows) for name, rows in view.landmarks.items()}
         text = json.dumps({name: rows.tolist() for name, rows in moved.items()})
@@ -149,7 +154,7 @@ def _decoded(plan: ViewPlan) -> np.ndarray:
         intrinsics=view.intrinsics,
         T_cam_world=view.T_cam_world,
     )
-    return turned(pixels.read_image(view.image, stored), plan.orientation)
+    return turned(pixels.read_image(view.image, stored, view.colour), plan.orientation)
 
 
 def _video_frame(view: SourceView, frame: VideoFrame) -> np.ndarray:
@@ -196,11 +201,18 @@ def _write_scan(root: Path, scan: Path | None, unit_m: float) -> list[str]:
     return ["the scan was scaled to metres: its vertices and triangles were written, without colours"]
 
 
+def _is_decoded(plan: ViewPlan) -> bool:
+    """Whether the written image is sRGB: decoded with the colour of its view."""
+    return not plan.as_it_is and isinstance(plan.view.image, Path)
+
+
 def _colour_notes(plans: Sequence[ViewPlan]) -> list[str]:
-    names = [plan.view.name for plan in plans if plan.view.colour != Colour()]
-    if not names:
-        return []
-    return [f"colour corrections of {len(names)} views are in {RECORD} and are not applied"]
+    coloured = [plan for plan in plans if plan.view.colour != Colour()]
+    applied = sum(map(_is_decoded, coloured))
+    stated = len(coloured) - applied
+    return [f"colour corrections of {applied} views were applied to the written images"] * (applied > 0) + [
+        f"colour corrections of {stated} views are in [colour] of capture.toml"
+    ] * (stated > 0)
 
 
 def _record(source: SourceCapture, plans: Sequence[ViewPlan], unit_m: float, notes: Sequence[str]) -> dict[str, Any]:

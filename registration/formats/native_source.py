@@ -43,6 +43,7 @@ def read(path: Path, options: ReadOptions) -> SourceCapture:
         unit_m=1.0,
         scan=capture.scan,
         classes=capture.classes,
+        labels=capture.labels,
         tags=capture.tags,
         notes=notes,
     )

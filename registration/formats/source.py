@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from registration.types import Colour, NormalsFrame
+from registration.types import Colour, LabelCode, NormalsFrame
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -60,6 +60,7 @@ class SourceCapture:
     unit_m: float | None  # metres per world unit; None: the format does not state it
     scan: Path | None = None  # mesh in the same world and unit
     classes: tuple[str, ...] = ()  # names of the label maps' indices
+    labels: LabelCode = LabelCode()  # what their pixels stand for
     tags: Mapping[str, Any] = field(default_factory=dict)
     notes: tuple[str, ...] = ()  # what the reader decided or left out, for the user
 

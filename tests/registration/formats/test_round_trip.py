@@ -5,7 +5,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from registration.capture import native
+from registration.capture import native, pixels
+from registration.formats import native_source
+from registration.formats.convert import import_capture
+from registration.formats.source import ReadOptions
 from registration.types import Capture
 from tests.registration.capture.small import DISTORTIONS, make
 from tests.registration.formats.writers import (
@@ -44,3 +47,21 @@ def test_cameras_images_and_masks_survive(name: str, original: Capture, tmp_path
             continue
         assert view.mask is not None and expected.mask is not None
         assert view.mask.read_bytes() == expected.mask.read_bytes()
+
+
+def test_labels_and_colours_of_a_native_capture_are_imported(tmp_path: Path) -> None:
+    """Label maps of a table are written as indices of the classes, colours as [colour]."""
+    root = make(tmp_path / "source", drop=("landmarks",))
+    path = root / "capture.toml"
+    text = path.read_text().split("[segmentation]")[0]
+    path.write_text(
+        text + '[segmentation]\ntable = "lapa"\n[colour]\nencoding = "linear"\n[colour.views.cam1]\ngain = 0.5\n'
+    )
+    before = native.read_capture(root)
+    import_capture(native_source.read(root, ReadOptions()), tmp_path / "copy")
+    after = native.read_capture(tmp_path / "copy")
+    assert after.classes == before.classes and [v.colour for v in after.views] == [v.colour for v in before.views]
+    for old, new in zip(before.views, after.views, strict=True):
+        np.testing.assert_array_equal(
+            pixels.read_view(new, after).label_coverage, pixels.read_view(old, before).label_coverage
+        )
