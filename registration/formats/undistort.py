@@ -49,7 +49,7 @@ class Undistortion:
 
     def landmarks(self, points: Float[np.ndarray, "L 3"]) -> Float[np.ndarray, "L 3"]:
         """Return landmarks (x_px y_px confidence) in the new image; confidence 0 where the lens has no inverse."""
-        plane = undistorted(self.distortion, _plane(self.intrinsics, points[:, :2]))
+        plane = undistorted(self.distortion, on_plane(self.intrinsics, points[:, :2]))
         K = self.camera.intrinsics
         moved = plane * [K[0, 0], K[1, 1]] + K[:2, 2]
         usable = np.isfinite(moved).all(-1)
@@ -75,7 +75,7 @@ class Undistortion:
     def sources(self, pixels: Float[np.ndarray, "P 2"]) -> Float[np.ndarray, "P 2"]:
         """Return where pixels of the new image (px) lie in the source image (px); NaN where the lens ends."""
         with np.errstate(all="ignore"):
-            distorted = distortions.distort(self.distortion, _plane(self.camera.intrinsics, pixels))
+            distorted = distortions.distort(self.distortion, on_plane(self.camera.intrinsics, pixels))
         return distorted @ self.intrinsics[:2, :2].T + self.intrinsics[:2, 2]
 
 
@@ -158,8 +158,8 @@ def _jacobians(distortion: Distortion, points: Float[np.ndarray, "P 2"]) -> Floa
     return np.where(usable[:, None, None], jacobians, np.eye(2))
 
 
-def _plane(intrinsics: Float[np.ndarray, "3 3"], pixels: Float[np.ndarray, "P 2"]) -> Float[np.ndarray, "P 2"]:
-    """Pixels on the plane z = 1, with skew."""
+def on_plane(intrinsics: Float[np.ndarray, "3 3"], pixels: Float[np.ndarray, "P 2"]) -> Float[np.ndarray, "P 2"]:
+    """Return pixels on the plane z = 1 of a camera with this K, which may have skew; distorted as they were."""
     shifted = pixels - intrinsics[:2, 2]
     y = shifted[:, 1] / intrinsics[1, 1]
     x = (shifted[:, 0] - intrinsics[0, 1] * y) / intrinsics[0, 0]
@@ -178,7 +178,7 @@ def _seen_rectangle(view: SourceView, pinhole: Float[np.ndarray, "3 3"]) -> tupl
         (1, True, np.stack([t * size[0], 0 * t + size[1]], -1)),
     )
     for axis, end, border in sides:
-        points = undistorted(view.distortion, _plane(view.intrinsics, border))[:, axis]
+        points = undistorted(view.distortion, on_plane(view.intrinsics, border))[:, axis]
         reached = points[np.isfinite(points)] * pinhole[axis, axis] + pinhole[axis, 2]
         if len(reached) and end:
             high[axis] = min(high[axis], reached.min())

@@ -1,6 +1,6 @@
 """The length of a world's unit: stated by the user or the format, or else estimated from the subject's size."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 
@@ -9,6 +9,7 @@ from registration.capture.settings import UNITS_M
 from registration.capture.triangulation import triangulate
 from registration.doctor.validation import EYE_DISTANCE_M, eye_distance
 from registration.errors import InputError
+from registration.formats.mask_size import mask_size
 from registration.formats.plan import ViewPlan
 from registration.formats.registry import find_format
 from registration.formats.source import SourceCapture
@@ -43,7 +44,8 @@ def world_unit(source: SourceCapture, plans: Sequence[ViewPlan], given_m: float 
         given_m: metres per unit according to the user; counts before the format's own.
 
     Raises:
-        InputError: nobody says it, and neither landmarks of scheme 68 nor a scan lets it be estimated.
+        InputError: nobody says it, and neither landmarks of scheme 68 nor, in a format of physical units, a scan or
+            masks let it be estimated.
     """
     if given_m is not None:
         if source.unit_m is not None and not np.isclose(given_m, source.unit_m):
@@ -53,19 +55,27 @@ def world_unit(source: SourceCapture, plans: Sequence[ViewPlan], given_m: float 
         return source.unit_m, None
     if (eyes := _eye_distance(source, plans)) is not None:
         return _from_eyes(eyes)
-    if source.scan is not None and find_format(source.format).physical:
-        extent = float(np.ptp(read_scan(source.scan).vertices, axis=0).max())
-        for name in _TRIED:
-            if _HEAD_M[0] <= extent * UNITS_M[name] <= _HEAD_M[1]:
-                size = f"the scan would be {extent * UNITS_M[name]:.2g} m large"
-                return UNITS_M[name], f"the world's unit was taken for {name}: {size}; --unit says it if it is another"
+    if find_format(source.format).physical:
+        for what, extent in _extents(source, plans):
+            for name in _TRIED:
+                if _HEAD_M[0] <= extent * UNITS_M[name] <= _HEAD_M[1]:
+                    size = f"{what} would be {extent * UNITS_M[name]:.2g} m large"
+                    return UNITS_M[name], f"the world's unit was taken for {name}: {size}; --unit says it if not"
     raise InputError(
         "The unit of the capture's world is not known",
         where=source.root,
-        expected="landmarks of scheme 68, a scan of a head, or the unit",
+        expected="landmarks of scheme 68, a scan or masks of a head, or the unit",
         got=f"none of them; {source.format} does not state the unit",
         fix="say it with --unit m, cm, mm, or the metres of one unit as a number, e.g. --unit 0.152",
     )
+
+
+def _extents(source: SourceCapture, plans: Sequence[ViewPlan]) -> Iterator[tuple[str, float]]:
+    """What may show a head, and its longest side in the world's unit."""
+    if source.scan is not None:
+        yield "the scan", float(np.ptp(read_scan(source.scan).vertices, axis=0).max())
+    if (size := mask_size(plans)) is not None:
+        yield "what the masks show", size
 
 
 def _eye_distance(source: SourceCapture, plans: Sequence[ViewPlan]) -> float | None:

@@ -172,6 +172,23 @@ def test_the_users_unit_counts_before_the_formats(source: SourceCapture, tmp_pat
     np.testing.assert_allclose(read_scan(scan).vertices, 0.5 * read_scan(source.scan).vertices, atol=1e-7)
 
 
+@pytest.mark.parametrize("name", ["m", "cm", "mm"])
+def test_masks_or_a_scan_tell_the_unit_of_a_physical_world(name: str, source: SourceCapture, tmp_path: Path) -> None:
+    scaled = in_unit(source, None, 1 / parse_unit(name))
+    scaled = replace(scaled, format="bare", views=tuple(replace(view, landmarks={}) for view in scaled.views))
+    done = import_capture(scaled, tmp_path / "native")
+    assert done.unit_m == parse_unit(name)
+    assert any("what the masks show would be 0.1" in note for note in done.notes)  # the ball's 18 cm
+    with pytest.raises(InputError, match="unit"):  # of any scale
+        import_capture(replace(scaled, format="colmap"), tmp_path / "other")
+
+
+def test_a_scan_tells_the_unit(source: SourceCapture, tmp_path: Path) -> None:
+    views = tuple(replace(view, landmarks={}, mask=None) for view in source.views)
+    done = import_capture(replace(source, unit_m=None, format="bare", views=views), tmp_path / "native")
+    assert done.unit_m == 1 and any("the scan would be 0.18 m" in note for note in done.notes)
+
+
 @pytest.mark.parametrize("unit", ["", "parsec", "-1", "0", "nan", "inf"])
 def test_units_that_are_none(unit: str) -> None:
     with pytest.raises(InputError, match="no such unit"):
