@@ -41,7 +41,7 @@ def read(path: Path, options: ReadOptions) -> SourceCapture:
     numbers = sorted(int(m[1]) for name in params.values if (m := _KEY.fullmatch(name)))
     if not numbers:
         raise params.error("0_K", "intrinsics VIEW_K of each view", "none")
-    invalid = [number for number in numbers if params.values.get(f"{number}_valid") is False]
+    invalid = [number for number in numbers if not params.values.get(f"{number}_valid", True)]
     views = tuple(_view(folder, params, number) for number in numbers if number not in invalid)
     if not views:
         raise params.error("0_valid", "at least one valid view", f"{len(invalid)} of {len(numbers)} invalid")

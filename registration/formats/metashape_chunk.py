@@ -9,7 +9,7 @@ Metashape user manual, appendices "Camera models" and "Coordinate systems":
 """
 
 import re
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -73,7 +73,7 @@ def read_chunk(chunk: Element, photographs: Photographs, root: Path, paths: dict
     read: dict[str, Lens] = {}
     images: list[Path] = []
     found: list[tuple[Lens, Float[np.ndarray, "4 4"]]] = []
-    disabled, unaligned = [], []
+    disabled, unaligned, slaves = [], [], []
     for number, camera in cameras.items():
         label = camera.attributes.get("label", number)
         if camera.attributes.get("enabled", "true") in ("false", "0"):
@@ -90,6 +90,7 @@ def read_chunk(chunk: Element, photographs: Photographs, root: Path, paths: dict
             raise camera.error("the id of a sensor", sensor)
         lens = read[sensor] = read.get(sensor) or _lens(lenses[sensor])
         own = camera.find("transform") is not None
+        slaves += [] if own else [label]
         name = (paths or {}).get(number, label)
         images.append(photographs.find(name, camera.refuse(), label))
         found.append((lens, T_chunk_master if own else T_chunk_master @ lens.T_master_slave))
@@ -102,6 +103,13 @@ def read_chunk(chunk: Element, photographs: Photographs, root: Path, paths: dict
         *left_out(unaligned, "not aligned"),
         *left_out(others, "in another component, whose world is another"),
     ]
+    if slaves:
+        notes.append(f"{len(slaves)} cameras have their master's pose and their sensor's offset, in the chunk's unit")
+    if any(
+        e.attributes.get("name") == "rolling_shutter" and e.attributes.get("value") == "true"
+        for e in _properties(chunk)
+    ):
+        notes.append("Metashape compensated a rolling shutter: that is not read, cameras are still ones")
     views = tuple(
         SourceView(
             name=name,
@@ -116,6 +124,10 @@ def read_chunk(chunk: Element, photographs: Photographs, root: Path, paths: dict
         for name, image, (lens, T_chunk_cam) in zip(unique_views(images, root), images, found, strict=True)
     )
     return Chunk(views=views, unit_m=world.unit_m, local=world.local, notes=tuple(notes))
+
+
+def _properties(chunk: Element) -> Iterator[Element]:
+    return chunk.need("sensors").descendants("property")
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -79,6 +79,9 @@ def read(path: Path, options: ReadOptions) -> SourceCapture:
     views = tuple(
         _view(name, image, d, photographs.mask(image)) for name, image, (_, d) in zip(names, images, posed, strict=True)
     )
+    notes = ["the files do not state the world's unit", *left_out(without, "without a pose")]
+    if any(view.distortion.model == "realityscan_division" for view in views):
+        notes.append("the division model was taken for distorted / (1 + k r^2): compare with undistorted images once")
     return SourceCapture(
         format=FORMAT.name,
         root=folder,
@@ -87,7 +90,7 @@ def read(path: Path, options: ReadOptions) -> SourceCapture:
         views=views,
         unit_m=None,
         scan=scan_beside(path),
-        notes=("the files do not state the world's unit", *left_out(without, "without a pose")),
+        notes=tuple(notes),
     )
 
 

@@ -229,6 +229,7 @@ def _opencv(*point: float) -> np.ndarray:
         ({"0_distortion": [0.1, 0]}, "0_distortion"),
         ({"0_width": 0.5}, "0_width"),
         ({"0_valid": False}, "valid"),
+        ({"0_valid": 0}, "valid"),
         ({"0_Rt": [[2, 0, 0, 0], [0, 2, 0, 0], [0, 0, 2, 5]]}, "rotation"),
     ],
 )

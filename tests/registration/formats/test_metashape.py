@@ -128,6 +128,7 @@ def test_cameras_of_other_components_and_their_transforms_do_not_count(tmp_path:
 def test_a_slave_has_its_masters_pose_and_its_sensors_offset(tmp_path: Path) -> None:
     slave = "<rotation>1 0 0 0 1 0 0 0 1</rotation><location>0.1 0 0</location>"
     source = read(write(tmp_path, slave=slave, second='sensor_id="0" master_id="0" label="side">'))
+    assert any("1 cameras have their master's pose" in note for note in source.notes)
     front, side = source.views
     centres = [-view.T_cam_world[:3, :3].T @ view.T_cam_world[:3, 3] for view in (front, side)]
     np.testing.assert_allclose(centres, [[0, 0, 0], [0.1, 0, 0]], atol=1e-12)  # the master's own pose has no offset
@@ -139,6 +140,12 @@ def test_cameras_that_do_not_count_are_named(tmp_path: Path) -> None:
     assert any("1 cameras were left out, not aligned: side" in note for note in source.notes)
     source = read(write(tmp_path, second=SECOND.replace('label="side.JPG"', 'label="side.JPG" enabled="false"')))
     assert any("disabled in Metashape: side.JPG" in note for note in source.notes)
+
+
+def test_a_rolling_shutter_is_named(tmp_path: Path) -> None:
+    assert not any("rolling" in note for note in read(write(tmp_path)).notes)
+    source = read(write(tmp_path, slave='<property name="rolling_shutter" value="true"/>'))
+    assert any("rolling shutter" in note for note in source.notes)
 
 
 def test_masks_are_found_and_are_no_photographs(tmp_path: Path) -> None:

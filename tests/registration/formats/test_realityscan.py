@@ -87,7 +87,9 @@ def test_brown_has_t1_along_x_and_k4(tmp_path: Path) -> None:
 
 def test_division_distorts_image_coordinates(tmp_path: Path) -> None:
     """Undistorted = distorted / (1 + k r^2), in units of the longer side, from the middle of the image."""
-    view = xmp(tmp_path, ("perspective", "division"), ("0 0 0 0 0 0", "-0.25 0 0 0 0 0")).views[0]
+    source = xmp(tmp_path, ("perspective", "division"), ("0 0 0 0 0 0", "-0.25 0 0 0 0 0"))
+    assert any("division model" in note for note in source.notes)
+    view = source.views[0]
     distorted = np.array([0.3, 0.2])  # r^2 = 0.13, 1 + k r^2 = 0.9675
     undistorted = distorted / 0.9675
     plane = (undistorted - [0.01, -0.02]) / 0.5
