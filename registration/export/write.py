@@ -127,16 +127,21 @@ def mask_file(file: Path) -> Path:
     return file.with_name(f"{file.stem}_unseen.png")
 
 
-def check_fits(mesh: HeadMesh, file: Path) -> None:
-    """Refuse a format that cannot hold what is to be exported, before it is written.
+def check_fits(file: Path, *, shapes: bool, frames: bool) -> None:
+    """Refuse a format that cannot hold what is to be exported.
+
+    Args:
+        file: of a known suffix.
+        shapes: there are expressions.
+        frames: it is a sequence.
 
     Raises:
         InputError: the head has shapes or frames, and the format has none.
     """
     kind = format_of(file)
     for present, able, what in (
-        (mesh.shapes, "shapes", "expressions"),
-        (mesh.frames is not None, "frames", "a sequence"),
+        (shapes, "shapes", "expressions"),
+        (frames, "frames", "a sequence"),
     ):
         if present and not getattr(kind, able):
             capable = [suffix for suffix, other in FORMATS.items() if getattr(other, able)]
@@ -163,7 +168,7 @@ def write(mesh: HeadMesh, file: Path) -> list[Path]:
         InputError: as `format_of` and `check_fits`.
     """
     kind = format_of(file)
-    check_fits(mesh, file)
+    check_fits(file, shapes=bool(mesh.shapes), frames=mesh.frames is not None)
     file.parent.mkdir(parents=True, exist_ok=True)
     beside = mesh.texture is not None and kind.texture and kind.texture_beside
     texture = file.with_suffix(".png").name if beside else None

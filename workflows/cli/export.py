@@ -32,10 +32,11 @@ def export(
         force: Replace files that exist.
         how: What is written.
     """
-    from registration.export.write import check_out, left_out, write
-    from workflows.records.export_source import read_source
+    from registration.export.write import check_fits, check_out, left_out, write
+    from workflows.records.export_source import holds, read_source
 
     check_out(out, replace=force, filled=how.fills)
+    check_fits(out, **holds(source, how))
     found = read_source(source, model, how)
     files = write(found.head, out)
     for note in found.notes:

@@ -84,6 +84,24 @@ def read_source(
     )
 
 
+def holds(source: Path, options: ExportOptions) -> dict[str, bool]:
+    """Return whether the head of a source has shapes, or is a sequence, by a look at the folder alone.
+
+    Args:
+        source: as of `read_source`; anything else holds neither.
+        options: of the export.
+    """
+    expressions = is_subject_folder(source) or stabilized_folder.is_stabilized(source)
+    single = source.is_file() or is_registration(source)
+    several = (
+        not (expressions or single) and source.is_dir() and any(is_registration(path) for path in source.iterdir())
+    )
+    return {
+        "shapes": options.arkit if single else expressions and not options.sequence,
+        "frames": several or (expressions and options.sequence),
+    }
+
+
 def _model(file: Path, model: Path | None, options: ExportOptions) -> ExportSource:
     for option, given in (("--fill", options.fills), ("--sequence", options.sequence), ("--model", model is not None)):
         if given:
