@@ -23,7 +23,7 @@ def image_file(root: Path, name: str) -> PurePosixPath:
     relative = PurePosixPath(name)
     usable = relative.suffix and not relative.is_absolute() and ".." not in relative.parts and "\0" not in name
     if usable and all(len(part.encode()) <= _MAX_NAME_BYTES for part in relative.parts):
-        if (root / "images" / relative).exists() or (near := _nearest(root / "images", name)) is None:
+        if (root / "images" / relative).exists() or (near := nearest_image(root / "images", name)) is None:
             return relative
         raise InputError(
             "The image is missing",
@@ -32,7 +32,7 @@ def image_file(root: Path, name: str) -> PurePosixPath:
             got=f"no such file; there is images/{near}",
             fix=f"{_advice(name, near)}: write {near} instead of {name} in the COLMAP model, or rename the file",
         )
-    near = None if "\0" in name else _nearest(root / "images", name)
+    near = None if "\0" in name else nearest_image(root / "images", name)
     raise InputError(
         "An image name cannot be used",
         where=root / "sparse",
@@ -54,7 +54,7 @@ def _advice(name: str, near: str) -> str:
     return "names are relative to images/, with all letters as in the file's name"
 
 
-def _nearest(images: Path, name: str) -> str | None:
+def nearest_image(images: Path, name: str) -> str | None:
     """A file that the name may mean: fewer folders, other separators, letters or suffix."""
     try:
         files = sorted(str(path.relative_to(images).as_posix()) for path in images.rglob("*") if path.is_file())

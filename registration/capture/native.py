@@ -46,9 +46,25 @@ def read_capture(root: Path, *, cameras_of: Callable[[Path], Mapping[str, Camera
             fix="check the path",
         )
     settings = read_settings(_inside(root, root / "capture.toml"), partial(_inside, root))
+    return assemble(root, settings, read_calibration(root, cameras_of))
+
+
+def read_leniently(root: Path) -> CaptureSettings:
+    """Read a capture's settings with a world in any unit. Raises InputError as `read_capture`."""
+    return read_settings(_inside(root, root / "capture.toml"), partial(_inside, root), any_unit=True)
+
+
+def read_calibration(
+    root: Path, cameras_of: Callable[[Path], Mapping[str, Camera]] = read_cameras
+) -> Mapping[str, Camera]:
+    """Read a capture's cameras by the names of their images. Raises InputError as `read_capture`."""
     for path in (root / "sparse", *sorted((root / "sparse").rglob("*"))):
         _inside(root, path)
-    cameras = cameras_of(root / "sparse")
+    return cameras_of(root / "sparse")
+
+
+def assemble(root: Path, settings: CaptureSettings, cameras: Mapping[str, Camera]) -> Capture:
+    """Read the other files of a capture. Raises InputError as `read_capture`."""
     views = tuple(_read_view(root, name, cameras[name], settings) for name in sorted(cameras, key=natural_key))
     _check_names(root, views)
     settings.colours.require_views(root / "capture.toml", [view.name for view in views])

@@ -25,6 +25,7 @@ class CaptureSettings:
 
     subject: str
     expression: str
+    units: str  # "m", unless others are asked for
     classes: tuple[str, ...]  # as `class_names.meaning` spells them, each once
     labels: LabelCode
     colours: ColourSettings
@@ -35,12 +36,13 @@ class CaptureSettings:
     head: HeadPose | None = None
 
 
-def read_settings(path: Path, inside: Callable[[Path], Path] = Path) -> CaptureSettings:
+def read_settings(path: Path, inside: Callable[[Path], Path] = Path, *, any_unit: bool = False) -> CaptureSettings:
     """Read `capture.toml` (docs/formats.md).
 
     Args:
         path: of the file.
         inside: returns the path of a file that it names if it lies within the capture; raises InputError if not.
+        any_unit: accept other units than metres.
 
     Raises:
         InputError: the file is missing or no TOML, or a required key is missing, misspelt or malformed.
@@ -59,7 +61,7 @@ def read_settings(path: Path, inside: Callable[[Path], Path] = Path) -> CaptureS
         if not isinstance(settings.get(key), str):
             got = settings.get(key, _misspelt(key, settings))
             raise refuse(f'capture.toml lacks "{key}"', f'{key} = "..."', got)
-    if settings.get("units") != "m":
+    if settings.get("units") != "m" and not any_unit:
         got = settings.get("units", _misspelt("units", settings))
         factor = UNITS_M.get(str(got).lower())
         by = f"scale the COLMAP model, the scan and the ground truth by {factor:g}, and " if factor else ""
@@ -74,6 +76,7 @@ def read_settings(path: Path, inside: Callable[[Path], Path] = Path) -> CaptureS
     return CaptureSettings(
         subject=settings["subject"],
         expression=settings["expression"],
+        units=str(settings.get("units", "")),
         classes=classes,
         labels=labels,
         colours=read_colours(path, settings.get("colour", {})),

@@ -11,7 +11,8 @@ from registration.capture.class_names import BACKGROUND, KNOWN
 from registration.capture.samples import ViewSample
 from registration.capture.text import listed
 from registration.capture.triangulation import MIN_CONFIDENCE
-from registration.errors import InputError
+from registration.doctor.findings import Finding, FindingError, refuse, warnings
+from registration.doctor.fixes import ClassFix, MaskFix
 from registration.types import Capture, View
 
 _MIN_POINTS, _MIN_SAMPLES = 6, 3
@@ -27,67 +28,120 @@ _PAIRS = (
 )
 
 
-def check_views(capture: Capture, samples: Sequence[ViewSample]) -> list[str]:
-    """Compare masks, labels, landmarks and images within each view.
-
-    Returns:
-        Warnings.
+def check_labels(capture: Capture, samples: Sequence[ViewSample]) -> None:
+    """Refuse labels whose names contradict masks or landmarks.
 
     Raises:
-        InputError: a mask is inverted, the labels' classes are in another order, or those of eyes or lips are exchanged
-            in most views.
+        InputError: the classes are in another order, or those of eyes or lips are exchanged in most views.
     """
-    found: dict[str, list[str]] = {}  # what -> views
-    for view, sample in zip(capture.views, samples, strict=True):
-        if sample.mask is not None:
-            _refuse_inverted(capture, view, sample)
-        for what in [*_mask_warnings(capture, view, sample), *_image_warnings(sample)]:
-            found.setdefault(what, []).append(view.name)
     _check_label_order(capture, samples)
-    warnings = [f"{what}: {listed(names)}" for what, names in found.items()]
-    return warnings + _exchanged_classes(capture, samples)
+    _exchanged_classes(capture, samples)
 
 
-def _refuse_inverted(capture: Capture, view: View, sample: ViewSample) -> None:
+def view_warnings(capture: Capture, samples: Sequence[ViewSample]) -> list[Finding]:
+    """Compare masks, labels, landmarks and images within each view."""
+    found: dict[tuple[str, str], list[str]] = {}  # kind, what -> views
+    for view, sample in zip(capture.views, samples, strict=True):
+        for kind, what in [*_mask_warnings(capture, view, sample), *_image_warnings(sample)]:
+            found.setdefault((kind, what), []).append(view.name)
+    lines = [Finding.warning(kind, f"{what}: {listed(names)}") for (kind, what), names in found.items()]
+    try:
+        return lines + warnings("labels-swapped", _exchanged_classes(capture, samples))
+    except FindingError:  # `check_labels` refused them
+        return lines
+
+
+def check_inverted(capture: Capture, samples: Sequence[ViewSample]) -> None:
+    """Refuse masks that are inverted. Raises InputError."""
+    found = {
+        view.name: got
+        for view, sample in zip(capture.views, samples, strict=True)
+        if sample.mask is not None and (got := _inverted(capture, view, sample)) is not None
+    }
+    if not found:
+        return
+    masked = [sample for sample in samples if sample.mask is not None]
+    if 2 * len(found) > len(masked):  # then so are others whose border is white
+        found |= {
+            s.name: "most of the border is in the mask" for s in masked if s.name not in found and _border(s) > _MOST
+        }
+    names = list(found)
+    first = next(view for view in capture.views if view.name in found)
+    raise refuse(
+        "mask-inverted",
+        "The mask is inverted",
+        where=first.mask if len(names) == 1 else capture.root / "masks",
+        expected="255 where the subject is, 0 elsewhere",
+        got=found[names[0]]
+        if len(names) == 1
+        else f"{len(names)} masks, {listed(names, 5)}; in {names[0]} {found[names[0]]}",
+        fix="invert the mask" if len(names) == 1 else "invert the masks",
+        mend=MaskFix(what=f"inverted {len(names)} masks: {listed(names, 5)}", views=names),
+    )
+
+
+def _inverted(capture: Capture, view: View, sample: ViewSample) -> str | None:
+    """What shows that a view's mask is inverted; None if it is not."""
     assert sample.mask is not None
     inside, hits = sample.mask > 127, landmarks_inside(view, sample)
-    border = float(np.concatenate([inside[0], inside[:, 0], inside[:, -1]]).mean())  # a bust touches the lower one
+    border = _border(sample)
     height, width = inside.shape
     centre = float(inside[height // 4 : -height // 4, width // 4 : -width // 4].mean())
     got = f"{100 * border:.0f} % of the border and {100 * centre:.0f} % of the centre in the mask"
-    if hits is not None:
-        inverted = hits < _FEW and border > _MOST
-        got += f"; {100 * hits:.0f} % of the landmarks lie in it"
-    elif sample.labels is not None and BACKGROUND in capture.classes:
+    if sample.labels is not None and BACKGROUND in capture.classes:
         agreement = float((inside == (sample.labels != capture.classes.index(BACKGROUND))).mean())
         inverted = agreement < _FEW and border > _MOST
         got += f"; {100 * agreement:.0f} % of the pixels agree with the labels"
+    elif hits is not None:
+        inverted = hits < _FEW and border > _MOST
+        got += f"; {100 * hits:.0f} % of the landmarks lie in it"
     else:
         inverted = border > 0.8 and centre < 0.2
-    if inverted:
-        raise InputError(
-            "The mask is inverted",
-            where=view.mask,
-            expected="255 where the subject is, 0 elsewhere",
-            got=got,
-            fix="invert the mask",
-        )
+    return got if inverted else None
 
 
-def _mask_warnings(capture: Capture, view: View, sample: ViewSample) -> Iterator[str]:
+def _border(sample: ViewSample) -> float:
+    """The share of the image's border that is in the mask, but for the lower one, which a bust touches."""
+    assert sample.mask is not None
+    inside = sample.mask > 127
+    return float(np.concatenate([inside[0], inside[:, 0], inside[:, -1]]).mean())
+
+
+def check_landmarks_inside(capture: Capture, samples: Sequence[ViewSample]) -> None:
+    """Refuse landmarks most of which lie outside the masks in most views. Raises InputError."""
+    shares = {
+        view.name: inside
+        for view, sample in zip(capture.views, samples, strict=True)
+        if sample.mask is not None and (inside := landmarks_inside(view, sample)) is not None
+    }
+    outside = [name for name, inside in shares.items() if inside < 0.5]
+    if len(outside) < 2 or 3 * len(outside) <= 2 * len(shares):
+        return
+    raise refuse(
+        "landmarks-outside",
+        f"The landmarks lie outside the masks: {listed(outside, 5)}",
+        where=capture.root / "landmarks",
+        expected="landmarks of the subject that the masks show, in pixels of the stored images",
+        got=f"{100 * shares[outside[0]]:.0f} % of those of {outside[0]} in its mask",
+        fix="check that landmarks and masks belong to these images and to their size: detectors report pixels of a "
+        "crop or of a resized image",
+    )
+
+
+def _mask_warnings(capture: Capture, view: View, sample: ViewSample) -> Iterator[tuple[str, str]]:
     if sample.mask is None:
         return
     if (sample.mask > 127).all():
-        yield "the mask covers the whole image; check that it is a mask"
+        yield "mask-values", "the mask covers the whole image; check that it is a mask"
         return
     hits, outlines = landmarks_inside(view, sample), silhouettes(capture, sample)
     if "segmentation" in outlines and overlap(outlines["masks"], outlines["segmentation"]) < _MOST:
-        yield "mask and labels show the subject in different places; check which is another image's"
+        yield "views-exchanged", "mask and labels show the subject in different places; check which is another image's"
     if "normals" in outlines and (outlines["normals"] & ~outlines["masks"]).sum() > 0.5 * outlines["normals"].sum():
         if not outlines["normals"].all():
-            yield "most normals lie outside the mask; check which is another image's"
+            yield "views-exchanged", "most normals lie outside the mask; check which is another image's"
     if hits is not None and hits < 0.5:
-        yield "most landmarks lie outside the mask; check which is another image's"
+        yield "landmarks-outside", "most landmarks lie outside the mask; check which is another image's"
 
 
 def _check_label_order(capture: Capture, samples: Sequence[ViewSample]) -> None:
@@ -109,7 +163,8 @@ def _check_label_order(capture: Capture, samples: Sequence[ViewSample]) -> None:
     if share > _MOST and (moved or named):
         fits = label_maps.fitting_tables(capture.views)
         looks = f'; the maps look like those of {" or ".join(fits)}: write table = "{fits[0]}"' if fits else ""
-        raise InputError(
+        raise refuse(
+            "labels-order",
             "The labels' classes are in another order, or the background has no name",
             where=capture.root / "capture.toml",
             expected="background outside the masks",
@@ -129,18 +184,18 @@ def landmarks_inside(view: View, sample: ViewSample) -> float | None:
     return float(near[sample.at(points)].mean())
 
 
-def _image_warnings(sample: ViewSample) -> Iterator[str]:
+def _image_warnings(sample: ViewSample) -> Iterator[tuple[str, str]]:
     if sample.grey is None:
         return
     values = sample.grey[sample.subject] if sample.subject.any() else sample.grey
     if values.mean() < _DARK:
-        yield "the image is black where the subject is"
+        yield "exposure", "the image is black where the subject is"
     elif sample.grey.std() < _FLAT:
-        yield "the image shows nothing, it has one brightness"
+        yield "exposure", "the image shows nothing, it has one brightness"
 
 
 def _exchanged_classes(capture: Capture, samples: Sequence[ViewSample]) -> list[str]:
-    warnings: list[str] = []
+    lines: list[str] = []
     apart: list[str] = []
     for first, first_points, second, second_points in _PAIRS:
         if first not in capture.classes or second not in capture.classes:
@@ -161,18 +216,20 @@ def _exchanged_classes(capture: Capture, samples: Sequence[ViewSample]) -> list[
         exchanged = [name for name, verdict in verdicts.items() if verdict]
         if len(exchanged) > len(verdicts) / 2 and (len(exchanged) > 1 or len(capture.views) == 2):
             side = ', or write left = "image" there ("subject" if it was)' if first == "left_eye" else ""
-            raise InputError(
+            raise refuse(
+                "labels-swapped",
                 f"The labels {first} and {second} are exchanged",
                 where=capture.root / "segmentation",
                 expected=f"{first} where the landmarks show it; left is the subject's left",
                 got=f"it lies at the {second} in {len(exchanged)} of {len(verdicts)} views: {listed(exchanged, 5)}",
                 fix=f"exchange {first} and {second} in [segmentation] classes of capture.toml{side}",
+                mend=ClassFix(what=f"exchanged the names of {first} and {second}", first=first, second=second),
             )
         if exchanged:
-            warnings.append(f"{first} and {second} are exchanged in labels or landmarks: {listed(exchanged)}")
+            lines.append(f"{first} and {second} are exchanged in labels or landmarks: {listed(exchanged)}")
     if apart:
-        warnings.append(f"labels and landmarks show the eyes in different places: {listed(apart)}")
-    return warnings
+        lines.append(f"labels and landmarks show the eyes in different places: {listed(apart)}")
+    return lines
 
 
 def _crossed(centres: Sequence[Float[np.ndarray, "2"]], marks: Sequence[Float[np.ndarray, "2"]]) -> bool | None:

@@ -7,7 +7,8 @@ import numpy as np
 from jaxtyping import Float
 
 from registration.capture import triangulation
-from registration.errors import InputError
+from registration.doctor.findings import refuse
+from registration.doctor.fixes import LandmarkFix
 from registration.types import Camera, Capture, View
 
 # The points of the 68 scheme after left and right are exchanged.
@@ -30,9 +31,16 @@ Points = Float[np.ndarray, "L 3"]
 class Reading:
     """Another meaning that landmark files may have."""
 
+    kind: str  # of the finding
     name: str
     fix: str
     read: Callable[[Points, Camera], Points]
+
+    def mend(self, scheme: str, views: Sequence[str] | None = None) -> LandmarkFix:
+        """The mend of landmarks with this meaning."""
+        return LandmarkFix(
+            what=f"read landmarks as {self.name}: {self.fix}", change=self.read, schemes=(scheme,), views=views
+        )
 
 
 def check_values(capture: Capture) -> None:
@@ -49,26 +57,31 @@ def check_values(capture: Capture) -> None:
     if (highest := confidences.max()) > _MAX_CONFIDENCE:
         flags = bool(np.isin(confidences, (0, 1, 2)).all())
         percent = "divide them by 100, if they are in percent" if highest <= 100 else "scale them to 0 to 1"
-        raise InputError(
+        raise refuse(
+            "landmarks-confidence",
             "The landmarks' confidences are not between 0 and 1",
             where=where,
             expected=f"0 to 1; points above {triangulation.MIN_CONFIDENCE} are used",
             got="0, 1 and 2, as COCO flags points" if flags else f"up to {highest:g}",
             fix="write 1 for flag 2 and 0 for the others" if flags else percent,
+            mend=_confidence_mend(flags, highest),
         )
     if highest <= triangulation.MIN_CONFIDENCE:
-        raise InputError(
+        raise refuse(
+            "face-unseen",
             "No landmark is used",
             where=where,
             expected=f"confidences above {triangulation.MIN_CONFIDENCE} for points that are seen",
             got=f"no confidence above {highest:g}",
-            fix="write the confidences as fractions of 1, or remove the landmarks",
+            fix="if all cameras are behind the head, add views of the face; else write the confidences as fractions of "
+            "1, or remove the landmarks",
         )
     used = [points[points[:, 2] > triangulation.MIN_CONFIDENCE, :2] for _, points in rows]
     low, high = np.concatenate(used).min(), np.concatenate(used).max()
     smallest = min(min(view.camera.width_px, view.camera.height_px) for view, _ in rows)
     if sum(map(len, used)) >= _MIN_POINTS and low >= -1.5 and high <= 1.5 and smallest > 16:
-        raise InputError(
+        raise refuse(
+            "landmarks-normalized",
             "The landmarks look normalized",
             where=where,
             expected="pixels of the stored images",
@@ -76,7 +89,30 @@ def check_values(capture: Capture) -> None:
             fix="multiply x by the image's width and y by its height"
             if low >= -0.2
             else "convert them into pixels: (x + 1) / 2 times the width, (y + 1) / 2 times the height",
+            mend=_in_pixels(centred=bool(low < -0.2)),
         )
+
+
+def _confidence_mend(flags: bool, highest: float) -> LandmarkFix | None:
+    """COCO's flags, percent or bytes as fractions; None for other scales."""
+    scale = next((scale for scale in (100, 255) if 0.5 * scale <= highest <= scale), None)
+    if flags:
+        what, change = "wrote confidences for COCO's flags", lambda values: np.where(values == 2, 1.0, 0.0)
+    elif scale is not None:
+        what, change = f"divided confidences by {scale}", lambda values: values / scale
+    else:
+        return None
+    return LandmarkFix(what=what, change=lambda points, _: np.column_stack([points[:, :2], change(points[:, 2])]))
+
+
+def _in_pixels(*, centred: bool) -> LandmarkFix:
+    """Coordinates from 0 to 1, or from -1 to 1, in pixels."""
+
+    def change(points: Points, camera: Camera) -> Points:
+        size = np.array([camera.width_px, camera.height_px, 1.0])
+        return (points + [1, 1, 0]) * size / [2, 2, 1] if centred else points * size
+
+    return LandmarkFix(what="converted normalized landmarks into pixels", change=change)
 
 
 def check_coordinates(capture: Capture) -> None:
@@ -93,13 +129,15 @@ def check_coordinates(capture: Capture) -> None:
         for reading in _readings(views, scheme):
             agreement = _agreement(_read_again(capture, scheme, reading), scheme)
             if agreement is not None and agreement >= _SURE and agreement > given + 0.25:
-                raise InputError(
+                raise refuse(
+                    reading.kind,
                     f"The landmarks are {reading.name}",
                     where=capture.root / "landmarks",
                     expected="x to the right and y down from the upper left corner, in pixels of the stored images",
                     got=f"{given:.0%} of the landmarks of scheme {scheme} agree as written, {agreement:.0%} if they are"
                     f" {reading.name}",
                     fix=reading.fix,
+                    mend=reading.mend(scheme),
                 )
 
 
@@ -107,12 +145,16 @@ def check_chirality(capture: Capture, points: Points) -> None:
     """Check that the triangulated points of the 68 scheme are a face and not its mirror image. Raises InputError."""
     if len(points) != 68 or (handedness := _handedness(points)) is None or handedness > -_MIN_CHIRALITY:
         return
-    raise InputError(
+    raise refuse(
+        "landmarks-swapped",
         "Left and right of the landmarks are exchanged",
         where=capture.root / "landmarks",
         expected="points 0 and 36 at the subject's right, 16 and 45 at the left, in scheme 68",
         got="the mirror image of a face",
         fix="exchange the points of both sides, as from a detector that ran on mirrored images",
+        mend=LandmarkFix(
+            what="exchanged the landmarks of both sides", change=lambda points, _: points[MIRRORED_68], schemes=("68",)
+        ),
     )
 
 
@@ -144,16 +186,19 @@ def misread_view(capture: Capture, view: View, points: Points) -> Reading | None
 
 def _readings(views: Sequence[View], scheme: str) -> Iterator[Reading]:
     yield Reading(
+        kind="landmarks-axes",
         name="with x and y exchanged",
         fix="write [x_px, y_px, confidence]",
         read=lambda points, _: points[:, [1, 0, 2]],
     )
     yield Reading(
+        kind="landmarks-axes",
         name="with y from the lower edge",
         fix="write the image's height minus y",
         read=lambda points, camera: np.array([0, camera.height_px, 0]) + points * [1, -1, 1],
     )
     mirrored = Reading(
+        kind="landmarks-mirrored",
         name="in mirrored images",
         fix="write the image's width minus x",
         read=lambda points, camera: np.array([camera.width_px, 0, 0]) + points * [-1, 1, 1],
@@ -161,11 +206,13 @@ def _readings(views: Sequence[View], scheme: str) -> Iterator[Reading]:
     yield mirrored
     if scheme == "68":
         yield Reading(
+            kind="landmarks-mirrored",
             name="in mirrored images, with left and right exchanged",
             fix="write the image's width minus x, and exchange the points of both sides",
             read=lambda points, camera: mirrored.read(points, camera)[MIRRORED_68],
         )
         yield Reading(
+            kind="landmarks-swapped",
             name="with left and right exchanged",
             fix="exchange the points of both sides",
             read=lambda points, _: points[MIRRORED_68],
@@ -173,6 +220,7 @@ def _readings(views: Sequence[View], scheme: str) -> Iterator[Reading]:
     yield _resized("100 x 100: percent", lambda camera: 100 / np.array([camera.width_px, camera.height_px]))
     for scale in _SCALES:
         yield Reading(
+            kind="landmarks-resolution",
             name=f"in pixels of images of {scale:.3g} times the size",
             fix=f"divide x and y by {scale:.3g}",
             read=lambda points, _, scale=scale: points * [1 / scale, 1 / scale, 1],  # type: ignore[misc]
@@ -192,6 +240,7 @@ def _longer(camera: Camera) -> int:
 
 def _resized(size: str, scale: Callable[[Camera], Float[np.ndarray, "2"]]) -> Reading:
     return Reading(
+        kind="landmarks-resolution",
         name=f"in pixels of images resized to {size}",
         fix="scale x and y back to the size of the stored images",
         read=lambda points, camera: points / [*scale(camera), 1],

@@ -16,7 +16,7 @@ from registration.capture import class_names, triangulation
 from registration.capture.samples import ViewSample
 from registration.capture.text import listed
 from registration.doctor import leftovers
-from registration.errors import InputError
+from registration.doctor.findings import refuse
 from registration.types import Capture, View
 
 _INSIDE = 253  # of 255, the pyramid's 0.99
@@ -126,7 +126,8 @@ def require_weight(capture: Capture, channels: Sequence[Channel]) -> list[str]:
         if not channel.matched:
             continue
         if not channel.total and channel.name == "segmentation":
-            raise InputError(
+            raise refuse(
+                "labels-empty",
                 "The label maps show no subject",
                 where=capture.root / channel.name,
                 expected="classes of the head",
@@ -138,7 +139,8 @@ def require_weight(capture: Capture, channels: Sequence[Channel]) -> list[str]:
             continue
         reason, lost = max(channel.losses.items(), key=lambda item: item[1], default=("", 0))
         if channel.counted <= _NOTHING * channel.total:
-            raise InputError(
+            raise refuse(
+                _kind(channel, reason),
                 f"Nothing of {channel.name}/ counts",
                 where=capture.root / channel.name,
                 expected=_expected(reason, capture.classes),
@@ -152,6 +154,13 @@ def require_weight(capture: Capture, channels: Sequence[Channel]) -> list[str]:
                 f"lost: {_lost(channel)}; {_fix(reason, capture.classes)}"
             )
     return warnings
+
+
+def _kind(channel: Channel, reason: str) -> str:
+    """The kind of the finding that nothing of a channel counts."""
+    if reason.startswith(_CLASS):
+        return "labels-vocabulary"
+    return {_SOFT: "mask-values", _AWAY: "normals-axes", _OUTSIDE: "landmarks-outside"}.get(reason, channel.name)
 
 
 def _inside(sample: ViewSample) -> list[_Loss]:

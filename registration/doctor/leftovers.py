@@ -9,7 +9,9 @@ from pathlib import Path, PurePosixPath
 
 from registration.capture.scan import SCAN, SCANS, unread_scans
 from registration.capture.text import listed
-from registration.errors import InputError
+from registration.doctor import findings
+from registration.doctor.findings import Finding, refuse
+from registration.doctor.fixes import RenameFix
 from registration.types import Capture
 
 SUFFIXES = {
@@ -61,44 +63,59 @@ class FolderFiles:
 
 
 def match_files(capture: Capture) -> dict[str, FolderFiles]:
-    """Match the files of images/, masks/, normals/, depth/, segmentation/ and landmarks/ with the views.
-
-    Raises:
-        InputError: a folder has files, and none of them belongs to a view.
-    """
+    """Match the files of images/, masks/, normals/, depth/, segmentation/ and landmarks/ with the views."""
     result = {}
     for folder, expected in _expected(capture).items():
         on_disk = files_in(capture.root / folder)
         unmatched = [name for name in on_disk if name not in expected]
         missing = set(expected) - set(on_disk)
-        found = FolderFiles(
+        result[folder] = FolderFiles(
             files=len(on_disk),
             matched=len(on_disk) - len(unmatched),
             unmatched={name: nearest(name, missing) or nearest(name, expected) for name in unmatched},
         )
-        if unmatched and not found.matched:
-            name = next((name for name, near in found.unmatched.items() if near is not None), unmatched[0])
-            near = found.unmatched[name] or next(iter(expected))
-            raise InputError(
-                f"No file in {folder}/ belongs to a view",
-                where=capture.root / folder,
-                expected=f"the names of the views, as {near}",
-                got=f"{len(unmatched)} other files, as {name}",
-                fix=_conversion(name, near),
-            )
-        result[folder] = found
     return result
 
 
-def warnings(capture: Capture, files: Mapping[str, FolderFiles]) -> list[str]:
-    """Name the files and folders that are not read, one line for each folder."""
-    lines = []
+def require_matches(capture: Capture, files: Mapping[str, FolderFiles]) -> None:
+    """Refuse a folder with files of which none belongs to a view. Raises InputError."""
     for folder, found in files.items():
-        if not found.unmatched:
+        if not found.unmatched or found.matched:
+            continue
+        unmatched = list(found.unmatched)
+        name = next((name for name in unmatched if found.unmatched[name] is not None), unmatched[0])
+        near = found.unmatched[name] or _expected(capture)[folder][0]
+        raise refuse(
+            "files-unmatched",
+            f"No file in {folder}/ belongs to a view",
+            where=capture.root / folder,
+            expected=f"the names of the views, as {near}",
+            got=f"{len(unmatched)} other files, as {name}",
+            fix=_conversion(name, near),
+            mend=rename_mend(folder, found),
+        )
+
+
+def rename_mend(folder: str, found: FolderFiles) -> RenameFix | None:
+    """The new names of files that belong to no view as they are; None if for one it is not certain."""
+    targets = list(found.unmatched.values())
+    suffixes = [{PurePosixPath(name).suffix.casefold() for name in pair if name} for pair in found.unmatched.items()]
+    if not targets or None in targets or len(set(targets)) < len(targets) or any(len(s) > 1 for s in suffixes):
+        return None
+    names = {f"{folder}/{name}": f"{folder}/{near}" for name, near in found.unmatched.items()}
+    return RenameFix(what=f"renamed {len(names)} files in {folder}/ as their views", names=names)
+
+
+def unread(capture: Capture, files: Mapping[str, FolderFiles]) -> list[Finding]:
+    """Name the files and folders that are not read, one warning for each folder."""
+    lines: list[Finding] = []
+    for folder, found in files.items():
+        if not found.unmatched or not found.matched:  # `require_matches` refuses the latter
             continue
         shown = [name if near is None else f"{name} (near {near})" for name, near in found.unmatched.items()]
         what = "are not calibrated, the COLMAP model does not name them" if folder == "images" else "belong to no view"
-        lines.append(f"{len(shown)} files in {folder}/ {what}: {listed(shown, 5)}")
+        line = f"{len(shown)} files in {folder}/ {what}: {listed(shown, 5)}"
+        lines.append(Finding.warning("files-unread", line))
     known = {"sparse", *files}
     for path in sorted(capture.root.iterdir()):
         if path.name.startswith(".") or path.name in known or path.name in _ROOT_FILES:
@@ -107,10 +124,14 @@ def warnings(capture: Capture, files: Mapping[str, FolderFiles]) -> list[str]:
             plain = path.name.casefold()
             meant = plain if plain in known else _OTHER_FOLDERS.get(plain)
             if meant is not None and (count := len(files_in(path))):
-                lines.append(f"{path.name}/ with {count} files is not read; rename it to {meant}/")
+                line = f"{path.name}/ with {count} files is not read; rename it to {meant}/"
+                fix = RenameFix(what=f"renamed {path.name}/ to {meant}/", names={path.name: meant})
+                free = not (capture.root / meant).exists() or meant.casefold() == path.name.casefold()
+                lines.append(Finding.warning("files-unread", line, fix if free else None))
         elif (meant := _meant_root_file(path)) is not None and not (capture.root / meant).exists():
-            lines.append(f"{path.name} is not read; convert or rename it to {meant}")
-    return lines + _other_scans(capture)
+            line = f"{path.name} is not read; convert or rename it to {meant}"
+            lines.append(Finding.warning("files-unread", line))
+    return lines + findings.warnings("files-unread", _other_scans(capture))
 
 
 def _other_scans(capture: Capture) -> list[str]:

@@ -16,7 +16,8 @@ from jaxtyping import Float
 
 from registration.capture.samples import ViewSample
 from registration.doctor.contradictions import overlap
-from registration.errors import InputError
+from registration.doctor.findings import FindingError, Fix, refuse
+from registration.doctor.fixes import NormalFix, NormalFrameFix
 from registration.types import Camera, NormalsFrame
 
 _MARGIN = 0.15  # by which other axes must agree better, of 2: 1 for facing and 1 at the outline
@@ -77,13 +78,15 @@ def check_normal_axes(
     (axes, world), better = _best(total)
     if better > _MARGIN:
         given = float(np.trace(total.camera))
-        raise InputError(
+        raise refuse(
+            "normals-axes",
             "The normals are in other axes",
             where=folder,
             expected="the camera's frame: x right, y down, z away from the camera, so that z < 0 where it sees",
             got=f"normals {_name(axes, world)}: these agree with outlines and viewing directions by "
             f"{_share(given + better)}, the camera's axes by {_share(given)}",
             fix=_mend(axes, world, stated),
+            mend=_fix(axes, world, stated),
         )
     warnings = []
     for name, found in moments.items():
@@ -110,8 +113,9 @@ def _check_encoding(folder: Path, samples: Sequence[ViewSample]) -> None:
         raise _wrong_encoding(folder, "the same normal everywhere")
 
 
-def _wrong_encoding(folder: Path, got: str) -> InputError:
-    return InputError(
+def _wrong_encoding(folder: Path, got: str) -> FindingError:
+    return refuse(
+        "normals-encoding",
         "The normal maps are encoded otherwise",
         where=folder,
         expected="16 bit RGB, n = 2 v / 65535 - 1 with unit normals n",
@@ -185,15 +189,30 @@ def _name(axes: tuple[int, ...], world: bool) -> str:
     return _NAMES.get(axes, f"as {_formula(axes)}")
 
 
-def _mend(axes: tuple[int, ...], world: bool, stated: NormalsFrame) -> str:
-    """The right statement in capture.toml, if there is one, or how to convert the maps."""
+def _frame(axes: tuple[int, ...], world: bool, stated: NormalsFrame) -> NormalsFrame | None:
+    """The axes that capture.toml should state; None if no statement makes the maps right."""
     opposite: dict[NormalsFrame, NormalsFrame] = {"camera_opencv": "camera_opengl", "camera_opengl": "camera_opencv"}
     frame = opposite.get(stated) if not world and axes == (1, -2, -3) else None
-    frame = "world" if world and stated == "camera_opencv" and axes == (1, 2, 3) else frame
+    return "world" if world and stated == "camera_opencv" and axes == (1, 2, 3) else frame
+
+
+def _mend(axes: tuple[int, ...], world: bool, stated: NormalsFrame) -> str:
+    """The right statement in capture.toml, if there is one, or how to convert the maps."""
+    frame = _frame(axes, world, stated)
     statement = [] if frame is None else [f'write [normals] frame = "{frame}" into capture.toml']
     if stated == "camera_opencv":
         return ", or ".join([*statement, _conversion(axes, world)])
     return (statement or [f'correct [normals] frame = "{stated}" in capture.toml'])[0]
+
+
+def _fix(axes: tuple[int, ...], world: bool, stated: NormalsFrame) -> Fix | None:
+    """The statement that is right, or else the conversion of the maps."""
+    matrix = _matrix(axes)
+    if (frame := _frame(axes, world, stated)) is not None:
+        return NormalFrameFix(what=f'wrote [normals] frame = "{frame}"', frame=frame, matrix=matrix, world=world)
+    if stated != "camera_opencv":
+        return None
+    return NormalFix(what=f"converted normals {_name(axes, world)}", matrix=matrix, world=world)
 
 
 def _conversion(axes: tuple[int, ...], world: bool) -> str:

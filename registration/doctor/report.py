@@ -5,7 +5,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-import cv2
 import numpy as np
 from jaxtyping import Float
 from rich.box import SIMPLE
@@ -13,15 +12,16 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from registration.capture import native, triangulation
+from registration.capture import triangulation
 from registration.capture.jaw_order import has_reversed_jaw
 from registration.capture.scan import Scan, read_scan, read_truth
 from registration.capture.text import listed
 from registration.doctor.contact_sheet import draw_contact_sheet
+from registration.doctor.diagnosis import Diagnosis, diagnose
 from registration.doctor.ledger import Channel
 from registration.doctor.scan_checks import scan_facts
-from registration.doctor.validation import eye_distance, validate_capture
-from registration.frames import MM_PER_M, opencv_intrinsics
+from registration.doctor.size_checks import eye_distance
+from registration.frames import MM_PER_M
 from registration.geometry.meshlab import scan_topology
 from registration.model.jaw_order import SCHEME
 from registration.storage.files import check_output_file
@@ -132,12 +132,28 @@ def check_capture(path: Path, sheet: Path | None = None) -> CaptureReport:
         sheet: PNG file for a contact sheet; None: none is drawn.
 
     Raises:
-        InputError: as `native.read_capture` and `validate_capture`; nothing is written then.
+        InputError: the first error of `diagnose`; nothing is written then.
+    """
+    diagnosis = diagnose(path)
+    if diagnosis.errors:
+        raise diagnosis.errors[0].error
+    return report_capture(diagnosis, sheet)
+
+
+def report_capture(diagnosis: Diagnosis, sheet: Path | None = None) -> CaptureReport:
+    """Report what a capture without errors offers.
+
+    Args:
+        diagnosis: of the capture.
+        sheet: PNG file for a contact sheet; None: none is drawn.
+
+    Raises:
+        InputError: the sheet cannot be written.
     """
     if sheet is not None:
         check_output_file(Path(sheet))
-    capture = native.read_capture(path)
-    ledger = validate_capture(capture)
+    capture, ledger = diagnosis.capture, diagnosis.ledger
+    assert capture is not None and ledger is not None
     scan = None if capture.scan is None else read_scan(capture.scan)
     names = sorted({name for view in capture.views for name in view.landmarks})
     triangulated = {name: triangulation.triangulate(capture, name)[0] for name in names}
@@ -196,12 +212,8 @@ def _warnings(
         if missing:
             warnings.append(f"{len(missing)} of {len(views)} views without {part}: {listed(missing)}")
     for view in views:
-        if view.outliers and np.isnan(view.residual_px):
-            warnings.append(f"{view.name}: the subject is behind the camera; check its pose")
-        elif view.outliers:
+        if view.outliers and not np.isnan(view.residual_px):
             warnings.append(f"{view.name}: landmarks that contradict the other views: {listed(view.outliers)}")
-        if _folds(view.camera):
-            warnings.append(f"{view.name}: the distortion folds the image over itself; check its coefficients")
     for scheme, points in triangulated.items():
         lost = np.flatnonzero(~np.isfinite(points).all(-1))
         seen = _views_that_see(capture, scheme)
@@ -224,22 +236,3 @@ def _views_that_see(capture: Capture, scheme: str) -> list[int]:
     """Number of views in which each landmark is used."""
     views = [view.landmarks[scheme][:, 2] for view in capture.views if scheme in view.landmarks]
     return [int(count) for count in (np.stack(views) > triangulation.MIN_CONFIDENCE).sum(0)]
-
-
-def _folds(camera: Camera) -> bool:
-    """Whether undistortion shows a part of the image twice or mirrored."""
-    if not camera.distortion:
-        return False
-    coarse = camera.scaled(64, 64)
-    size = (64, 64)
-    x, y = cv2.initUndistortRectifyMap(
-        opencv_intrinsics(camera.intrinsics),
-        np.array(camera.distortion),
-        None,
-        opencv_intrinsics(coarse.intrinsics),
-        size,
-        cv2.CV_32FC1,
-    )
-    (x_down, x_right), (y_down, y_right) = np.gradient(x), np.gradient(y)
-    inside = (x >= 0) & (x <= camera.width_px - 1) & (y >= 0) & (y <= camera.height_px - 1)
-    return bool((x_right * y_down - x_down * y_right)[inside].min(initial=1.0) <= 0)

@@ -6,24 +6,24 @@ the views agree is named.
 """
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
 
 import cv2
 import numpy as np
 from jaxtyping import Bool, Float
-from scipy.spatial.transform import Rotation
 
 from registration.capture.triangulation import MIN_CONFIDENCE, triangulate
-from registration.errors import InputError
+from registration.doctor.conventions import MISREADINGS, Misreading, Witness, agreements
+from registration.doctor.findings import Finding, FindingError, refuse
+from registration.doctor.fixes import CameraFix
+from registration.doctor.length_units import wrong_unit
 from registration.types import Camera, Capture
-
-Matrix = Float[np.ndarray, "4 4"]
 
 SUBJECT_M = (0.04, 2.5)  # what masks show, its longer side: from a part of a child's face to a whole adult
 LANDMARKS_M = (0.01, 2.5)  # the extent of a scheme's landmarks
-_HEAD_M, _FACE_M = 0.3, 0.15  # a head with its neck, and landmarks on it: for the factor in messages
+HEAD_M, _FACE_M = (0.15, 0.5), (0.06, 0.25)  # a head with its neck, and landmarks on it: name the unit
 _DOUBTFUL, _BETTER, _CONFIRMED = 0.85, 0.25, 0.5  # fractions of landmark observations that fit
 _MEETING = 0.6  # fraction of views in which the point where the rays meet must lie in the mask
 _MIN_LANDMARKS, _TRIED_LANDMARKS = 6, 24
@@ -32,7 +32,6 @@ _TRIM = 0.005  # of a mask's pixels at each side, outside the box: specks
 _MAX_PAIRS = 400
 _SAME_PLACE_M = 1e-6
 _FAR_M = 1e4
-_UNITS_M = {"millimetres": 1e-3, "centimetres (0.0254: inches)": 1e-2, "kilometres": 1e3}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -54,70 +53,6 @@ def mask_box(inside: Bool[np.ndarray, "H W"]) -> MaskBox | None:
     return MaskBox(low=np.array([ends[0][0], ends[1][0]], float), high=np.array([ends[0][1], ends[1][1]], float))
 
 
-def _pose(rotation: Float[np.ndarray, "3 3"], translation: Float[np.ndarray, "3"]) -> Matrix:
-    T = np.eye(4)
-    T[:3, :3], T[:3, 3] = rotation, translation
-    return T
-
-
-_FLIP = np.diag([1.0, -1.0, -1.0, 1.0])  # OpenGL's axes to OpenCV's
-
-
-def _from_centre(T: Matrix) -> Matrix:
-    return _pose(T[:3, :3], -T[:3, :3] @ T[:3, 3])
-
-
-def _scalar_first(T: Matrix) -> Matrix:
-    """The pose of a quaternion that was stored as x y z w and read as w x y z."""
-    w, x, y, z = Rotation.from_matrix(T[:3, :3]).as_quat(scalar_first=True)
-    return _pose(Rotation.from_quat([w, x, y, z]).as_matrix(), T[:3, 3])
-
-
-@dataclass(frozen=True, kw_only=True)
-class Misreading:
-    """A convention that poses may have been written in, and how COLMAP's come from them."""
-
-    name: str
-    edit: str
-    mend: Callable[[Matrix], Matrix]
-
-
-MISREADINGS = (
-    Misreading(
-        name="in OpenGL's camera axes (y up, z backwards)",
-        edit="multiply each rotation and translation by diag(1, -1, -1) from the left",
-        mend=lambda T: _FLIP @ T,
-    ),
-    Misreading(
-        name="camera to world",
-        edit="invert each pose: R' = transpose of R, t' = -R' t",
-        mend=lambda T: np.linalg.inv(T),
-    ),
-    Misreading(
-        name="camera to world in OpenGL's axes, as nerfstudio and Blender write them",
-        edit="invert each pose and turn its axes: R' = diag(1, -1, -1) times the transpose of R, t' = -R' t",
-        mend=lambda T: _FLIP @ np.linalg.inv(T),
-    ),
-    Misreading(name="with the camera's centre in place of the translation", edit="write t' = -R t", mend=_from_centre),
-    Misreading(
-        name="with the camera's centre in place of the translation, in OpenGL's axes",
-        edit="write R' = diag(1, -1, -1) R and t' = -R' t",
-        mend=lambda T: _from_centre(_pose(_FLIP[:3, :3] @ T[:3, :3], T[:3, 3])),
-    ),
-    Misreading(
-        name="with transposed rotations",
-        edit="transpose each rotation (negate x, y and z of the quaternion) and keep the translation",
-        mend=lambda T: _pose(T[:3, :3].T, T[:3, 3]),
-    ),
-    Misreading(name="with quaternions as x y z w", edit="write quaternions as w x y z", mend=_scalar_first),
-    Misreading(
-        name="in PyTorch3D's axes (x to the left, y up), or of images that were turned by half",
-        edit="multiply each rotation and translation by diag(-1, -1, 1) from the left, or turn the images",
-        mend=lambda T: np.diag([-1.0, -1.0, 1.0, 1.0]) @ T,
-    ),
-)
-
-
 def check_landmark_rays(capture: Capture) -> bool:
     """Check that landmarks of the views agree on points in front of the cameras.
 
@@ -129,20 +64,17 @@ def check_landmark_rays(capture: Capture) -> bool:
     """
     centres = np.stack([view.camera.centre for view in capture.views])
     if np.ptp(centres, axis=0).max() < _SAME_PLACE_M:
-        raise InputError(
+        raise refuse(
+            "poses",
             "All cameras are in one place",
             where=capture.root / "sparse",
             expected="cameras that see the subject from several sides",
             got=f"{len(centres)} cameras at {np.round(centres[0], 4).tolist()}",
             fix="write each image's translation into the COLMAP model",
         )
-    counts: dict[str, int] = {}
-    for view in capture.views:
-        for name, points in view.landmarks.items():
-            counts[name] = counts.get(name, 0) + int((points[:, 2] > MIN_CONFIDENCE).sum())
-    if not counts:
+    if (witness := LandmarkWitness.of(capture)) is None:
         return False
-    scheme = "68" if counts.get("68") else max(counts, key=lambda name: counts[name])
+    scheme = witness.scheme
     given = _agreement(capture, scheme)
     if given is None or given >= _DOUBTFUL:
         return given is not None
@@ -156,16 +88,65 @@ def check_landmark_rays(capture: Capture) -> bool:
         centre = np.nanmedian(points, axis=0)[None]
         behind = all(view.camera.project(centre)[1][0] < 0 for view in capture.views)
         got = "the subject is behind all cameras" if behind else f"{100 * given:.0f} % of the landmarks agree"
-        raise _wrong_poses(capture, expected, got, misreading)
+        raise wrong_poses(capture, expected, got, misreading)
     _check_digits(capture, given)
     return given >= _CONFIRMED
+
+
+@dataclass(frozen=True, kw_only=True)
+class LandmarkWitness:
+    """The agreement of the views on the points that their landmarks show."""
+
+    capture: Capture
+    scheme: str
+    sure: float = _DOUBTFUL
+    better: float = _BETTER
+
+    @classmethod
+    def of(cls, capture: Capture) -> "LandmarkWitness | None":
+        """The witness of a capture; None if too few landmarks are seen by two views."""
+        counts: dict[str, int] = {}
+        for view in capture.views:
+            for name, points in view.landmarks.items():
+                counts[name] = counts.get(name, 0) + int((points[:, 2] > MIN_CONFIDENCE).sum())
+        if not counts:
+            return None
+        scheme = "68" if counts.get("68") else max(counts, key=lambda name: counts[name])
+        return None if _agreement(capture, scheme) is None else cls(capture=capture, scheme=scheme)
+
+    def __call__(self, cameras: Sequence[Camera]) -> float:
+        """The share of observations that fit the triangulated points."""
+        views = tuple(replace(v, camera=camera) for v, camera in zip(self.capture.views, cameras, strict=True))
+        return _agreement(replace(self.capture, views=views), self.scheme) or 0.0
+
+
+def check_poses(capture: Capture, witness: Witness) -> None:
+    """Refuse poses of another convention, in which the views agree much better. Raises InputError."""
+    cameras = [view.camera for view in capture.views]
+    (given, _), *others = agreements(cameras, witness)
+    best, misreading = max(others, key=lambda pair: pair[0])
+    if best >= max(witness.sure, given + witness.better):
+        expected = "views that agree on the colours, labels and normals of the subject's surface"
+        got = f"an agreement of {given:.2f}, against {best:.2f}"
+        if misreading is not None and _all_behind(cameras, [misreading.camera(camera) for camera in cameras]):
+            got = "the subject is behind all cameras"
+        raise wrong_poses(capture, expected, got, misreading)
+
+
+def _all_behind(cameras: Sequence[Camera], mended: Sequence[Camera]) -> bool:
+    """Whether the point that the mended cameras look at is behind all cameras as they are written."""
+    across = np.stack([np.eye(3) - np.outer(axis, axis) for axis in (camera.T_cam_world[2, :3] for camera in mended)])
+    centres = np.stack([camera.centre for camera in mended])
+    point = np.linalg.lstsq(across.sum(0), np.einsum("nij,nj->i", across, centres), rcond=None)[0]
+    return all(camera.project(point[None])[1][0] < 0 for camera in cameras)
 
 
 def _check_digits(capture: Capture, agreement: float) -> None:
     """Refuse a far world whose poses do not agree: a rotation's rounding moves a camera by its part of the distance."""
     far = _distance(capture)
     if far > _FAR_M and agreement < _CONFIRMED:
-        raise InputError(
+        raise refuse(
+            "poses",
             "The poses have too few digits for a world so far from its origin",
             where=capture.root / "sparse",
             expected=f"landmarks that agree, of cameras {far:.3g} m from the world's origin",
@@ -180,13 +161,7 @@ def _distance(capture: Capture) -> float:
 
 
 def _mended(capture: Capture, misreading: Misreading) -> Capture:
-    return replace(
-        capture, views=tuple(replace(view, camera=_mended_camera(view.camera, misreading)) for view in capture.views)
-    )
-
-
-def _mended_camera(camera: Camera, misreading: Misreading) -> Camera:
-    return replace(camera, T_cam_world=misreading.mend(camera.T_cam_world))
+    return replace(capture, views=tuple(replace(view, camera=misreading.camera(view.camera)) for view in capture.views))
 
 
 def _agreement(capture: Capture, scheme: str) -> float | None:
@@ -217,24 +192,43 @@ def check_mask_rays(capture: Capture, boxes: Mapping[str, MaskBox | None], *, po
     if len(pairs) < 2:
         return
     cameras = [camera for camera, _ in pairs]
-    ends = np.stack([_undistorted(camera, box) for camera, box in pairs])
-    given = _meeting(cameras, ends)
+    ends = np.stack([undistorted_box(camera, box) for camera, box in pairs])
+    given = meeting(cameras, ends)
     needed = max(2, math.ceil(_MEETING * len(pairs)))
     if poses and given.hits < needed:
-        tried = [(_meeting([_mended_camera(camera, m) for camera in cameras], ends), m) for m in MISREADINGS]
+        tried = [(meeting([m.camera(camera) for camera in cameras], ends), m) for m in MISREADINGS]
         best, misreading = max(tried, key=lambda pair: (pair[0].hits, -pair[0].miss))
         seen = f"{len(pairs) - given.hits} of {len(pairs)} cameras do not see the point that most rays pass"
         behind = given.behind == len(pairs)
         got = "the subject is behind all cameras" if behind else seen
         expected = "rays through the masks' centres that nearly meet, in front of all cameras"
-        raise _wrong_poses(capture, expected, got, misreading if best.hits >= needed else None)
+        raise wrong_poses(capture, expected, got, misreading if best.hits >= needed else None)
+    extent = subject_extent(capture, boxes) if size and given.hits >= needed else None
+    if extent is not None:
+        check_extent(capture, "masks", extent, SUBJECT_M, HEAD_M)
+
+
+def subject_extent(capture: Capture, boxes: Mapping[str, MaskBox | None]) -> float | None:
+    """The longer side (m) of what boxes show, in the median of the views; None: their rays do not meet, or are cut."""
+    pairs = [(view.camera, box) for view in capture.views if (box := boxes.get(view.name)) is not None]
+    if len(pairs) < 2:
+        return None
+    met = meeting([camera for camera, _ in pairs], np.stack([undistorted_box(camera, box) for camera, box in pairs]))
     sides = [
         side
-        for (camera, box), depth in zip(pairs, given.depths, strict=True)
+        for (camera, box), depth in zip(pairs, met.depths, strict=True)
         if depth > 0 and (side := _longer_side(camera, box, depth)) is not None
     ]
-    if size and given.hits >= needed and sides:
-        check_extent(capture, "masks", float(np.median(sides)), SUBJECT_M, _HEAD_M)
+    return float(np.median(sides)) if sides and met.hits >= 2 else None
+
+
+def subject_centre(capture: Capture, boxes: Mapping[str, MaskBox | None]) -> Float[np.ndarray, "3"] | None:
+    """The point (m, world) that the rays through most boxes pass; None: fewer than two thirds of them do."""
+    pairs = [(view.camera, box) for view in capture.views if (box := boxes.get(view.name)) is not None]
+    if len(pairs) < 3:
+        return None
+    met = meeting([camera for camera, _ in pairs], np.stack([undistorted_box(camera, box) for camera, box in pairs]))
+    return met.point if 3 * met.hits >= 2 * len(pairs) else None
 
 
 def check_landmark_size(capture: Capture, scheme: str, points: Float[np.ndarray, "L 3"]) -> None:
@@ -245,31 +239,34 @@ def check_landmark_size(capture: Capture, scheme: str, points: Float[np.ndarray,
         check_extent(capture, f"landmarks of scheme {scheme}", extent, LANDMARKS_M, _FACE_M)
 
 
-def check_extent(capture: Capture, what: str, extent_m: float, limits_m: tuple[float, float], typical_m: float) -> None:
+def check_extent(
+    capture: Capture, what: str, extent_m: float, limits_m: tuple[float, float], typical_m: tuple[float, float]
+) -> None:
     """Refuse an extent outside the limits, which is a sign of another unit. Raises InputError."""
     if limits_m[0] <= extent_m <= limits_m[1]:
         return
-    unit, factor = min(_UNITS_M.items(), key=lambda item: abs(math.log(item[1] * max(extent_m, 1e-9) / typical_m)))
-    raise InputError(
+    raise wrong_unit(
+        capture,
         "The world is not in metres",
-        where=capture.root / "sparse",
-        expected=f"{what} of a head, {limits_m[0]:g} to {limits_m[1]:g} m large",
-        got=f"{what} that are {extent_m:.3g} m large",
-        fix=f"scale the COLMAP model and the scan to metres, by {factor:g} if they are in {unit}",
+        f"{what} of a head, {limits_m[0]:g} to {limits_m[1]:g} m large",
+        f"{what} that are {extent_m:.3g} m large",
+        extent=extent_m,
+        limits_m=typical_m,
     )
 
 
 @dataclass(frozen=True, kw_only=True)
-class _Meeting:
+class Meeting:
     """The point that most rays pass."""
 
     hits: int  # views in which it lies in front, in or near the mask's box
     miss: float  # mean distance from the boxes' centres in these views, in sides of the box
     depths: Float[np.ndarray, "N"]  # m
     behind: int  # views that have it behind them, if the rays are taken as lines
+    point: Float[np.ndarray, "3"]  # m, world
 
 
-def _meeting(cameras: Sequence[Camera], ends: Float[np.ndarray, "N 2 2"]) -> _Meeting:
+def meeting(cameras: Sequence[Camera], ends: Float[np.ndarray, "N 2 2"]) -> Meeting:
     """Find it among the points nearest to pairs of lines, and to all."""
     centres = np.stack([camera.centre for camera in cameras])
     middle, half = ends.mean(1), (ends[:, 1] - ends[:, 0]) / 2 * (1 + 2 * _MARGIN)
@@ -294,15 +291,16 @@ def _meeting(cameras: Sequence[Camera], ends: Float[np.ndarray, "N 2 2"]) -> _Me
     hit = (miss.max(-1) <= 1) & (depth > 0)
     distance = np.where(hit, miss.max(-1), 0).sum(0) / np.maximum(hit.sum(0), 1)
     best = np.lexsort((distance, -hit.sum(0)))[0]
-    return _Meeting(
+    return Meeting(
         hits=int(hit[:, best].sum()),
         miss=float(distance[best]),
         depths=depth[:, best],
         behind=int((depth[:, -1] < 0).sum()),
+        point=points[best],
     )
 
 
-def _undistorted(camera: Camera, box: MaskBox) -> Float[np.ndarray, "2 2"]:
+def undistorted_box(camera: Camera, box: MaskBox) -> Float[np.ndarray, "2 2"]:
     """The box in the image without distortion: low and high corner."""
     corners = np.array([[x, y] for x in (box.low[0], box.high[0]) for y in (box.low[1], box.high[1])])
     if camera.distortion:
@@ -319,15 +317,22 @@ def _longer_side(camera: Camera, box: MaskBox, depth_m: float) -> float | None:
     return float(sides[whole].max()) if whole.any() else None
 
 
-def _wrong_poses(capture: Capture, expected: str, got: str, misreading: Misreading | None) -> InputError:
-    hint = "" if misreading is None else f"; all is well if the poses are {misreading.name}"
-    return InputError(
-        "The cameras do not look at one subject",
-        where=capture.root / "sparse",
+def wrong_poses(capture: Capture, expected: str, got: str, misreading: Misreading | None) -> FindingError:
+    """The refusal of cameras that do not look at one subject, with the convention in which they would."""
+    far = ", with 17 digits in a world so far from its origin" if _distance(capture) > _FAR_M else ""
+    conventions = "world to camera, x right, y down, z forward"
+    fix = None
+    if misreading is not None:
+        fix = CameraFix(what=f"read the poses as {misreading.name}: {misreading.edit}", change=misreading.camera)
+    return Finding(
+        kind="poses" if misreading is None else misreading.kind,
+        severity="error",
+        where=str(capture.root / "sparse"),
+        believed="The cameras do not look at one subject",
         expected=expected,
-        got=got + hint,
-        fix="check the poses: COLMAP's are world to camera, x right, y down, z forward, quaternions w x y z"
-        f"{', with 17 digits in a world so far from its origin' if _distance(capture) > _FAR_M else ''}"
+        evidence=got if misreading is None else f"{got}; all is well if the poses are {misreading.name}",
+        mend=f"check the poses: COLMAP's are {conventions}, quaternions w x y z{far}"
         if misreading is None
-        else f"{misreading.edit}; COLMAP's poses are world to camera, x right, y down, z forward",
-    )
+        else f"{misreading.edit}; COLMAP's poses are {conventions}",
+        fix=fix,
+    ).error

@@ -7,17 +7,20 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from registration.capture.scan import Scan
+from registration.doctor import scan_position
+from registration.doctor.findings import Finding, warnings
+from registration.doctor.fixes import ScanFix
+from registration.doctor.mesh_frame import Frame, candidate_frames
 from registration.doctor.scan_frame import (
     FEW_SAMPLES,
     GRID,
     MAX_DISTANCE_M,
     MAX_SAMPLES,
     MIN_LANDMARKS,
-    Frame,
     Silhouettes,
-    candidate_frames,
     evenly_spaced,
     finite_points,
+    frame_kind,
     length_text,
     vertex_tree,
 )
@@ -37,27 +40,37 @@ _MAX_FACES = 300_000  # whose neighbours are compared
 _FRONT_M = 0.01  # behind the nearest point of a coarse cell
 
 
-def scan_warnings(capture: Capture, scan: Scan, landmarks: Float[np.ndarray, "L 3"]) -> list[str]:
-    """What may be wrong with a scan that `require_frame` accepts, one line each; empty if nothing is.
+def scan_warnings(capture: Capture, scan: Scan, landmarks: Float[np.ndarray, "L 3"]) -> list[Finding]:
+    """What may be wrong with a scan that `require_frame` accepts; empty if nothing is.
 
     Args:
         capture: whose cameras see the scan.
         scan: of the capture.
         landmarks: triangulated, metres; NaN where not.
     """
-    warnings, tree = _contents(scan), vertex_tree(scan.vertices)
+    found, tree = warnings("scan-contents", _contents(scan)), vertex_tree(scan.vertices)
     if pieces := _floating(scan.vertices):
-        warnings.append(pieces)
+        found.append(Finding.warning("scan-pieces", pieces))
     points = finite_points(landmarks)
     if len(points) < MIN_LANDMARKS:
-        warnings += _turned(capture, scan)
+        turned = _turned(capture, scan)
+        found += turned or scan_position.moved_from_masks(capture, scan)
     elif (frame := _better_frame(scan, points, distance := _landmark_distance(scan, tree, points), tree)) is not None:
-        warnings.append(f"the scan fits the landmarks better if it is {frame}; compare it with the images")
-    elif distance > MAX_DISTANCE_M:
-        warnings.append(f"the scan is {MM_PER_M * distance:.0f} mm from the landmarks; check its frame and unit")
-    if len(scan.triangles):
-        warnings += _winding(capture, scan)
-    return warnings
+        found.append(_turned_scan(capture, frame, "fits the landmarks"))
+    else:
+        found += scan_position.moved_from_landmarks(scan, tree, points, distance)
+    if len(scan.triangles) and not any(finding.kind == "scan-mirrored" for finding in found):
+        found += warnings("scan-winding", _winding(capture, scan))
+    return found
+
+
+def _turned_scan(capture: Capture, frame: Frame, how: str) -> Finding:
+    """A scan that fits better in other axes. A person compares: what is left may be the symmetry of a head."""
+    line = f"the scan {how} better if it is {frame}; compare it with the images, and export it again"
+    fix = None
+    if capture.scan is not None:
+        fix = ScanFix(what=f"converted the scan that was {frame}", frame=frame, file=capture.scan.name)
+    return Finding.warning(frame_kind(frame), line, fix)
 
 
 def scan_facts(scan: Scan) -> str:
@@ -121,8 +134,8 @@ def _better_frame(scan: Scan, points: Float[np.ndarray, "L 3"], distance: float,
     return frame if fits else None
 
 
-def _turned(capture: Capture, scan: Scan) -> list[str]:
-    """A line if the scan's silhouette fits the masks better with other axes."""
+def _turned(capture: Capture, scan: Scan) -> list[Finding]:
+    """A warning if the scan's silhouette fits the masks better with other axes."""
     views, frames = Silhouettes.of(capture), [frame for frame in candidate_frames() if frame.unit == 1]
     if not views.masks:
         return []
@@ -130,7 +143,7 @@ def _turned(capture: Capture, scan: Scan) -> list[str]:
     best = views.best(sample, frames)
     if best is None or best[1].plain or best[0] < _CLEARLY * views.overlap(sample):
         return []
-    return [f"the scan's silhouette fits the masks better if it is {best[1]}; compare it with the images"]
+    return [_turned_scan(capture, best[1], "by its silhouette fits the masks")]
 
 
 def _winding(capture: Capture, scan: Scan) -> list[str]:

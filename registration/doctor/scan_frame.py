@@ -4,9 +4,8 @@ A mesh in another frame is compared in every unit and with every exchange of the
 export it again.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import permutations, product
 from pathlib import Path
 
 import numpy as np
@@ -16,66 +15,20 @@ from scipy.spatial import cKDTree
 from registration.capture import pixels
 from registration.capture.scan import Scan, read_scan, read_truth
 from registration.capture.triangulation import triangulate
-from registration.errors import InputError
+from registration.doctor.findings import refuse
+from registration.doctor.fixes import ScanFix
+from registration.doctor.mesh_frame import Frame, candidate_frames
 from registration.frames import MM_PER_M
 from registration.types import Capture, View
 
 MIN_LANDMARKS = 6  # that locate a mesh
 MAX_DISTANCE_M = 0.01  # median of the landmarks' distances from a mesh of the skin that they lie on
 FAR_M = 0.1  # of all landmarks: the mesh shows something else, or lies elsewhere
-_UNITS = {1.0: "", 1e-3: "millimetres", 1e-2: "centimetres", 0.0254: "inches", 1e3: "kilometres"}
-_AXES = "xyz"
 GRID = 32  # cells per side of the coarse images in which a scan without landmarks is compared with masks
 _MIN_OVERLAP = 0.1  # of a mesh with the masks; a scan of the whole body beside masks of the head has 0.2
 _FITS = 0.5
 _HEADS_M = (0.1, 3.0)  # sizes of a scan, from a face to a body
 MAX_SAMPLES, FEW_SAMPLES = 20_000, 2_000
-
-
-@dataclass(frozen=True, kw_only=True)
-class Frame:
-    """How a file's coordinates may have been exported: world axis k is sign * file axis, times the unit."""
-
-    unit: float  # metres per unit of the file
-    axes: tuple[int, int, int]
-    signs: tuple[int, int, int]
-
-    @property
-    def plain(self) -> bool:
-        return self.axes == (0, 1, 2) and self.signs == (1, 1, 1)
-
-    @property
-    def mirrored(self) -> bool:
-        return bool(np.linalg.det(np.eye(3)[list(self.axes)] * self.signs) < 0)
-
-    def to_file(self, world: Float[np.ndarray, "P 3"]) -> Float[np.ndarray, "P 3"]:
-        """World points (m) in the coordinates that the file would give them."""
-        points = np.empty_like(world)
-        points[:, list(self.axes)] = world * self.signs / self.unit
-        return points
-
-    def to_world(self, file: Float[np.ndarray, "P 3"]) -> Float[np.ndarray, "P 3"]:
-        """Points of the file in the world, metres."""
-        return file[:, list(self.axes)] * self.signs * self.unit
-
-    def __str__(self) -> str:
-        turned = ", ".join(("-" if s < 0 else "") + _AXES[k] for k, s in zip(self.axes, self.signs, strict=True))
-        parts = [f"in {_UNITS[self.unit]}"] if self.unit != 1 else []
-        parts += [] if self.plain else [f"{'mirrored' if self.mirrored else 'turned'}: the world is its ({turned})"]
-        return " and ".join(parts)
-
-
-_AS_IT_IS = Frame(unit=1.0, axes=(0, 1, 2), signs=(1, 1, 1))
-
-
-def candidate_frames() -> Iterator[Frame]:
-    """All units and all axes, simpler ones first."""
-    axes = [(a, s) for a in permutations(range(3)) for s in product((1, -1), repeat=3)]
-    turned = [Frame(unit=1.0, axes=a, signs=s) for a, s in axes]  # type: ignore[arg-type]
-    turned.sort(key=lambda frame: (not frame.plain, frame.mirrored))
-    for frame in turned:
-        for unit in _UNITS:
-            yield Frame(unit=unit, axes=frame.axes, signs=frame.signs)
 
 
 def require_frames(capture: Capture) -> Scan | None:
@@ -126,13 +79,29 @@ def require_frame(
             return
         expected, got = "a surface that the cameras see where the subject is", "one outside the masks or the images"
     extent = " x ".join(length_text(side) for side in np.ptp(vertices, axis=0))
-    raise InputError(
+    raise refuse(
+        _kind(title, guess),
         f"The {title} is in another unit or frame than the cameras",
         where=where,
         expected=expected,
         got=f"{got}, {extent} large" + (f"; it fits if it is {guess}" if guess else ""),
         fix="export it in metres in the world of the COLMAP model, or remove it",
+        mend=None
+        if guess is None
+        else ScanFix(what=f"converted the {title} that was {guess}", frame=guess, file=where.name),
     )
+
+
+def _kind(title: str, guess: Frame | None) -> str:
+    """The kind of the finding that a mesh is in another frame."""
+    if title != "scan":
+        return "ground-truth"
+    return "scan-elsewhere" if guess is None else frame_kind(guess)
+
+
+def frame_kind(frame: Frame) -> str:
+    """The kind of the finding that a scan is in this frame."""
+    return "scan-unit" if frame.unit != 1 else "scan-mirrored" if frame.mirrored else "scan-axes"
 
 
 def _fit_landmarks(

@@ -7,7 +7,7 @@ import numpy as np
 from registration.capture.scan import read_scan
 from registration.capture.settings import UNITS_M
 from registration.capture.triangulation import triangulate
-from registration.doctor.validation import EYE_DISTANCE_M, eye_distance
+from registration.doctor.size_checks import EYE_DISTANCE_M, eye_distance
 from registration.errors import InputError
 from registration.formats.mask_size import mask_size
 from registration.formats.plan import ViewPlan

@@ -1,5 +1,6 @@
 """`gnmreg capture ...` and `dataset synth`: captures checked, rendered and degraded."""
 
+import sys
 from collections.abc import Sequence
 from typing import Annotated, Literal
 
@@ -9,6 +10,7 @@ from registration.errors import InputError
 from workflows.cli.options import (
     NOT_SET,
     CaptureFolder,
+    OptionalFolder,
     OptionalImage,
     OutputFolder,
     Seed,
@@ -19,16 +21,36 @@ from workflows.cli.options import (
 _STUDIO = StudioOptions()
 
 
-def check(capture: CaptureFolder, /, out: OptionalImage = None) -> int:
+def check(
+    capture: CaptureFolder,
+    /,
+    out: OptionalImage = None,
+    fix: OptionalFolder = None,
+) -> int:
     """Check a capture folder before it is registered.
+
+    All that is wrong is listed, each with what mends it; the exit code is 2 if a registration would refuse the capture.
 
     Args:
         capture: The capture folder.
         out: Contact sheet to draw: every image with the scan and the landmarks projected into it.
+        fix: Folder for a mended copy: what has one mend is mended, doctor.txt says what was done and what is left.
     """
-    from registration.doctor import report
+    from registration.doctor import mending, report
+    from registration.doctor.diagnosis import diagnose
 
-    print(report.check_capture(capture, sheet=out))
+    if fix is not None:
+        mended = mending.mend_capture(capture, fix)
+        print(mended)
+        return 0 if mended.usable else 2
+    diagnosis = diagnose(capture)
+    if diagnosis.errors:
+        print(diagnosis, file=sys.stderr)
+        for finding in diagnosis.findings:
+            if finding.severity == "warning":
+                print(f"warning: {finding.line}")
+        return 2
+    print(report.report_capture(diagnosis, sheet=out))
     return 0
 
 

@@ -111,7 +111,7 @@ def test_other_units_are_refused_without_landmarks_too(good: Path, tmp_path: Pat
         return  # a ball of 1.8 cm or 1.8 m may be a part of a subject or a whole one
     with pytest.raises(InputError, match="not in metres") as caught:
         validate_capture(without(capture, "landmarks"))
-    assert f"by {0.01 if factor == 39.37 else 1 / factor:g} " in caught.value.fix
+    assert f"by {0.0254 if factor == 39.37 else 1 / factor:g} " in caught.value.fix
     with pytest.raises(InputError, match="not in metres"):
         check_landmark_size(capture, "dense", factor * landmarks_68())
 
