@@ -17,6 +17,7 @@ class Diagnosis:
 
     root: Path
     findings: tuple[Finding, ...]  # errors first
+    as_written: Capture | None  # before mends of poses, K and unit; None: it cannot be read
     capture: Capture | None  # as it would be with the mends of the errors; None: it cannot be read
     ledger: Ledger | None  # None: the checks ended early
 
@@ -46,13 +47,16 @@ def diagnose(root: Path) -> Diagnosis:
     """
     reading = read_leniently(Path(root))
     findings, capture, ledger = list(reading.findings), reading.capture, None
+    as_written = capture
     if capture is not None:
         examination = Examination(capture)
         findings += examination.findings
         capture, ledger = examination.capture, examination.ledger
     errors = [finding for finding in findings if finding.severity == "error"]
     others = [finding for finding in findings if finding.severity != "error"]
-    return Diagnosis(root=Path(root), findings=(*_merged(errors), *others), capture=capture, ledger=ledger)
+    return Diagnosis(
+        root=Path(root), findings=(*_merged(errors), *others), as_written=as_written, capture=capture, ledger=ledger
+    )
 
 
 def _merged(errors: Iterable[Finding]) -> list[Finding]:

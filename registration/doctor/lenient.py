@@ -94,7 +94,7 @@ def _unit_entry(capture: Capture, settings: CaptureSettings) -> Finding:
         believed="The units are not metres",
         expected='units = "m", and a world in metres',
         evidence=f"{settings.units or 'no units'}; {size}{', as in metres' if metres else ''}",
-        mend=f'{"" if metres else by}write units = "m"',
+        mend=f'{"" if metres else by}write units = "m"; see docs/formats.md',
         fix=fix,
     )
 
@@ -155,7 +155,7 @@ def _resized(root: Path, cameras: Mapping[str, Camera], names: list[str], size: 
     of_model, of_images = (float(np.abs(point / side - 0.5).max()) for side in (given, np.array(size)))
     scale = size[0] / given[0]
     resized = abs(scale - 1) > _RESIZED and abs(size[1] - scale * given[1]) <= max(1.0, scale)  # else it is cropped
-    fix, mend = None, "rescale the camera in the COLMAP model, or store the images at its size"
+    fix, mend = None, "store the image at the size of the calibrated image, or rescale the camera in the COLMAP model"
     if of_images <= _CENTRED < of_model:
         mend = f"write {size[0]} x {size[1]} px into the COLMAP model: K is for images of this size"
         fix = CameraFix(

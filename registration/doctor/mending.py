@@ -1,7 +1,7 @@
 """Write a mended copy of a capture: what has one mend is mended, what has several is left to a person."""
 
 import shutil
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from registration.capture.native_writer import check_new
@@ -71,7 +71,7 @@ def mend_capture(source: Path, out: Path) -> MendedCapture:
                 break
             diagnosis = diagnose(temporary)
         moved = tuple(finding.moved(temporary, out) for finding in diagnosis.findings)
-        left = Diagnosis(root=out, findings=moved, capture=diagnosis.capture, ledger=diagnosis.ledger)
+        left = replace(diagnosis, root=out, findings=moved)
         mended = MendedCapture(
             source=source, out=out, done=tuple(finding.moved(temporary, out) for finding in done), left=left
         )

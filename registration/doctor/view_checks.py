@@ -26,7 +26,9 @@ def check_face(capture: Capture, samples: Sequence[ViewSample]) -> None:
     """Refuse labelled captures in which no view shows a face. Raises InputError."""
     indices = [capture.classes.index(name) for name in _FACE if name in capture.classes]
     labelled = [sample.labels for sample in samples if sample.labels is not None]
-    if len(indices) < 2 or not labelled or any(_shows(labels, indices) for labels in labelled):
+    skin = [capture.classes.index(name) for name in ("skin",) if name in capture.classes]
+    shown = any(_shows(labels, skin) for labels in labelled)
+    if len(indices) < 2 or not shown or any(_shows(labels, indices) for labels in labelled):
         return
     raise refuse(
         "face-unseen",
@@ -115,6 +117,6 @@ def unseen_warnings(capture: Capture, centre: Float[np.ndarray, "3"] | None) -> 
             names.append(view.name)
     if not names:
         return []
-    where = "x ".join(f"{value:.2f} " for value in centre).replace("x ", ", ").strip()
+    where = ", ".join(f"{value:.2f}" for value in centre)
     line = f"the subject, at ({where}) m, is not in the view of {listed(names)}; check the poses, or remove these views"
     return [Finding.warning("unseen", line)]

@@ -26,6 +26,7 @@ def check(
     /,
     out: OptionalImage = None,
     fix: OptionalFolder = None,
+    explain: OptionalImage = None,
 ) -> int:
     """Check a capture folder before it is registered.
 
@@ -35,15 +36,22 @@ def check(
         capture: The capture folder.
         out: Contact sheet to draw: every image with the scan and the landmarks projected into it.
         fix: Folder for a mended copy: what has one mend is mended, doctor.txt says what was done and what is left.
+        explain: Picture to draw of the rig: cameras, head and scan from three sides, with what is wrong in words.
     """
     from registration.doctor import mending, report
     from registration.doctor.diagnosis import diagnose
+    from registration.doctor.rig_picture import draw_rig
+    from registration.storage.files import check_output_file
 
     if fix is not None:
         mended = mending.mend_capture(capture, fix)
         print(mended)
         return 0 if mended.usable else 2
+    if explain is not None:
+        check_output_file(explain)
     diagnosis = diagnose(capture)
+    if explain is not None:
+        draw_rig(diagnosis, explain)
     if diagnosis.errors:
         print(diagnosis, file=sys.stderr)
         for finding in diagnosis.findings:

@@ -143,7 +143,7 @@ def test_a_single_camera_that_looks_away_is_named(good: Path, tmp_path: Path) ->
     shutil.rmtree(root / "sparse")
     turned = replace(cameras["cam3.png"], T_cam_world=FLIP @ cameras["cam3.png"].T_cam_world)
     write_model(root / "sparse", {**cameras, "cam3.png": turned}, np.zeros((0, 3)))
-    assert any("cam3: the subject is behind the camera" in warning for warning in check_capture(root).warnings)
+    assert any("is not in the view of cam3; check the pose" in warning for warning in check_capture(root).warnings)
 
 
 def test_cameras_in_one_place_are_refused(good: Path, tmp_path: Path) -> None:
