@@ -80,7 +80,7 @@ class ScanOptions:
             file=self.scan, landmarks=Path(file) if file else None, scheme=scheme or None, unit=self.unit
         )
         data = gnm_npz.read(model)
-        root = self.scan_capture or out.with_name(f"{out.name}_capture")
+        root = self.scan_capture or Path(f"{out.absolute()}_capture")
         made = make_capture(source, root, data, read_schemes(model, data, fit.landmark_files), progress)
         progress.message(f"the capture of the scan: {made.root}")
         return made.root, replace(fit, use_scan="always") if fit.use_scan == "auto" else fit
