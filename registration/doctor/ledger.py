@@ -90,7 +90,8 @@ def take_stock(
     for sample in samples:
         inside, excluded = _inside(sample), _excluded(sample, capture.classes)
         normals = [] if sample.normals is None else _normal_losses(sample)
-        add("images", sample.subject, [*inside, *excluded, *normals])
+        if capture.photographs:  # else the images count for nothing, as capture.toml says
+            add("images", sample.subject, [*inside, *excluded, *normals])
         if sample.mask is not None:
             add("masks", sample.subject, inside)
         if sample.normals is not None:
@@ -123,7 +124,7 @@ def require_weight(capture: Capture, channels: Sequence[Channel]) -> list[str]:
     named: set[str] = set()
     order = ("masks", "segmentation", "landmarks", "normals", "depth", "images")  # a cause before what follows from it
     for channel in sorted(channels, key=lambda channel: order.index(channel.name)):
-        if not channel.matched:
+        if not channel.matched or (channel.name == "images" and not capture.photographs):
             continue
         if not channel.total and channel.name == "segmentation":
             raise refuse(

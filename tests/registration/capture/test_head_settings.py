@@ -8,6 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from registration.capture.native import read_capture
 from registration.capture.native_writer import CaptureDescription, write_capture
+from registration.doctor.validation import validate_capture
 from registration.errors import InputError
 from registration.targets.classes import class_map
 from registration.targets.pyramid import build_pyramid
@@ -32,6 +33,10 @@ def test_pose_photographs_and_tables_of_tags_are_read_as_written(tmp_path: Path)
     assert capture.head.scale == POSE.scale
     plain = read_capture(make(tmp_path / "plain"))
     assert plain.photographs and plain.head is None
+    images = {
+        one.root: next(c for c in validate_capture(one).channels if c.name == "images") for one in (capture, plain)
+    }
+    assert not images[capture.root].counted and images[plain.root].counted
     for one in (capture, plain):
         targets = build_pyramid(one, class_map(one.classes), finest_head_px=100, levels=1)[0]
         assert bool(targets.rgb_weight.any()) == one.photographs
