@@ -165,10 +165,19 @@ def write(mesh: HeadMesh, file: Path) -> list[Path]:
         The files.
 
     Raises:
-        InputError: as `format_of` and `check_fits`.
+        InputError: as `format_of` and `check_fits`; numbers that are not finite.
     """
     kind = format_of(file)
     check_fits(file, shapes=bool(mesh.shapes), frames=mesh.frames is not None)
+    for name, values in {"vertices": mesh.vertices, "frames": mesh.frames, **mesh.shapes}.items():
+        if values is not None and not np.isfinite(values).all():
+            raise InputError(
+                "The head is not finite",
+                where=f"{mesh.name}, {name}",
+                expected="finite numbers",
+                got=f"{np.count_nonzero(~np.isfinite(values))} NaN or infinite",
+                fix="register or stabilize again",
+            )
     file.parent.mkdir(parents=True, exist_ok=True)
     beside = mesh.texture is not None and kind.texture and kind.texture_beside
     texture = file.with_suffix(".png").name if beside else None

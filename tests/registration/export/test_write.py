@@ -116,6 +116,14 @@ def test_a_format_without_shapes_refuses_them(tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == []
 
 
+def test_numbers_that_are_not_finite_are_refused(tmp_path: Path) -> None:
+    shape = np.zeros_like(HEAD.vertices)
+    shape[3, 1] = np.nan
+    with pytest.raises(InputError, match="not finite") as error:
+        write(replace(HEAD, shapes={"smile": shape}), tmp_path / "head.glb")
+    assert "smile" in error.value.where and list(tmp_path.iterdir()) == []
+
+
 def test_a_failed_registration_is_refused_unless_accepted() -> None:
     failed = a_registration(status="failed", reason="the mesh moved")
     with pytest.raises(InputError, match="failed") as error:
