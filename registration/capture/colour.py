@@ -159,6 +159,7 @@ def _xyz(xy: tuple[float, float]) -> Float[np.ndarray, "3"]:
 class Conversion:
     """How the values of an image become sRGB."""
 
+    name: str  # of the encoding or the profile
     curves: tuple[Curve, Curve, Curve]
     primaries: Float[np.ndarray, "3 3"]  # to linear sRGB
     colour: Colour  # its matrix and gain
@@ -226,7 +227,12 @@ def stated_conversion(colour: Colour, primaries: Chromaticities | None = None) -
         primaries: of the file, in place of the encoding's.
     """
     encoding = ENCODINGS[colour.encoding]
-    return Conversion(curves=(encoding.curve,) * 3, primaries=to_rec709(primaries or encoding.primaries), colour=colour)
+    return Conversion(
+        name=colour.encoding,
+        curves=(encoding.curve,) * 3,
+        primaries=to_rec709(primaries or encoding.primaries),
+        colour=colour,
+    )
 
 
 def require_encoding(path: Path, colour: Colour) -> None:

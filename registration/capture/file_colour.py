@@ -17,7 +17,7 @@ from registration.frames import srgb_to_linear
 from registration.storage.exr_files import exr_primaries, is_exr
 from registration.storage.image_files import FORMATS
 from registration.storage.reading import open_file
-from registration.types import Colour
+from registration.types import Colour, View
 
 _PNG = b"\x89PNG\r\n\x1a\n"
 _INTEROPERABILITY = 0xA005  # EXIF directory
@@ -41,7 +41,21 @@ def conversion_of(path: Path, colour: Colour) -> Conversion | None:
     if own is None:
         return None if colour == Colour() else stated_conversion(colour)
     red, green, blue = own.curves
-    return Conversion(curves=(red, green, blue), primaries=own.primaries, colour=colour)
+    return Conversion(name=own.name, curves=(red, green, blue), primaries=own.primaries, colour=colour)
+
+
+def colour_name(view: View) -> str:
+    """Return what a view's image is read as, for people: sRGB, or its encoding or profile, with matrix and gain.
+
+    Raises:
+        InputError: as `conversion_of`.
+    """
+    conversion = conversion_of(view.image, view.colour)
+    if conversion is None:
+        return "sRGB"
+    colour = view.colour
+    matrix = ["a matrix"] * (colour.matrix is not None)
+    return ", ".join([conversion.name, *matrix, *[f"gain {colour.gain:g}"] * (colour.gain != 1)])
 
 
 def _profile(path: Path) -> Profile | None:

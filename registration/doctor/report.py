@@ -1,6 +1,7 @@
 """The report of `gnmreg capture check`: what a capture offers, and what may be wrong with it."""
 
 import io
+from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,6 +14,7 @@ from rich.table import Table
 from rich.text import Text
 
 from registration.capture import triangulation
+from registration.capture.file_colour import colour_name
 from registration.capture.jaw_order import has_reversed_jaw
 from registration.capture.scan import Scan, read_scan, read_truth
 from registration.capture.text import listed
@@ -106,6 +108,9 @@ class CaptureReport:
         facts += [f"{key}: {value}" for key, value in capture.tags.items()]
         if capture.classes:
             facts.append(f"classes: {', '.join(capture.classes)}")
+        colours = Counter(map(colour_name, capture.views))
+        if set(colours) != {"sRGB"}:
+            facts.append(f"colours: {'; '.join(f'{name} ({views} views)' for name, views in colours.items())}")
         for scheme, (count, triangulated) in self.schemes.items():
             facts.append(f"landmarks {scheme}: {triangulated} of {count} triangulated")
             if scheme == SCHEME and has_reversed_jaw(capture):

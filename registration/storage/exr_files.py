@@ -26,7 +26,10 @@ def exr_size(file: Path, refuse: Refuse) -> tuple[int, int]:
             that is not its display window, or other channels than R, G and B, or Y.
     """
     header = _header(file, refuse)
-    names = {channel.name: channel for channel in header["channels"]}
+    try:
+        names = {channel.name: channel for channel in header["channels"]}
+    except UnicodeDecodeError as error:
+        raise refuse(expected="names of channels in ASCII", got=str(error)) from None
     if not ({"R", "G", "B"} <= set(names) or "Y" in names) or any(
         (names[name].xSampling, names[name].ySampling) != (1, 1) for name in _colours(names)
     ):

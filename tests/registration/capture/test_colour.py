@@ -9,9 +9,11 @@ from PIL import Image
 
 from registration.capture import native, pixels
 from registration.capture.colour import ENCODINGS, to_rec709
+from registration.capture.file_colour import colour_name
 from registration.capture.headers import read_header
 from registration.capture.native_writer import CaptureDescription, write_capture
 from registration.degrading import degradation, degrade
+from registration.doctor.report import check_capture
 from registration.errors import InputError
 from registration.frames import linear_to_srgb, srgb_to_linear
 from registration.types import Camera, Capture, Colour
@@ -161,6 +163,9 @@ def test_faulty_exr_files_are_refused(tmp_path: Path) -> None:
         assert got in str(caught.value.got)
     write_exr(path, {"RGB": LIGHT})
     content = bytearray(path.read_bytes())
+    path.write_bytes(content.replace(b"\0B\0", b"\0\xff\0", 1))
+    with pytest.raises(InputError, match="not a readable image"):
+        read_header(path, "image")
     path.write_bytes(content[:100])
     with pytest.raises(InputError, match="not a readable image"):
         read_header(path, "image")
@@ -191,6 +196,10 @@ matrix_space = "encoded"
     assert capture.views[0].colour == Colour(encoding="linear", gain=2.0)
     assert capture.views[1].colour == Colour(encoding="sony_slog3", gain=2.0, matrix=identity, matrix_space="encoded")
     assert "colour" not in capture.tags
+    assert [colour_name(view) for view in capture.views[:2]] == ["linear, gain 2", "sony_slog3, a matrix, gain 2"]
+    assert "colours: linear, gain 2 (4 views); sony_slog3, a matrix, gain 2 (1 views)" in str(
+        check_capture(capture.root)
+    )
     stored = cv2.imread(str(capture.views[0].image))[80, 60, ::-1] / 255
     found = pixels.read_view(capture.views[0], capture).rgb[80, 60]
     np.testing.assert_allclose(found, (2 * stored).clip(0, 1), atol=1e-3)
