@@ -24,6 +24,7 @@ from registration.formats.undistort import scaled_world, turned
 from registration.formats.units import world_unit
 from registration.progress import NullProgress, Progress
 from registration.storage.files import atomic_directory, write_json
+from registration.storage.hashing import versions
 from registration.storage.mesh import write_ply
 from registration.storage.reading import open_file
 from registration.types import Camera, Colour
@@ -223,6 +224,7 @@ def _record(source: SourceCapture, plans: Sequence[ViewPlan], unit_m: float, not
         "source": str(source.root),
         "unit_m": unit_m,
         "notes": list(notes),
+        "versions": versions(),
         "views": {plan.view.name: _view_record(source, plan) for plan in plans},
     }
 
