@@ -1,7 +1,7 @@
 """Every view decoded once for the checks and reduced to some thousand pixels of each channel."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -103,6 +103,14 @@ def _sample(view: View, capture: Capture, decode_normals: bool) -> ViewSample:
         coverage=coverage,
         head_rows=int(np.ptp(rows)) + 1 if len(rows) else camera.height_px,
     )
+
+
+def with_grey(sample: ViewSample, view: View) -> ViewSample:
+    """The sample with the image's grey values, also of an image that `sample_views` does not decode."""
+    if sample.grey is not None:
+        return sample
+    height, width = sample.subject.shape
+    return replace(sample, grey=_reduced_grey(pixels.read_image(view.image, view.camera, view.colour), width, height))
 
 
 def _reduced_grey(image: np.ndarray, width: int, height: int) -> Float[np.ndarray, "h w"]:

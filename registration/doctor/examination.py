@@ -1,6 +1,6 @@
 """All checks of a capture, in the order in which one fault can be blamed for another."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import replace
 from typing import TypeVar
 
@@ -9,7 +9,7 @@ from jaxtyping import Float
 
 from registration.capture import label_maps, triangulation
 from registration.capture.class_names import BACKGROUND
-from registration.capture.samples import ViewSample, sample_views
+from registration.capture.samples import ViewSample, sample_views, with_grey
 from registration.capture.scan import SCANS, Scan, read_scan
 from registration.doctor import (
     contradictions,
@@ -228,13 +228,23 @@ class Examination:
     def _body(self, boxes: dict[str, rig_checks.MaskBox | None]) -> BodyWitness | ScanWitness | None:
         """What the views should agree on without landmarks: the hull of the masks, else the scan."""
         if (silhouettes := Silhouettes.of(self.capture, self.samples, boxes)) is not None:
-            return BodyWitness(silhouettes=silhouettes, samples=self.samples)
+            return BodyWitness(silhouettes=silhouettes, samples=self._with_grey(silhouettes.numbers))
         try:
             vertices = np.zeros((0, 3)) if self.capture.scan is None else read_scan(self.capture.scan).vertices
         except InputError:  # it is refused later
             return None
         some = vertices[:: max(1, len(vertices) // _SCAN_POINTS)]
-        return ScanWitness(points=some, samples=self.samples) if len(some) else None
+        return ScanWitness(points=some, samples=self._with_grey(range(len(self.samples)))) if len(some) else None
+
+    def _with_grey(self, numbers: Collection[int]) -> list[ViewSample]:
+        """The samples, some of them with the grey values of large images; those that cannot be decoded as they are."""
+        try:
+            return [
+                with_grey(sample, view) if number in numbers else sample
+                for number, (sample, view) in enumerate(zip(self.samples, self.capture.views, strict=True))
+            ]
+        except InputError:  # it is refused when the fit decodes it
+            return self.samples
 
 
 def _scan_channel(capture: Capture, scan: Scan | None) -> Channel:
