@@ -12,12 +12,13 @@ from jaxtyping import Bool, Float
 
 from registration.capture.headers import require_complete
 from registration.errors import InputError
+from registration.storage.exr_files import exr_size, read_exr_depth
 from registration.storage.image_files import MAX_PIXELS, decode, image_size
 from registration.storage.reading import Refuse, open_file
 from registration.types import Camera, View
 
 COLMAP_SUFFIXES = (".geometric.bin", ".photometric.bin")
-DEPTH_SUFFIXES = (".png", ".npy", ".tif", ".tiff", *COLMAP_SUFFIXES)
+DEPTH_SUFFIXES = (".png", ".npy", ".tif", ".tiff", ".exr", *COLMAP_SUFFIXES)
 _COLMAP_HEADER = re.compile(rb"(\d{1,6})&(\d{1,6})&(\d{1,2})&")
 _SAME_ASPECT = 0.01
 _STEP_M, _STEP_PX = 3e-3, 8.0  # range of depths around a pixel, beyond which it lies between two surfaces
@@ -84,6 +85,9 @@ def read_depth(view: View) -> Float[np.ndarray, "H W"]:
         values: np.ndarray = read_colmap_map(path, role, camera, 1)[..., 0]
     elif path.suffix == ".npy":
         values = _read_npy(path, refuse)
+    elif path.suffix == ".exr":
+        exr_size(path, refuse, depth=True)
+        values = read_exr_depth(path, refuse)
     else:
         image_size(path, refuse)
         require_complete(path, role)

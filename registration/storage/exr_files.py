@@ -11,6 +11,8 @@ if TYPE_CHECKING:
     import numpy as np
 
 _MAGIC = b"\x76\x2f\x31\x01"
+_COLOURS = (("R", "G", "B"), ("Y",))  # channels that are read together, the first that are all there
+_DEPTHS = (("Z",), ("Depth.Z",), ("ViewLayer.Depth.Z",), ("V",), ("Y",), ("R",))  # as renderers name them
 
 
 def is_exr(start: bytes) -> bool:
@@ -18,22 +20,22 @@ def is_exr(start: bytes) -> bool:
     return start[:4] == _MAGIC
 
 
-def exr_size(file: Path, refuse: Refuse) -> tuple[int, int]:
-    """Return the width and height (px) that an OpenEXR file declares.
+def exr_size(file: Path, refuse: Refuse, *, depth: bool = False) -> tuple[int, int]:
+    """Return the width and height (px) that an OpenEXR file declares, of an image or of a depth map.
 
     Raises:
         InputError: it is missing, damaged, has more than `MAX_PIXELS`, several parts, samples in depth, a data window
-            that is not its display window, or other channels than R, G and B, or Y.
+            that is not its display window, or no channels R, G and B, or Y (of a depth map: Z, V, Y or R).
     """
     header = _header(file, refuse)
     try:
         names = {channel.name: channel for channel in header["channels"]}
     except UnicodeDecodeError as error:
         raise refuse(expected="names of channels in ASCII", got=str(error)) from None
-    if not ({"R", "G", "B"} <= set(names) or "Y" in names) or any(
-        (names[name].xSampling, names[name].ySampling) != (1, 1) for name in _colours(names)
-    ):
-        raise refuse(expected="channels R, G, B or Y at full resolution", got=", ".join(names) or "no channels")
+    read = _read_channels(names, _DEPTHS if depth else _COLOURS)
+    if not read or any((names[name].xSampling, names[name].ySampling) != (1, 1) for name in read):
+        expected = f"channels {'Z, V, Y or R' if depth else 'R, G, B or Y'} at full resolution"
+        raise refuse(expected=expected, got=", ".join(names) or "no channels")
     low, high = header["dataWindow"]
     if any((a != b).any() for a, b in zip(header["dataWindow"], header["displayWindow"], strict=True)):
         raise refuse(expected="a data window that is the display window", got=f"{low} to {high}")
@@ -65,6 +67,22 @@ def read_exr(file: Path, refuse: Refuse) -> "np.ndarray":
         InputError: they cannot be decoded, or are no half or float numbers.
     """
     import numpy as np
+
+    planes = _planes(file, refuse, _COLOURS)
+    return np.stack(planes if len(planes) == 3 else planes * 3, -1)
+
+
+def read_exr_depth(file: Path, refuse: Refuse) -> "np.ndarray":
+    """Return a depth map as (H, W) float32. Check its size first.
+
+    Raises:
+        InputError: as `read_exr`.
+    """
+    return _planes(file, refuse, _DEPTHS)[0]
+
+
+def _planes(file: Path, refuse: Refuse, sets: tuple[tuple[str, ...], ...]) -> "list[np.ndarray]":
+    import numpy as np
     import OpenEXR
 
     try:
@@ -72,18 +90,18 @@ def read_exr(file: Path, refuse: Refuse) -> "np.ndarray":
             if not image.parts:  # the library prints why
                 raise refuse(expected="a whole, undamaged image", got="pixels that cannot be decoded")
             channels = image.channels()
-            planes = [np.asarray(channels[name].pixels) for name in _colours(channels)]
+            planes = [np.asarray(channels[name].pixels) for name in _read_channels(channels, sets)]
     except InputError:
         raise
     except Exception as error:  # the library raises its own kinds
         raise refuse(expected="a whole, undamaged image", got=str(error)) from None
     if any(plane.dtype not in (np.float16, np.float32) for plane in planes):
         raise refuse(expected="half or float", got=", ".join(str(plane.dtype) for plane in planes))
-    return np.stack(planes if len(planes) == 3 else planes * 3, -1).astype(np.float32)
+    return [plane.astype(np.float32) for plane in planes]
 
 
-def _colours(names: Any) -> tuple[str, ...]:
-    return ("R", "G", "B") if {"R", "G", "B"} <= set(names) else ("Y",)
+def _read_channels(names: Any, sets: tuple[tuple[str, ...], ...]) -> tuple[str, ...]:
+    return next((wanted for wanted in sets if set(wanted) <= set(names)), ())
 
 
 def _header(file: Path, refuse: Refuse) -> dict[str, Any]:

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+import OpenEXR
 import pytest
 
 from registration.capture import native, pixels
@@ -51,6 +52,9 @@ def write_depths(root: Path, kind: str) -> None:
             np.save(f"{stem}.npy", np.where(depth > 0, depth, np.nan))
         elif kind == "tif":
             cv2.imwrite(f"{stem}.tif", depth * 1000)
+        elif kind in ("Z", "Y"):
+            header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+            OpenEXR.File(header, {kind: np.where(depth > 0, depth, np.inf)}).write(f"{stem}.exr")
         else:
             write_colmap(Path(f"{stem}.png.{kind}.bin"), depth[..., None])
     unit = {"tif": "mm"}.get(kind)
@@ -63,7 +67,7 @@ def write_depths(root: Path, kind: str) -> None:
             file.write(f'\n[depth]\nunit = "{unit}"\n')
 
 
-@pytest.mark.parametrize("kind", ["npy", "tif", "geometric", "photometric"])
+@pytest.mark.parametrize("kind", ["npy", "tif", "Z", "Y", "geometric", "photometric"])
 @pytest.mark.parametrize("distortion", [(), small.DISTORTIONS["OPENCV"]])
 def test_normals_from_depths_are_those_of_the_surface(tmp_path: Path, kind: str, distortion: tuple[float, ...]) -> None:
     root = small.make(tmp_path / "capture", drop=("normals",), distortion=distortion)
@@ -138,6 +142,7 @@ def test_normal_maps_of_colmap_are_normal_maps(tmp_path: Path) -> None:
         ("cam0.npy", b"\x93NUMPY\x01\x00", "ValueError"),
         ("cam0.npy", b"no array", "ValueError"),
         ("cam0.tif", b"II*\0", "a file that starts with"),
+        ("cam0.exr", b"v/1\x01", ""),
     ],
 )
 def test_damaged_depth_maps_are_refused(tmp_path: Path, name: str, content: bytes, got: str) -> None:
