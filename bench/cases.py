@@ -211,7 +211,7 @@ def main() -> int:
     options = parser.parse_intermixed_args()
     folder = options.keep or Path(tempfile.mkdtemp(prefix="cases-"))
     folder.mkdir(parents=True, exist_ok=True)
-    found = sorted(path.parent for path in options.cases.glob("*/make.py"))
+    found = sorted(path.parent for path in options.cases.resolve().glob("*/make.py"))
     cases = [case for case in found if not options.names or case.name in options.names]
     if missing := set(options.names) - {case.name for case in cases}:
         parser.error(f"no such case: {', '.join(sorted(missing))}")

@@ -34,7 +34,8 @@ from registration.pipeline import register
 from registration.types import Camera, View
 
 _AS_STORED = cv2.IMREAD_UNCHANGED | cv2.IMREAD_IGNORE_ORIENTATION
-_EXACT, _NEAR_M, _NEAR_PX, _NEAR_NORMAL = 1e-9, 1e-6, 1e-6, 2e-4  # of numbers; of rounded ones
+_EXACT, _NEAR_M, _NEAR_PX = 1e-9, 1e-6, 1e-6  # of numbers; of rounded ones
+_NEAR_NORMAL = 2e-3  # stored normals of a length above 1 clip when they are encoded in other axes
 
 
 def examine(case: Spoiled, source: Path, folder: Path) -> tuple[str, list[str]]:

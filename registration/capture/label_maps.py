@@ -199,7 +199,8 @@ def _unnamed(
         where=path,
         expected=f"indices below {len(names)}: {', '.join(names)}" if named[: len(names)].all() else "named indices",
         got=f"index {highest} at {int(counts[highest])} pixels",
-        fix=f'the map looks like {" or ".join(t.name for t in fits)}: write table = "{fits[0].name}" in [segmentation]'
+        fix=f'the map looks like {" or ".join(t.name for t in fits)}: write table = "{fits[0].name}" in place of '
+        "[segmentation] classes of capture.toml"
         if fits
         else fix,
     )

@@ -154,6 +154,8 @@ class Examination:
         self._warn("normals-axes", lines)
         self._attempt("labels", contradictions.check_labels, self.capture, self.samples)
         self._attempt("face", view_checks.check_face, self.capture, self.samples)
+        if self.findings and self.findings[-1].kind == "face-unseen":
+            self._left_out.add("landmarks")  # none counts because of that
         self.findings += view_checks.lens_warnings(self.capture)
         self.findings += view_checks.exposure_warnings(self.capture, self.samples)
         unseen = view_checks.unseen_warnings(self.capture, self._centre())

@@ -74,7 +74,7 @@ def draw_rig(diagnosis: Diagnosis, path: Path) -> None:
 def _heading(pen: ImageDraw.ImageDraw, diagnosis: Diagnosis, capture: Capture | None) -> None:
     errors, warnings = len(diagnosis.errors), len(diagnosis.findings) - len(diagnosis.errors)
     counts = [f"{n} {word}{'' if n == 1 else 's'}" for n, word in ((errors, "error"), (warnings, "warning")) if n]
-    verdict = " and ".join(counts) or "nothing is wrong"
+    verdict = " and ".join(counts) or "no fault found"
     title = (
         diagnosis.root.name
         if capture is None
@@ -104,7 +104,7 @@ def _words(diagnosis: Diagnosis) -> list[tuple[str, _Colour]]:
         lines += [(line, _BAD if error else _INK) for line in wrapped]
     if len(lines) > _MAX_LINES:
         lines = [*lines[: _MAX_LINES - 1], ("... and more: gnmreg capture check lists all", _FAINT)]
-    return lines or [("All checks passed.", _GOOD)]
+    return lines or [("No fault found.", _GOOD)]
 
 
 def _scene(capture: Capture, diagnosis: Diagnosis) -> _Scene | None:

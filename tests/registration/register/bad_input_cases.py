@@ -116,7 +116,7 @@ def image_truncated(request: Request) -> None:
     path.write_bytes(path.read_bytes()[:-3000])
 
 
-@bad("The camera model is not supported", where="image cam4.png", got="THIN_PRISM_FISHEYE", fix="image_undistorter")
+@bad("The camera model is not supported", where="image cam4.png", got="THIN_PRISM_FISHEYE", fix="gnmreg capture import")
 def camera_model_unsupported(request: Request) -> None:
     edit_line(
         request.capture / "sparse" / "cameras.txt",

@@ -52,7 +52,7 @@ def test_the_options_are_those_of_the_help(
     ("typed", "words"),
     [
         ("gnmreg st", "stabilize status store"),
-        ("gnmreg capture ", "check synth degrade"),
+        ("gnmreg capture ", "import check synth degrade"),
         ("gnmreg stabilize r", "review"),
         ("gnmreg status --wa", "--watch"),
         ("gnmreg stabilize review --po", "--port"),

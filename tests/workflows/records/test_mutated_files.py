@@ -13,7 +13,9 @@ from typing import Any
 
 import cv2
 import numpy as np
+import OpenEXR
 import pytest
+import trimesh
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
@@ -32,6 +34,7 @@ from tests.fixtures.malformed.sandbox import make_templates
 from tests.workflows.records.plan import PLAN
 from workflows.records.coregistration import CoregistrationPlan, CoregistrationState, initial_state
 from workflows.records.dataset import DatasetRecord
+from workflows.records.dataset_import import DatasetImportRecord, ImportRow
 from workflows.records.decisions import read_decisions
 from workflows.records.held_out import read_held_out
 from workflows.records.store import Store
@@ -53,6 +56,9 @@ def valid(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = make_templates(tmp_path_factory.mktemp("mutated") / "valid")
     initial_state(PLAN).write(folder / "coregistration.json")
     PLAN.write(folder / "plan.json")
+    recording = ImportRow(folder="ann/smile", source="017/EXP-1", format="nersemble", frame=3, status="imported")
+    origin = DatasetImportRecord(source=Path("/data"), frames=(3,), neutral="EXP-1", unit=None, rows=(recording,))
+    origin.write(folder / "import.json")
     row = {"dataset": "d" * 64, "region": "mouth", "component": 0, "action": "drop", "reason": ""}
     (folder / "decisions.jsonl").write_text(f"{json.dumps(row)}\n" * 2)
     picture = np.random.default_rng(0).integers(0, 255, (SIZE[1], SIZE[0], 3), np.uint8)
@@ -61,12 +67,17 @@ def valid(tmp_path_factory: pytest.TempPathFactory) -> Path:
     depths = np.full((SIZE[1], SIZE[0]), 0.5, np.float32)
     (folder / "cam1.geometric.bin").write_bytes(f"{SIZE[0]}&{SIZE[1]}&1&".encode("ascii") + depths.tobytes())
     np.save(folder / "cam1.npy", depths)
+    header_exr = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+    OpenEXR.File(header_exr, {"Z": depths}).write(str(folder / "cam1.exr"))
     rng = np.random.default_rng(1)
     rows = "".join(f"{x:.4f} {y:.4f} {z:.4f}\n" for x, y, z in rng.normal(size=(20, 3)))
     header = "ply\nformat ascii 1.0\nelement vertex 20\nproperty float x\nproperty float y\nproperty float z\n"
     faces = "element face 2\nproperty list uchar int vertex_indices\nend_header\n"
     gnmw.write(gnmw.web_model(gnm_npz.read(folder / "tiny_gnm.npz")), folder / "tiny_gnm.gnmw")
     (folder / "text.ply").write_text(header + faces + rows + "3 0 1 2\n4 3 4 5 6\n")
+    ball = trimesh.creation.icosphere(subdivisions=1)
+    for suffix in ("obj", "glb"):
+        ball.export(folder / f"ball.{suffix}")
     return folder
 
 
@@ -96,12 +107,15 @@ READERS: dict[str, tuple[str, Reader]] = {  # name -> the file that is mutated, 
     "labels": ("capture/segmentation/cam1.png", lambda file: pixels.read_labels(file, _camera(), CLASSES)),
     "dense depths": ("cam1.geometric.bin", lambda file: pixels.read_depth(_view(file))),
     "depths": ("cam1.npy", lambda file: pixels.read_depth(_view(file))),
+    "EXR depths": ("cam1.exr", lambda file: pixels.read_depth(_view(file))),
     **{
         suffix: (f"picture.{suffix}", lambda file: pixels.read_image(file, _camera()))
         for suffix in ("jpg", "tif", "bmp", "webp")
     },
     "scan": ("capture/scan.ply", read_scan),
     "text scan": ("text.ply", read_scan),
+    "OBJ scan": ("ball.obj", read_scan),
+    "GLB scan": ("ball.glb", read_scan),
     "truth": ("capture/ground_truth.npz", read_truth),
     "model": ("tiny_gnm.npz", gnm_npz.read),
     "model for the web": ("tiny_gnm.gnmw", gnmw.read),
@@ -112,6 +126,7 @@ READERS: dict[str, tuple[str, Reader]] = {  # name -> the file that is mutated, 
     "texture": ("registration/texture.png", lambda file: load_registration(file.parent)),
     "subject": ("run/ann/subject.json", SubjectRecord.read),
     "dataset": ("dataset/dataset.json", DatasetRecord.read),
+    "dataset import": ("import.json", DatasetImportRecord.read),
     "decisions": ("decisions.jsonl", lambda file: read_decisions(file, "d" * 64)),
     "plan": ("plan.json", CoregistrationPlan.read),
     "state": ("coregistration.json", CoregistrationState.read),
@@ -236,7 +251,14 @@ def test_the_readers_include_all_records():
     """A new record must be mutated here too."""
     from registration.storage.records import Record
 
-    known = {"RegistrationManifest", "SubjectRecord", "DatasetRecord", "DecisionEntry", "Artifact"}
+    known = {
+        "RegistrationManifest",
+        "SubjectRecord",
+        "DatasetRecord",
+        "DecisionEntry",
+        "Artifact",
+        "DatasetImportRecord",
+    }
     known |= {"CoregistrationPlan", "CoregistrationState"}
     stored = {cls.__name__ for cls in Record.__subclasses__() if cls.__module__.startswith("workflows.records")}
     assert stored - known <= {"StepResult", "StabilizeResult"}  # of steps, written and read in one run
