@@ -54,7 +54,8 @@ def read_settings(path: Path, inside: Callable[[Path], Path] = Path, *, any_unit
         return InputError(what, where=path, expected=expected, got=got, fix=fix)
 
     if not os.path.lexists(path):
-        raise refuse("capture.toml is missing", "subject, expression and units", "no such file")
+        fix = "convert the files of another program with gnmreg capture import; or write it as docs/formats.md says"
+        raise refuse("capture.toml is missing", "subject, expression and units", "no such file", fix)
     unreadable = partial(refuse, "capture.toml cannot be read")
     settings = parse_toml(read_bytes(path, unreadable), unreadable)
     for key in ("subject", "expression"):
