@@ -35,7 +35,7 @@ from registration.types import Camera, View
 
 _AS_STORED = cv2.IMREAD_UNCHANGED | cv2.IMREAD_IGNORE_ORIENTATION
 _EXACT, _NEAR_M, _NEAR_PX = 1e-9, 1e-6, 1e-6  # of numbers; of rounded ones
-_NEAR_NORMAL = 2e-3  # stored normals of a length above 1 clip when they are encoded in other axes
+_NEAR_NORMAL = 4e-4  # of unit vectors; stored lengths above 1 clip when they are encoded in other axes
 
 
 def examine(case: Spoiled, source: Path, folder: Path) -> tuple[str, list[str]]:
@@ -101,9 +101,7 @@ def _unlike_view(a: View, b: View) -> list[str]:
         if (one is None) != (other is None):
             wrong.append(f"{field}: one more or less")
         elif one is not None and field == "normals":
-            x, y = (
-                pixels.in_camera(pixels.decode_normals(pixels.read_normals(v.normals, v.camera)), v) for v in (a, b)
-            )
+            x, y = (_unit_normals(view) for view in (a, b))
             wrong += [] if np.abs(x - y).max() < _NEAR_NORMAL else ["normals differ"]
         elif one is not None:
             x, y = (
@@ -111,6 +109,12 @@ def _unlike_view(a: View, b: View) -> list[str]:
             )
             wrong += [] if x.shape == y.shape and (x == y).all() else [f"{field} differs"]
     return wrong
+
+
+def _unit_normals(view: View) -> np.ndarray:
+    """The normal map of a view in its camera's frame; 0 where there is none."""
+    normals = pixels.in_camera(pixels.decode_normals(pixels.read_normals(view.normals, view.camera)), view)
+    return normals / np.maximum(np.linalg.norm(normals, axis=-1, keepdims=True), 0.5)
 
 
 def _cameras_apart(a: Camera, b: Camera) -> float:

@@ -98,7 +98,8 @@ class FitContext:
         if self.scan is None:
             return None
         finest = self.pyramid[0]
-        shown = finest.pixels.image((finest.rgb_weight > 0).float()[:, None])[..., 0].numpy() > 0  # no hair or clothes
+        compared = (finest.rgb_weight > 0) | (finest.normal_weight > 0)  # no hair or clothes; a bare scan has no colours
+        shown = finest.pixels.image(compared.float()[:, None])[..., 0].numpy() > 0
         rows = np.flatnonzero(head_skin(self.data))
         return ScanDistance(self.scan, rows, self.data.triangles, finest.pixels.cameras, list(shown))
 
