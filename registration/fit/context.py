@@ -98,7 +98,7 @@ class FitContext:
         if self.scan is None:
             return None
         finest = self.pyramid[0]
-        compared = (finest.rgb_weight > 0) | (finest.normal_weight > 0)  # no hair or clothes; a bare scan has no colours
+        compared = (finest.rgb_weight > 0) | (finest.normal_weight > 0)  # no hair; bare scans have no colours
         shown = finest.pixels.image(compared.float()[:, None])[..., 0].numpy() > 0
         rows = np.flatnonzero(head_skin(self.data))
         return ScanDistance(self.scan, rows, self.data.triangles, finest.pixels.cameras, list(shown))

@@ -26,6 +26,7 @@ def test_a_scan_in_millimetres_lying_on_its_side_is_registered(tmp_path: Path) -
     result = load_registration(out)
     assert result.figures["subject"] == "head" and result.figures["scan_hygiene"]["unit"] == "mm"
     assert result.figures["scan_to_mesh"]["face"]["mean_mm"] < 0.35
+    assert result.figures["scan_in_fit"]["surface"] > 0.3  # of the skin; a bare scan has no colours that show it
     assert any("is like the model's" in n for n in result.figures["notes"])
     assert np.ptp(result.vertices, axis=0).argmax() == 0  # it lies on its side, as the scan does
     assert "is like the model&#39;s" in (out / "report.html").read_text("utf-8")
