@@ -34,32 +34,40 @@ def check(
 
     Args:
         capture: The capture folder.
-        out: Contact sheet to draw: every image with the scan and the landmarks projected into it.
+        out: Contact sheet to draw (with --fix of the copy): every image, with scan and landmarks projected into it.
         fix: Folder for a mended copy: what has one mend is mended, doctor.txt says what was done and what is left.
         explain: Picture to draw of the rig: cameras, head and scan from three sides, with what is wrong in words.
     """
+    from registration.capture.native_writer import check_new
     from registration.doctor import mending, report
     from registration.doctor.diagnosis import diagnose
     from registration.doctor.rig_picture import draw_rig
     from registration.storage.files import check_output_file
 
+    for picture in (out, explain):
+        if picture is not None:
+            check_output_file(picture)
     if fix is not None:
-        mended = mending.mend_capture(capture, fix)
-        print(mended)
-        return 0 if mended.usable else 2
-    if explain is not None:
-        check_output_file(explain)
+        check_new(fix)
     diagnosis = diagnose(capture)
     if explain is not None:
         draw_rig(diagnosis, explain)
-    if diagnosis.errors:
+    if fix is not None:
+        mended = mending.mend_capture(capture, fix)
+        print(mended)
+        usable = mended.usable
+        if usable and out is not None:
+            report.check_capture(mended.out or capture, sheet=out)
+    elif usable := not diagnosis.errors:
+        print(report.report_capture(diagnosis, sheet=out))
+    else:
         print(diagnosis, file=sys.stderr)
         for finding in diagnosis.findings:
             if finding.severity == "warning":
                 print(f"warning: {finding.line}")
-        return 2
-    print(report.report_capture(diagnosis, sheet=out))
-    return 0
+    if out is not None and not usable:
+        print(f"{out} was not drawn: the contact sheet shows captures without errors", file=sys.stderr)
+    return 0 if usable else 2
 
 
 def synth(

@@ -3,6 +3,7 @@
 from pathlib import Path
 from types import SimpleNamespace
 
+import cv2
 import pytest
 
 import workflows.steps.subject
@@ -130,6 +131,19 @@ def test_capture_check_prints_and_draws(tmp_path: Path, capsys: pytest.CaptureFi
     text = capsys.readouterr().out
     assert "5 views, all checks passed" in text and str(sheet) in text
     assert sheet.read_bytes().startswith(b"\x89PNG")
+
+
+def test_capture_check_mends_and_draws_at_once(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    capture, mended = make(tmp_path / "capture"), tmp_path / "mended"
+    for mask in (capture / "masks").iterdir():
+        cv2.imwrite(str(mask), 255 - cv2.imread(str(mask), cv2.IMREAD_UNCHANGED))
+    rig, sheet = tmp_path / "rig.png", tmp_path / "sheet.png"
+    words = ["capture", "check", str(capture), "--explain", str(rig), "--out", str(sheet)]
+    assert main(words) == 2 and rig.is_file() and not sheet.exists()
+    assert "sheet.png was not drawn" in capsys.readouterr().err
+    rig.unlink()
+    assert main([*words, "--fix", str(mended)]) == 0
+    assert rig.is_file() and sheet.is_file() and (mended / "doctor.txt").is_file()
 
 
 def test_capture_degrade_applies_the_faults(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
