@@ -44,19 +44,20 @@ class MendedCapture:
         return "\n\n".join([*lines, *left])
 
 
-def mend_capture(source: Path, out: Path) -> MendedCapture:
+def mend_capture(source: Path, out: Path, diagnosis: Diagnosis | None = None) -> MendedCapture:
     """Write a copy of a capture with all mends that are certain, and the record `doctor.txt`; it is checked again.
 
     Args:
         source: the capture folder; it is not changed.
         out: the copy, which appears in one rename; it must not exist. Without any mend nothing is written.
+        diagnosis: of the source; None: it is made here.
 
     Raises:
         InputError: `out` exists, or the source is no folder.
     """
     source, out = Path(source), Path(out)
     check_new(out)
-    diagnosis = diagnose(source)
+    diagnosis = diagnosis or diagnose(source)
     if not diagnosis.mendable:
         return MendedCapture(source=source, out=None, done=(), left=diagnosis)
     done: list[Finding] = []

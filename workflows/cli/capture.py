@@ -53,7 +53,7 @@ def check(
     if explain is not None:
         draw_rig(diagnosis, explain)
     if fix is not None:
-        mended = mending.mend_capture(capture, fix)
+        mended = mending.mend_capture(capture, fix, diagnosis)
         print(mended)
         usable = mended.usable
         if usable and out is not None:
