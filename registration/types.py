@@ -78,8 +78,11 @@ class View:
     normals_frame: NormalsFrame = "camera_opencv"  # axes of the stored normals
     depth: Path | None = None
     depth_unit_m: float | None = None  # of the stored depths; None: metres, of floating-point numbers only
+    confidence: Path | None = None  # of normals and depths, 8 bit; None: all count fully
     segmentation: Path | None = None
     landmarks: Mapping[str, Float[np.ndarray, "L 3"]] = field(default_factory=dict)  # scheme -> x_px y_px confidence
+    # Scheme -> standard deviation of each landmark's position along each axis, px; not all schemes have it.
+    landmark_spread_px: Mapping[str, Float[np.ndarray, "L"]] = field(default_factory=dict)
     colour: Colour = Colour()
 
     @property
@@ -205,6 +208,7 @@ class Targets:
     classes: Float[Tensor, "P K"]
     class_weight: Float[Tensor, "P"]
     landmarks: Mapping[str, Float[Tensor, "N L 3"]]  # scheme -> x_px y_px confidence
+    landmark_spread_px: Mapping[str, Float[Tensor, "N L"]] = field(default_factory=dict)  # of their positions
     px_per_head: float  # the subject's height in pixels, median over views
 
     def select(self, views: Sequence[int], device: torch.device) -> "Targets":

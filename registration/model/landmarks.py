@@ -28,6 +28,7 @@ class LandmarkScheme:
     name: str  # "68" for head_sparse_68.txt
     indices: Int[np.ndarray, "L 3"]
     weights: Float[np.ndarray, "L 3"]  # rows sum to 1
+    spread_m: Float[np.ndarray, "L"] | None = None  # standard deviation of a detector's point around it; None: unknown
     reversed_in_file: bool = field(default=False, metadata={"not_hashed": "the points are in the corrected order"})
 
     @overload

@@ -219,6 +219,7 @@ def _targets(crops: list[_ViewCrop], mapping: ClassMap) -> Targets:
         mask=listed([crop.mask for crop in crops]),
         classes=listed([crop.classes for crop in crops]),
         landmarks={scheme: _stack_landmarks(crops, scheme) for scheme in schemes},
+        landmark_spread_px={},
         px_per_head=float(np.median([crop.head_px for crop in crops])),
         **{name: listed([w[name] for w in weighted]) for name in weighted[0]},
     )

@@ -1,0 +1,1 @@
+"""Cameras from photographs alone: poses and focal lengths, metric by the head model."""

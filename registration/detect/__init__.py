@@ -1,0 +1,1 @@
+"""Landmarks detected in photographs: providers, views, and agreement across views."""

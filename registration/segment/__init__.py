@@ -1,0 +1,1 @@
+"""Masks and labels without a face parser: from landmarks, depths, the fitted model and the image itself."""
