@@ -4,7 +4,6 @@ import shlex
 import time
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -18,16 +17,11 @@ from registration.evaluate.evaluation import RegistrationEvaluation, evaluate_re
 from registration.evaluate.verdict import judge
 from registration.evaluate.viewpoint import intersection_figures
 from registration.fit.context import FitContext
-from registration.fit.initialization import (
-    MIN_LANDMARKS,
-    MIN_OVERLAP,
-    from_landmarks,
-    from_masks,
-    select_spread_views,
-)
-from registration.fit.problem import FitProblem, FitTrace, assess, refine
+from registration.fit.initialization import select_spread_views
+from registration.fit.problem import FitProblem, FitTrace
 from registration.fit.recipes import Stage
-from registration.fit.variables import InitialGuess, initial_guess_from, pivot
+from registration.fit.start import initial_guess
+from registration.fit.variables import InitialGuess
 from registration.fit.view_weights import ViewErrors
 from registration.geometry.nearest_planes import CloudPlanes, MeshPlanes, NearestPlanes
 from registration.geometry.surface_views import SurfaceViews
@@ -52,7 +46,7 @@ from registration.storage.registration_folder import (
 )
 from registration.targets.classes import class_map
 from registration.targets.pyramid import build_pyramid
-from registration.types import Camera, Parameters, Registration, Status
+from registration.types import Camera, HeadPose, Registration, Status
 
 CONVERGED_MM = 0.05  # 95th percentile of vertex motion over the last tenth of the last stage
 MAX_LANDMARK_PX = 3.0  # median residual at 512 px of head height
@@ -139,7 +133,10 @@ def _fit(
     start_time = time.perf_counter()
     context = _context(inputs, seed, device, progress)
     targets_time = time.perf_counter()
-    initial = _initial_guess(inputs, context, progress)
+    unknown = {name for view in inputs.capture.views for name in view.landmarks} - set(inputs.schemes)
+    if unknown:
+        progress.message(f"landmark schemes that the model does not have, ignored: {', '.join(sorted(unknown))}")
+    initial = initial_guess(context, _head_pose(inputs))
     for note in (*inputs.notes, *initial.notes):
         progress.message(note)
     problem = FitProblem(context, initial)
@@ -182,10 +179,18 @@ def _context(inputs: RegistrationInputs, seed: int, device: torch.device, progre
         corner_uvs=texture_atlas(inputs.data),
         recipe=recipe,
         seed=seed,
-        neutral=inputs.neutral,
+        neutral=None
+        if inputs.neutral is None
+        else replace(inputs.neutral, translation=inputs.neutral.translation - inputs.origin),
         triangulated={name: points - inputs.origin for name, points in inputs.landmarks.items()},
         scan=planes,
     )
+
+
+def _head_pose(inputs: RegistrationInputs) -> HeadPose | None:
+    """The pose that the capture brings, in the world around the origin."""
+    head = inputs.capture.head
+    return None if head is None else replace(head, translation=head.translation - inputs.origin)
 
 
 def _scan(inputs: RegistrationInputs, cameras: Sequence[Camera]) -> tuple[SurfaceViews | None, NearestPlanes | None]:
@@ -228,37 +233,6 @@ class _Snapshots:
         label = f"{len(self._states) - 1:02d}_{self._states[-1]}"
         write_stage(self._folder, label, views, vertices, self._problem.context.data.triangles)
         self._states.append(name)
-
-
-def _initial_guess(inputs: RegistrationInputs, context: FitContext, progress: Progress) -> InitialGuess:
-    """From landmarks if model and capture share a scheme, else from the neutral's pose, a given one, or the masks."""
-    neutral = None
-    if inputs.neutral is not None:
-        parameters = _parameters(inputs.neutral, inputs.origin)
-        neutral = initial_guess_from(parameters, inputs.neutral.offsets, context.model, inputs.data)
-    unknown = {name for view in inputs.capture.views for name in view.landmarks} - set(inputs.schemes)
-    if unknown:
-        progress.message(f"landmark schemes that the model does not have, ignored: {', '.join(sorted(unknown))}")
-    counts = {name: int(np.isfinite(points).all(1).sum()) for name, points in inputs.landmarks.items()}
-    best = max(counts, key=lambda name: counts[name], default=None)
-    if best is not None and counts[best] >= MIN_LANDMARKS:
-        scheme, points, free_scale = inputs.schemes[best], inputs.landmarks[best] - inputs.origin, inputs.recipe.scale
-        return from_landmarks(inputs.data, scheme, points, free_scale=free_scale, neutral=neutral)
-    if neutral is not None and assess(context, neutral).overlap >= MIN_OVERLAP:
-        return replace(neutral, notes=("no landmarks: starting from the neutral's pose",))
-    if (head := inputs.capture.head) is not None:
-        position = head.scale * head.rotation @ pivot(inputs.data) + head.translation - inputs.origin
-        note = "no landmarks: starting from the head's pose in capture.toml"
-        return InitialGuess(rotation=head.rotation, position=position, scale=head.scale, notes=(note,))
-    progress.message("no landmarks of a scheme that the model has: estimating the head's pose from the masks")
-    return from_masks(inputs.data, context.pyramid[-1], partial(assess, context), partial(refine, context))
-
-
-def _parameters(registration: Registration, origin: Float[np.ndarray, "3"]) -> Parameters:
-    """A registration's parameters in the world around `origin`."""
-    names = ("identity", "expression", "rotations", "scale")
-    values = {name: torch.as_tensor(np.asarray(getattr(registration, name))) for name in names}
-    return Parameters(**values, translation=torch.as_tensor(np.asarray(registration.translation - origin, np.float32)))
 
 
 def _in_world(points: Float[np.ndarray, "*P 3"], origin: Float[np.ndarray, "3"]) -> Float[np.ndarray, "*P 3"]:

@@ -1,0 +1,53 @@
+"""Where a fit starts: from landmarks, the neutral, a given pose, or the masks."""
+
+from dataclasses import replace
+from functools import partial
+
+import numpy as np
+import torch
+
+from registration.fit.context import FitContext
+from registration.fit.initialization import MIN_LANDMARKS, MIN_OVERLAP, from_landmarks, from_masks
+from registration.fit.problem import assess, refine
+from registration.fit.variables import InitialGuess, initial_guess_from, pivot
+from registration.types import HeadPose, Parameters, Registration
+
+
+def initial_guess(context: FitContext, head: HeadPose | None = None) -> InitialGuess:
+    """Return the initial guess of a fit.
+
+    From landmarks, if model and capture share a scheme; else from the neutral's pose, if it covers the masks; else the
+    given pose; else the best of many head poses at the masks' common centre.
+
+    Args:
+        context: its triangulated landmarks, neutral and masks are used.
+        head: the pose that the capture brings, if any; in the world of the context.
+
+    Returns:
+        The guess; its notes say how it was estimated.
+
+    Raises:
+        InputError: no head pose covers the masks.
+    """
+    neutral = None
+    if context.neutral is not None:
+        parameters = _parameters(context.neutral)
+        neutral = initial_guess_from(parameters, context.neutral.offsets, context.model, context.data)
+    counts = {name: int(np.isfinite(points).all(1).sum()) for name, points in context.triangulated.items()}
+    best = max(counts, key=lambda name: counts[name], default=None)
+    if best is not None and counts[best] >= MIN_LANDMARKS:
+        scheme, points, free_scale = context.schemes[best], context.triangulated[best], context.recipe.scale
+        return from_landmarks(context.data, scheme, points, free_scale=free_scale, neutral=neutral)
+    if neutral is not None and assess(context, neutral).overlap >= MIN_OVERLAP:
+        return replace(neutral, notes=("no landmarks: starting from the neutral's pose",))
+    if head is not None:
+        position = head.scale * head.rotation @ pivot(context.data) + head.translation
+        note = "no landmarks: starting from the head's pose in capture.toml"
+        return InitialGuess(rotation=head.rotation, position=position, scale=head.scale, notes=(note,))
+    return from_masks(context.data, context.pyramid[-1], partial(assess, context), partial(refine, context))
+
+
+def _parameters(registration: Registration) -> Parameters:
+    names = ("identity", "expression", "rotations", "scale", "translation")
+    values = {name: torch.as_tensor(np.asarray(getattr(registration, name), np.float32)) for name in names}
+    return Parameters(**values)
