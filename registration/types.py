@@ -141,6 +141,8 @@ class ViewPixels:
     normals: Float[np.ndarray, "H W 3"] | None  # unit, camera frame; 0 where there is none
     label_coverage: Float[np.ndarray, "H W K"] | None  # coverage by each of Capture.classes; sums to 1 where valid
     valid: Float[np.ndarray, "H W"]  # fraction of the pixel that undistortion has a source for
+    depth: Float[np.ndarray, "H W"] | None = None  # along the optical axis, metres; 0 where there is none
+    confidence: Float[np.ndarray, "H W"] | None = None  # of normals and depth, in [0, 1]
 
 
 _BLOCK = 4  # pixels, width and height of the blocks that order a list

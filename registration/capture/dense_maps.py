@@ -23,6 +23,8 @@ _COLMAP_HEADER = re.compile(rb"(\d{1,6})&(\d{1,6})&(\d{1,2})&")
 _SAME_ASPECT = 0.01
 _STEP_M, _STEP_PX = 3e-3, 8.0  # range of depths around a pixel, beyond which it lies between two surfaces
 _SMOOTHING_PX = 1.0  # standard deviation, of depths before they are differentiated
+_MIN_SHARE = 0.74  # of a block's pixels with a depth: three of four
+_MAX_SPREAD = 0.01  # of a block's depths, of their mean: 5 mm at half a metre
 _LEAST_COSINE = 0.25  # of incidence, 75 degrees: depths change too fast beyond
 
 
@@ -124,6 +126,21 @@ def _read_npy(path: Path, refuse: Refuse) -> np.ndarray:
         stream.seek(0)
         array: np.ndarray = np.lib.format.read_array(stream, allow_pickle=False)
         return array
+
+
+def block_depth(
+    share: Float[np.ndarray, "h w"], total: Float[np.ndarray, "h w"], squares: Float[np.ndarray, "h w"]
+) -> Float[np.ndarray, "h w"]:
+    """Return the mean depth of blocks of pixels; 0 where few have one, or where they are of two surfaces.
+
+    Args:
+        share: of a block's pixels, those that have a depth.
+        total: mean over all of a block's pixels of their depths, 0 for those without.
+        squares: the same of the squared depths.
+    """
+    mean, square = total / np.maximum(share, 1e-3), squares / np.maximum(share, 1e-3)
+    spread = np.sqrt(np.maximum(square - mean**2, 0))
+    return np.where((share > _MIN_SHARE) & (spread < _MAX_SPREAD * mean), mean, 0)
 
 
 def depth_normals(depth: Float[np.ndarray, "h w"], rays: Float[np.ndarray, "h w 3"]) -> Float[np.ndarray, "h w 3"]:

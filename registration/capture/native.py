@@ -107,6 +107,7 @@ def _read_view(root: Path, file_name: str, camera: Camera, settings: CaptureSett
         normals_frame=settings.normals_frame,
         depth=_channel(root, "depth", relative, *DEPTH_SUFFIXES),
         depth_unit_m=settings.depth_unit_m,
+        confidence=_channel(root, "confidence", relative, ".png"),
         segmentation=_channel(root, "segmentation", relative, ".png"),
         landmarks={} if landmarks is None else read_landmarks(landmarks),
         colour=colour,

@@ -15,6 +15,7 @@ from registration.capture.colour_settings import colours_to_toml
 from registration.capture.scan import Scan
 from registration.errors import InputError
 from registration.frames import linear_to_srgb
+from registration.storage.exr_files import write_exr_depth
 from registration.storage.files import atomic_directory
 from registration.storage.mesh import write_ply
 from registration.types import Camera, Colour, HeadPose
@@ -29,6 +30,8 @@ class ViewArrays:
     rgb: Float[np.ndarray, "H W 3"] | UInt8[np.ndarray, "H W 3"] | UInt16[np.ndarray, "H W 3"]  # float is linear light
     mask: Float[np.ndarray, "H W"] | Bool[np.ndarray, "H W"] | None = None  # coverage of the subject in [0, 1]
     normals: Float[np.ndarray, "H W 3"] | None = None  # unit, camera frame; 0 where there is none
+    depth: Float[np.ndarray, "H W"] | None = None  # along the optical axis, metres; 0 where there is none
+    confidence: Float[np.ndarray, "H W"] | None = None  # of normals and depth, in [0, 1]
     labels: UInt8[np.ndarray, "H W"] | None = None  # index into the capture's classes
     landmarks: Mapping[str, Float[np.ndarray, "L 3"]] = field(default_factory=dict)  # scheme -> x_px y_px confidence
 
@@ -110,6 +113,11 @@ def _write_view(root: Path, view: ViewArrays, bits: int) -> None:
         encoded = _quantized((view.normals + 1) / 2, 16)
         encoded[~view.normals.any(-1)] = 0
         _write_png(root / "normals", view, encoded)
+    if view.depth is not None:
+        _check_size(root / "depth", view, view.depth)
+        write_exr_depth(_file(root / "depth", view, ".exr"), view.depth)
+    if view.confidence is not None:
+        _write_png(root / "confidence", view, _quantized(view.confidence.astype(np.float64), 8))
     if view.labels is not None:
         _write_png(root / "segmentation", view, view.labels)
     if view.landmarks:
@@ -126,11 +134,15 @@ def _quantized(values: np.ndarray, bits: int) -> np.ndarray:
 
 
 def _write_png(folder: Path, view: ViewArrays, pixels: np.ndarray) -> None:
-    if pixels.shape[:2] != (view.camera.height_px, view.camera.width_px):
-        raise ValueError(f"{folder.name} of {view.name}: {pixels.shape[:2]} is not the camera's (height, width)")
+    _check_size(folder, view, pixels)
     path = _file(folder, view, ".png")
     if not cv2.imwrite(str(path), pixels[..., ::-1] if pixels.ndim == 3 else pixels):
         raise OSError(f"{path} cannot be written")
+
+
+def _check_size(folder: Path, view: ViewArrays, pixels: np.ndarray) -> None:
+    if pixels.shape[:2] != (view.camera.height_px, view.camera.width_px):
+        raise ValueError(f"{folder.name} of {view.name}: {pixels.shape[:2]} is not the camera's (height, width)")
 
 
 def _file(folder: Path, view: ViewArrays, suffix: str) -> Path:

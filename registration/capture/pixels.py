@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from registration.capture.colour import require_encoding
-from registration.capture.dense_maps import depth_normals, is_colmap_map, read_colmap_map, read_depth
+from registration.capture.dense_maps import block_depth, depth_normals, is_colmap_map, read_colmap_map, read_depth
 from registration.capture.file_colour import conversion_of
 from registration.capture.headers import require_complete, require_size, undecodable
 from registration.capture.label_maps import read_labels
@@ -26,8 +26,6 @@ from registration.storage.exr_files import is_exr, read_exr
 from registration.storage.image_files import decode
 from registration.types import Camera, Capture, Colour, View, ViewPixels
 
-_MIN_SHARE = 0.75  # of a block's pixels with a depth
-_MAX_SPREAD = 0.01  # of a block's depths, of their mean: 5 mm at half a metre
 STRIP_PIXELS = 2**21  # converted to float at a time: 25 MB of float32 RGB
 _COLOUR = cv2.IMREAD_COLOR_RGB | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
 _SRGB = Colour()
@@ -38,7 +36,8 @@ def read_view(view: View, capture: Capture, *, downsample: int = 1) -> ViewPixel
     """Decode and undistort a view at 1/`downsample` of its size; K changes by that factor only.
 
     Args:
-        view: its image, mask, normals and labels are undistorted alike; normals stay in the camera's frame.
+        view: its files are undistorted alike; normals stay in the camera's frame, and are those of the depths where the
+            view has no others.
         capture: names the classes of the labels.
         downsample: whole factor; the remainder at the right and at the bottom is cut off.
 
@@ -60,16 +59,28 @@ def read_view(view: View, capture: Capture, *, downsample: int = 1) -> ViewPixel
     rgb = _resample(read_image(view.image, camera, view.colour), _to_linear, strips, valid)
     mask = None if view.mask is None else _resample(read_mask(view.mask, camera), _to_coverage, strips, valid)
     reduced = downsampled_camera(camera, downsample)
-    normals = None
+    depth = None if view.depth is None else _block_depth(read_depth(view), strips, valid)
+    normals = confidence = None
     if view.normals is not None:
         normals = _unit(in_camera(_resample(read_normals(view.normals, camera), decode_normals, strips, valid), view))
-    elif view.depth is not None:
-        normals = depth_normals(_block_depth(read_depth(view), strips, valid), _plane(reduced)).astype(np.float32)
+    elif depth is not None:
+        normals = depth_normals(depth, _plane(reduced)).astype(np.float32)
+    if view.confidence is not None:
+        confidence = _resample(read_confidence(view.confidence, camera), _to_coverage, strips, valid)
     coverage = None
     if view.segmentation is not None:
         labels = read_labels(view.segmentation, camera, capture.classes, capture.labels)
         coverage = _label_coverage(labels, strips, valid, len(capture.classes))
-    return ViewPixels(camera=reduced, rgb=rgb, mask=mask, normals=normals, label_coverage=coverage, valid=valid)
+    return ViewPixels(
+        camera=reduced,
+        rgb=rgb,
+        mask=mask,
+        normals=normals,
+        label_coverage=coverage,
+        valid=valid,
+        depth=depth,
+        confidence=confidence,
+    )
 
 
 def downsampled_camera(camera: Camera, downsample: int) -> Camera:
@@ -143,6 +154,20 @@ def read_normals(path: Path, camera: Camera) -> np.ndarray:
             expected="16 bit RGB PNG, n = 2 v / 65535 - 1",
             got=pixels.dtype,
             fix="write it with 16 bits per channel",
+        )
+    return pixels
+
+
+def read_confidence(path: Path, camera: Camera) -> UInt8[np.ndarray, "H W"]:
+    """Read a confidence map of normals and depths, 255 = 1, distorted. Raises InputError if it is none."""
+    pixels = _imread(path, "confidence map", camera, _AS_STORED)
+    if pixels.dtype != np.uint8 or pixels.ndim != 2:
+        raise InputError(
+            "The confidence map cannot be used",
+            where=path,
+            expected="one channel of 8 bits, 255 where normals and depths are certain",
+            got=f"{pixels.dtype}, shape {pixels.shape}",
+            fix="write it as a grey PNG of 8 bits",
         )
     return pixels
 
@@ -244,9 +269,7 @@ def _block_depth(
     """Mean depth of the pixels of each block that have one; 0 where few have, or where they are of two surfaces."""
     share = _resample(depth, lambda raw: (raw > 0).astype(np.float32), strips, valid)
     total, squares = _resample(depth, np.positive, strips, valid), _resample(depth, np.square, strips, valid)
-    mean, square = total / np.maximum(share, 1e-3), squares / np.maximum(share, 1e-3)
-    spread = np.sqrt(np.maximum(square - mean**2, 0))
-    return np.where((share > _MIN_SHARE) & (spread < _MAX_SPREAD * mean), mean, 0)
+    return block_depth(share, total, squares).astype(np.float32)
 
 
 def _plane(camera: Camera) -> Float[np.ndarray, "h w 3"]:

@@ -29,6 +29,7 @@ class ViewSample:
     mask: UInt8[np.ndarray, "h w"] | None  # 255: subject
     labels: UInt8[np.ndarray, "h w"] | None
     normals: Float[np.ndarray, "h w 3"] | None  # as encoded, camera frame, not of unit length; 0: none
+    depth: Float[np.ndarray, "h w"] | None  # metres; 0: none
     subject: Bool[np.ndarray, "h w"]  # by the mask, else by the labels, else everything
     coverage: float | None  # fraction of the stored image that the mask covers
     head_rows: int  # height of what shows the head, px of the stored image
@@ -59,7 +60,7 @@ def _sample(view: View, capture: Capture, decode_normals: bool) -> ViewSample:
     step = max(1, math.ceil(math.sqrt(camera.width_px * camera.height_px / _SAMPLES)))
     some = slice(step // 2, None, step)
     width, height = len(range(camera.width_px)[some]), len(range(camera.height_px)[some])
-    grey = mask = labels = normals = head = coverage = None
+    grey = mask = labels = normals = depth = head = coverage = None
     rays = _rays(camera, some)
     if view.mask is not None:
         full = pixels.read_mask(view.mask, camera)
@@ -81,9 +82,10 @@ def _sample(view: View, capture: Capture, decode_normals: bool) -> ViewSample:
         grey = _reduced_grey(pixels.read_image(view.image, camera, view.colour), width, height)
     if view.normals is not None and (_small(camera) or decode_normals):
         normals = pixels.in_camera(pixels.decode_normals(pixels.read_normals(view.normals, camera)[some, some]), view)
-    elif view.depth is not None and (_small(camera) or decode_normals):
+    if view.depth is not None and (_small(camera) or decode_normals):
         depth = pixels.read_depth(view)[some, some]
-        normals = pixels.depth_normals(depth, rays / rays[..., 2:])
+        if view.normals is None:
+            normals = pixels.depth_normals(depth, rays / rays[..., 2:])
     if mask is not None:
         subject = mask > 127
     elif labels is not None and BACKGROUND in classes:
@@ -99,6 +101,7 @@ def _sample(view: View, capture: Capture, decode_normals: bool) -> ViewSample:
         mask=mask,
         labels=labels,
         normals=normals,
+        depth=depth,
         subject=subject,
         coverage=coverage,
         head_rows=int(np.ptp(rows)) + 1 if len(rows) else camera.height_px,

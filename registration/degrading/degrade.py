@@ -95,9 +95,9 @@ def _check(capture: Capture, preset: DegradationPreset, faults: Mapping[str, Col
     if _TAG in capture.tags:
         got, fix = capture.tags[_TAG], "degrade the capture that it was made from"
         raise InputError("The capture is degraded already", where=where, expected="a clean capture", got=got, fix=fix)
-    if any(view.depth or (view.normals and is_colmap_map(view.normals)) for view in capture.views):
+    if any(view.depth or view.confidence or (view.normals and is_colmap_map(view.normals)) for view in capture.views):
         expected, fix = "normal maps as PNG, or none", "take the maps out of the source"
-        got = "depth maps or maps of COLMAP"
+        got = "depth maps, confidence maps or maps of COLMAP"
         raise InputError("Dense maps cannot be degraded", where=where, expected=expected, got=got, fix=fix)
     names = [view.name for view in capture.views]
     for name, kinds in faults.items():

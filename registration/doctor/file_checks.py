@@ -15,7 +15,13 @@ from registration.types import Capture, View
 
 # Field of a view -> what messages call its file.
 ROLES: Mapping[str, str] = MappingProxyType(
-    {"image": "image", "mask": "mask", "normals": "normal map", "segmentation": "label map"}
+    {
+        "image": "image",
+        "mask": "mask",
+        "normals": "normal map",
+        "confidence": "confidence map",
+        "segmentation": "label map",
+    }
 )
 
 

@@ -267,7 +267,7 @@ class TurnFix(_Mend):
 
     def _others(self, root: Path, name: str) -> list[Path]:
         stem = Path(name).with_suffix("")
-        folders = ("masks", "normals", "segmentation")
+        folders = ("masks", "normals", "confidence", "segmentation")
         files = [root / folder / f"{stem}{suffix}" for folder in folders for suffix in (".png", ".jpg", ".jpeg")]
         return [file for file in files if file.is_file()]
 

@@ -26,6 +26,7 @@ _MIN_LENGTH = 0.5  # of a normal
 _SOFT = "mask between 50 and 99 %"
 _AWAY = "normal faces away"
 _NO_NORMAL = "no normal"
+_NO_DEPTH = "no depth"
 _BACKGROUND = "labelled as background"
 _UNUSED = f"confidence of {triangulation.MIN_CONFIDENCE} or less"
 _CONTRADICT = "contradicts other views"
@@ -79,7 +80,7 @@ def take_stock(
         files: of its folders.
     """
     mapped = {view.name: "depth" for view in capture.views if view.normals is None and view.depth is not None}
-    depth = ("depth",) if mapped else ()
+    depth = ("depth",) if any(view.depth is not None for view in capture.views) else ()
     totals = dict.fromkeys(("images", "masks", "normals", *depth, "segmentation"), 0)
     lost: dict[str, Counter[str]] = {name: Counter() for name in totals}
 
@@ -96,6 +97,8 @@ def take_stock(
             add("masks", sample.subject, inside)
         if sample.normals is not None:
             add(mapped.get(sample.name, "normals"), sample.subject, [*inside, *excluded, *normals])
+        if sample.depth is not None and sample.name not in mapped:
+            add("depth", sample.subject, [*inside, *excluded, (_NO_DEPTH, sample.depth <= 0)])
         if sample.labels is not None:
             add("segmentation", sample.subject, [*inside, *_label_losses(sample, capture.classes)])
     totals["landmarks"], lost["landmarks"] = _landmark_counts(capture)
@@ -224,7 +227,7 @@ def _landmark_losses(
 
 def _on_purpose(reason: str) -> bool:
     """Whether a loss is how captures are: hidden landmarks, hair and clothes, subjects without normals in places."""
-    return reason in (_UNUSED, _NO_NORMAL) or class_names.covers(reason.removeprefix(_CLASS))
+    return reason in (_UNUSED, _NO_NORMAL, _NO_DEPTH) or class_names.covers(reason.removeprefix(_CLASS))
 
 
 def _lost(channel: Channel) -> str:
@@ -238,6 +241,7 @@ def _expected(reason: str, classes: tuple[str, ...]) -> str:
         _SOFT: "masks of 255 inside the subject",
         _AWAY: "normals in the camera's frame, OpenCV's axes, that point towards the camera",
         _NO_NORMAL: "normals on the subject",
+        _NO_DEPTH: "depths on the subject",
         _BACKGROUND: "labels of the subject where the masks show it",
         _UNUSED: f"confidences above {triangulation.MIN_CONFIDENCE} for points that are seen",
         _CONTRADICT: "landmarks on which at least two views agree",
@@ -255,6 +259,7 @@ def _fix(reason: str, classes: tuple[str, ...]) -> str:
         _SOFT: "threshold the masks: 255 inside the subject, 0 outside",
         _AWAY: "turn the normals into the camera's frame: x right, y down, z away from the camera, so that z < 0",
         _NO_NORMAL: "check that normals/ belongs to these images; 0 means that a pixel has no normal",
+        _NO_DEPTH: "check that depth/ belongs to these images; 0 means that a pixel has no depth",
         _BACKGROUND: "check that masks and label maps belong to the same images",
         _UNUSED: "write confidences from 0 to 1",
         _CONTRADICT: "check that landmarks are in pixels of the stored images, and the calibration",

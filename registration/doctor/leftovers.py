@@ -18,6 +18,7 @@ SUFFIXES = {
     "masks": ".png",
     "normals": ".png",
     "depth": ".png",
+    "confidence": ".png",
     "segmentation": ".png",
     "landmarks": ".json",
 }  # besides images/
@@ -35,6 +36,8 @@ _OTHER_FOLDERS = {
     "normal_maps": "normals",
     "depths": "depth",
     "depth_maps": "depth",
+    "confidences": "confidence",
+    "confidence_maps": "confidence",
     "labels": "segmentation",
     "label": "segmentation",
     "seg": "segmentation",
@@ -63,7 +66,7 @@ class FolderFiles:
 
 
 def match_files(capture: Capture) -> dict[str, FolderFiles]:
-    """Match the files of images/, masks/, normals/, depth/, segmentation/ and landmarks/ with the views."""
+    """Match the files of images/, masks/, landmarks/ and the other channels with the views."""
     result = {}
     for folder, expected in _expected(capture).items():
         on_disk = files_in(capture.root / folder)

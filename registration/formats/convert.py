@@ -122,6 +122,12 @@ def _write_view(root: Path, plan: ViewPlan, source: SourceCapture, unit_m: float
             _write_png(_target(root / "normals", view), written_normals(plan))
     if view.depth is not None:
         write_depth(_target(root / "depth", view, ".npy"), plan, unit_m)
+    if view.confidence is not None:
+        if plan.lens is None:
+            _copy(view.confidence, _target(root / "confidence", view))
+        else:
+            confidence = plan.lens.image(pixels.read_confidence(view.confidence, camera))
+            _write_png(_target(root / "confidence", view), confidence)
     if view.segmentation is not None:
         labels = _target(root / "segmentation", view)
         if plan.lens is None and not (source.labels.indices or source.labels.colours):
@@ -233,7 +239,7 @@ def _view_record(source: SourceCapture, plan: ViewPlan) -> dict[str, Any]:
     view = plan.view
     video = view.image if isinstance(view.image, VideoFrame) else None
     image = view.image.file if isinstance(view.image, VideoFrame) else view.image
-    files = {part: getattr(view, part) for part in ("mask", "normals", "depth", "segmentation")}
+    files = {part: getattr(view, part) for part in ("mask", "normals", "depth", "confidence", "segmentation")}
     named = {part: _name(source, file) for part, file in files.items() if file is not None}
     record: dict[str, Any] = {"image": _name(source, image), **named}
     if video is not None:

@@ -65,6 +65,7 @@ def _view(view: View, lens: Distortion) -> SourceView:
         normals_frame=view.normals_frame,
         depth=view.depth,
         depth_unit_m=view.depth_unit_m,
+        confidence=view.confidence,
         segmentation=view.segmentation,
         landmarks=view.landmarks,
     )

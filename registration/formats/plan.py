@@ -16,7 +16,7 @@ from registration.storage.reading import path_defect
 from registration.types import Camera
 
 _ROTATION_TOLERANCE = 1e-4
-_CHANNELS = {"mask": "mask", "normals": "normal map", "segmentation": "label map"}
+_CHANNELS = {"mask": "mask", "normals": "normal map", "confidence": "confidence map", "segmentation": "label map"}
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -44,6 +44,7 @@ class SourceView:
     normals_frame: NormalsFrame = "camera_opencv"  # axes of the stored normals
     depth: Path | None = None  # along the optical axis, of a kind that native captures have
     depth_unit_m: float | None = None  # metres per stored unit; None: the values are lengths of the world
+    confidence: Path | None = None  # of normals and depths
     segmentation: Path | None = None
     landmarks: Mapping[str, Float[np.ndarray, "L 3"]] = field(default_factory=dict)  # x_px y_px confidence, distorted
 

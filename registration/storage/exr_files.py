@@ -81,6 +81,15 @@ def read_exr_depth(file: Path, refuse: Refuse) -> "np.ndarray":
     return _planes(file, refuse, _DEPTHS)[0]
 
 
+def write_exr_depth(file: Path, depth: "np.ndarray") -> None:
+    """Write a depth map (H, W) as 32 bit numbers, channel Z, compressed without loss."""
+    import numpy as np
+    import OpenEXR
+
+    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+    OpenEXR.File(header, {"Z": np.ascontiguousarray(depth, np.float32)}).write(str(file))
+
+
 def _planes(file: Path, refuse: Refuse, sets: tuple[tuple[str, ...], ...]) -> "list[np.ndarray]":
     import numpy as np
     import OpenEXR

@@ -38,6 +38,7 @@ class _ViewCrop:
     excluded: Float[np.ndarray, "H W"]
     valid: Float[np.ndarray, "H W"]
     incidence: Float[np.ndarray, "H W"]  # cosine, where it is known without normals; else 1
+    confidence: Float[np.ndarray, "H W"] | None  # of normals; None: 1
     landmarks: Mapping[str, Float[np.ndarray, "L 3"]]
     has_mask: bool
     has_classes: bool
@@ -123,6 +124,7 @@ def _view_crop(view: View, capture: Capture, mapping: ClassMap, downsample: int)
         excluded=excluded,
         valid=pixels.valid,
         incidence=zeros + 1,
+        confidence=pixels.confidence,
         landmarks=landmarks,
         has_mask=mask is not None,
         has_classes=pixels.label_coverage is not None,
@@ -243,7 +245,7 @@ def _apply_weights(crop: _ViewCrop) -> dict[str, np.ndarray]:
     core = cv2.erode(inside.astype(np.uint8), np.ones((3, 3), np.uint8)).astype(np.float32)
     return {
         "normals": normals,
-        "normal_weight": facing,
+        "normal_weight": facing if crop.confidence is None else facing * crop.confidence,
         "rgb_weight": core * (facing if crop.has_normals else crop.incidence) * float(crop.has_colours),
         "mask_weight": _silhouette_weight(crop) * valid if crop.has_mask else 0 * valid,
         "class_weight": inside * (crop.classes.sum(-1) > 0.5),

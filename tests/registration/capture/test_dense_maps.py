@@ -1,6 +1,7 @@
 """Depth maps in every form that is read, and COLMAP's dense maps written from their public description."""
 
 import struct
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -10,6 +11,7 @@ import pytest
 
 from registration.capture import native, pixels
 from registration.capture.dense_maps import depth_normals, read_colmap_map
+from registration.capture.native_writer import CaptureDescription, write_capture
 from registration.doctor.validation import validate_capture
 from registration.errors import InputError
 from registration.types import View
@@ -172,3 +174,47 @@ def test_nothing_at_steps_and_beside_missing_depths() -> None:
     normals = depth_normals(depth, rays)
     assert not normals[:, 19:21].any() and not normals[4:10, 4:10].any()
     np.testing.assert_allclose(normals[15:35, 3:16], np.broadcast_to([0, 0, -1.0], (20, 13, 3)), atol=1e-9)
+
+
+@pytest.mark.parametrize("distortion", [(), small.DISTORTIONS["OPENCV"]])
+def test_depths_and_confidences_of_a_view_on_its_own_grid(tmp_path: Path, distortion: tuple[float, ...]) -> None:
+    """Written beside normals, with a hole; the depth of the undistorted, reduced pixels is the ball's."""
+    view = small.synthetic_view("cam0", small.camera(0.2, distortion=distortion))
+    depth = exact_depth(View(name="cam0", camera=view.camera, image=tmp_path))
+    depth[60:80, 50:60] = 0
+    confidence = np.where(np.arange(120) < 60, 0.2, 1.0)[None].repeat(160, 0)
+    views = [replace(view, depth=depth, confidence=confidence), small.synthetic_view("cam1", small.camera(0.8))]
+    root = write_capture(
+        tmp_path / "capture", views, CaptureDescription(subject="a", expression="b", classes=small.CLASSES)
+    )
+    capture = native.read_capture(root)
+    first, second = capture.views
+    assert first.depth is not None and first.confidence is not None and second.confidence is None
+    np.testing.assert_array_equal(pixels.read_depth(first), depth)
+    for downsample in (1, 2):
+        found = pixels.read_view(first, capture, downsample=downsample)
+        assert found.depth is not None and found.confidence is not None and found.normals is not None
+        expected = exact_depth(View(name="cam0", camera=found.camera, image=tmp_path))
+        inside = found.normals[..., 2] < -0.5
+        known = inside & (found.depth > 0)
+        slope = np.abs(np.gradient(expected)).max(0)  # of a block with a missing pixel the middle is elsewhere
+        assert (np.abs(found.depth - expected)[known] < 1e-5 + 0.2 * slope[known]).all()
+        assert np.median(np.abs(found.depth - expected)[known]) < 3e-5
+        assert known.sum() > 0.9 * inside.sum() and (inside & (found.depth == 0)).sum() > 100 / downsample**2
+        np.testing.assert_allclose(np.unique(found.confidence.round(2))[[0, -1]], [0.2, 1.0])
+    assert pixels.read_view(second, capture).depth is None
+    row = next(row for row in validate_capture(capture).channels if row.name == "depth")
+    assert row.matched == 1 and 0.9 * row.total < row.counted < row.total
+
+
+@pytest.mark.parametrize(
+    "content", [np.zeros((160, 120), np.uint16), np.zeros((160, 120, 3), np.uint8), np.zeros((8, 8), np.uint8)]
+)
+def test_maps_that_are_no_confidences_are_refused(tmp_path: Path, content: np.ndarray) -> None:
+    root = small.make(tmp_path / "capture")
+    (root / "confidence").mkdir()
+    cv2.imwrite(str(root / "confidence" / "cam0.png"), content)
+    capture = native.read_capture(root)
+    with pytest.raises(InputError, match="confidence map") as caught:
+        pixels.read_view(capture.views[0], capture)
+    assert caught.value.where == str(root / "confidence" / "cam0.png")
