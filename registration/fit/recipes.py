@@ -3,17 +3,11 @@
 A recipe is the result of a function without parameters; its values are saved with every registration.
 """
 
-import importlib
-import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import partial
-from pathlib import Path
-from typing import Any, TypeVar
 
 from registration.errors import InputError
-
-T = TypeVar("T")
+from registration.import_paths import load_named
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -243,7 +237,7 @@ def named_recipe(name: str) -> str:
 
 
 def load_recipe(recipe: str | Recipe) -> Recipe:
-    """Return the recipe of a name or import path (`load_named`).
+    """Return the recipe of a name or import path (`registration.import_paths.load_named`).
 
     Args:
         recipe: a key of `RECIPES`, an import path, or a Recipe.
@@ -252,51 +246,3 @@ def load_recipe(recipe: str | Recipe) -> Recipe:
         InputError: as `load_named`.
     """
     return load_named(recipe, RECIPES, Recipe, title="recipe")
-
-
-def load_named(recipe: str | T, table: Mapping[str, Callable[[], T]], type_: type[T], *, title: str) -> T:
-    """Return the settings of a name or import path.
-
-    Args:
-        recipe: a key of `table`; `module:function`, the import path of a function without parameters that returns
-            settings, looked up in the working directory too; or settings, which are returned as they are.
-        table: name -> function.
-        type_: of the settings.
-        title: what messages call them.
-
-    Raises:
-        InputError: an unknown name, a module or function that cannot be imported or fails, or a result of another type.
-    """
-    if isinstance(recipe, type_):
-        return recipe
-    name = str(recipe)
-    if name in table:
-        return table[name]()
-    invalid = partial(
-        InputError,
-        f"There is no such {title}",
-        where=title,
-        expected=f"{', '.join(table)}, or module:function of a function that returns a {type_.__name__}",
-        fix="choose one by name, or correct the import path",
-    )
-    module, _, function = name.partition(":")
-    if not (module and function):
-        raise invalid(got=f"the name {name}")
-    try:
-        loaded = _import(module, function)()
-    except (Exception, SystemExit) as error:  # the module is the user's: anything may go wrong
-        raise invalid(got=f"{type(error).__name__}: {error}") from error
-    if not isinstance(loaded, type_):
-        raise invalid(got=f"a function that returns {type(loaded).__name__}")
-    return loaded
-
-
-def _import(module: str, function: str) -> Callable[[], Any]:
-    """The function of a module, which may lie in the working directory."""
-    folder = str(Path.cwd())
-    sys.path.insert(0, folder)
-    try:
-        result: Callable[[], Any] = getattr(importlib.import_module(module), function)
-    finally:
-        sys.path.remove(folder)
-    return result

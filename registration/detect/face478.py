@@ -1,0 +1,150 @@
+"""Google's 478-point face landmarker [FaceMesh], run by OpenCV.
+
+Faces are found by the short-range detector. Each is cut out upright and its points predicted; from these the crop is
+made anew, and predicted again, several times with small changes. The mean of the last passes are the points, their
+scatter and a floor, measured on rendered heads, the spread.
+"""
+
+import hashlib
+import tempfile
+import threading
+from collections.abc import Sequence
+from functools import cached_property
+from pathlib import Path
+
+import cv2
+import numpy as np
+from jaxtyping import Float, UInt8
+
+from registration.detect import short_range
+from registration.detect.blendshapes import NAMES, SUBSET
+from registration.detect.crops import Crop
+from registration.detect.provider import Face
+from registration.detect.short_range import Detection
+from registration.detect.weights import TASK_SHA256, FaceLandmarkerFiles, read_face_landmarker
+
+SCHEME = "face478"
+COUNT = 478
+SIZE = 256  # px, of the crops
+SCALE = 1.5  # of a crop, relative to the face
+MIN_PRESENCE = 0.5
+MAX_FACES = 4
+RIGHT_EYE, LEFT_EYE = 33, 263  # outer corners, the subject's
+FLOOR = 0.006  # of the spread, as a fraction of the face's size
+_POINTS, _PRESENCE = "Identity", "Identity_1"
+# Shift along both axes (fractions of the side), scale, turn (radians) of the crops whose scatter is measured.
+_JITTER = (
+    ((0.0, 0.0), 1.0, 0.0),
+    ((0.02, 0.01), 1.04, 0.04),
+    ((-0.02, 0.02), 0.96, -0.04),
+    ((0.01, -0.02), 1.06, -0.06),
+    ((-0.01, -0.01), 0.94, 0.06),
+)
+_CODE = 1  # raised when the same nets give other results
+
+
+class _Nets(threading.local):
+    """The nets of one thread: a net's forward pass changes it."""
+
+    def __init__(self, files: FaceLandmarkerFiles) -> None:
+        self.detector, self.points, self.blendshapes = map(_net, (files.detector, files.points, files.blendshapes))
+
+
+def _net(content: bytes) -> cv2.dnn.Net:
+    # The other engines of OpenCV 5 give wrong values for the second of two outputs, and a net from memory ignores which
+    # engine was asked for: it is read from a file.
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "net.tflite"
+        path.write_bytes(content)
+        return cv2.dnn.readNetFromTFLite(str(path), cv2.dnn.ENGINE_CLASSIC)
+
+
+class Face478Provider:
+    """Landmarks of scheme `face478`: 468 points of the skin, lips and lids, and five of each iris (468 to 477).
+
+    Its nets are read, and downloaded if need be, by the first image. It may be used by several threads.
+    """
+
+    scheme = SCHEME
+    count = COUNT
+
+    @property
+    def version(self) -> str:
+        """Name, and digest of the nets, of OpenCV's version and of the code's."""
+        decides = f"{TASK_SHA256} {cv2.__version__} {_CODE} {FLOOR} {_JITTER}"
+        return f"{SCHEME} {hashlib.sha256(decides.encode()).hexdigest()}"
+
+    @cached_property
+    def _nets(self) -> _Nets:
+        return _Nets(read_face_landmarker())
+
+    def detect(self, image: UInt8[np.ndarray, "H W 3"]) -> Sequence[Face]:
+        """Return the faces in an image, the most certain first, at most `MAX_FACES`.
+
+        Args:
+            image: red green blue, sRGB, without distortion.
+
+        Raises:
+            InputError: the nets cannot be downloaded.
+        """
+        detections = short_range.detect(self._nets.detector, image)[:MAX_FACES]
+        faces = [face for detection in detections if (face := self._refine(image, detection)) is not None]
+        return _distinct(sorted(faces, key=lambda face: -face.presence))
+
+    def _refine(self, image: UInt8[np.ndarray, "H W 3"], detection: Detection) -> Face | None:
+        points, presence = self._predict(image, detection.crop(SCALE))
+        presences = [detection.score, presence]
+        if min(presences) < MIN_PRESENCE:
+            return None
+        crop = _crop_of(points)
+        passes = []
+        for shift, scale, turn in _JITTER:
+            points, presence = self._predict(image, crop.moved(shift, scale, turn))
+            presences.append(presence)
+            passes.append(points)
+            if presence < MIN_PRESENCE:
+                return None
+        points = np.mean(passes, 0)
+        crop = _crop_of(points)
+        scatter = np.sqrt(((np.array(passes) - points) ** 2).sum((0, 2)) / (2 * (len(passes) - 1)))
+        least = float(min(presences))
+        return Face(
+            points=points,
+            confidence=np.full(COUNT, least),
+            spread_px=np.hypot(scatter, FLOOR * crop.side / SCALE),
+            presence=least,
+            box=np.concatenate([points.min(0), points.max(0)]),
+            roll=crop.roll,
+            hints=self._blendshapes(crop.from_image(points)),
+        )
+
+    def _predict(self, image: UInt8[np.ndarray, "H W 3"], crop: Crop) -> tuple[Float[np.ndarray, "478 2"], float]:
+        """Points in px of the image, and whether there is a face, from one crop."""
+        net = self._nets.points
+        net.setInput(cv2.dnn.blobFromImage(crop.pixels(image, SIZE), 1 / 255, (SIZE, SIZE)))
+        points, presence = net.forward([_POINTS, _PRESENCE])
+        local = np.asarray(points, np.float64).reshape(COUNT, 3)[:, :2] / SIZE
+        return crop.to_image(local), float(1 / (1 + np.exp(-np.float64(presence).reshape(-1)[0])))
+
+    def _blendshapes(self, points: Float[np.ndarray, "478 2"]) -> dict[str, float]:
+        net = self._nets.blendshapes
+        net.setInput(np.ascontiguousarray(points[list(SUBSET)] * SIZE, np.float32)[None])
+        scores = np.asarray(net.forward(), np.float64).reshape(-1)
+        return {name: float(score) for name, score in zip(NAMES, scores, strict=True) if not name.startswith("_")}
+
+
+def _crop_of(points: Float[np.ndarray, "478 2"]) -> Crop:
+    across = points[LEFT_EYE] - points[RIGHT_EYE]
+    return Crop.around(points, float(np.arctan2(across[1], across[0])), SCALE)
+
+
+def _distinct(faces: Sequence[Face]) -> list[Face]:
+    """The faces without those whose centre lies in the middle of a more certain one's box."""
+    kept: list[Face] = []
+    for face in faces:
+        centre = (face.box[:2] + face.box[2:]) / 2
+        sizes = [(other.box[2:] - other.box[:2]).max() for other in kept]
+        middles = [(other.box[:2] + other.box[2:]) / 2 for other in kept]
+        if all(np.linalg.norm(centre - m) > 0.4 * size for m, size in zip(middles, sizes, strict=True)):
+            kept.append(face)
+    return kept
