@@ -210,7 +210,7 @@ class Targets:
     classes: Float[Tensor, "P K"]
     class_weight: Float[Tensor, "P"]
     landmarks: Mapping[str, Float[Tensor, "N L 3"]]  # scheme -> x_px y_px confidence
-    landmark_spread_px: Mapping[str, Float[Tensor, "N L"]] = field(default_factory=dict)  # of their positions
+    landmark_spread_px: Mapping[str, Float[Tensor, "N L"]] = field(default_factory=dict)  # NaN: unknown
     px_per_head: float  # the subject's height in pixels, median over views
 
     def select(self, views: Sequence[int], device: torch.device) -> "Targets":
@@ -236,8 +236,10 @@ class Targets:
             for f in fields(self)
             if isinstance(getattr(self, f.name), Tensor)
         }
-        landmarks = {scheme: points[views].to(device) for scheme, points in self.landmarks.items()}
-        return replace(self, names=tuple(self.names[v] for v in views), pixels=pixels, landmarks=landmarks, **values)
+        names = tuple(self.names[v] for v in views)
+        values["landmarks"] = {scheme: points[views].to(device) for scheme, points in self.landmarks.items()}
+        spreads = {scheme: spread_px[views].to(device) for scheme, spread_px in self.landmark_spread_px.items()}
+        return replace(self, names=names, pixels=pixels, landmark_spread_px=spreads, **values)
 
 
 @dataclass(frozen=True, kw_only=True)

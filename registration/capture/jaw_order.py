@@ -24,4 +24,8 @@ def with_corrected_jaw(capture: Capture) -> Capture:
 def _turned(view: View) -> View:
     if (points := view.landmarks.get(jaw_order.SCHEME)) is None:
         return view
-    return replace(view, landmarks={**view.landmarks, jaw_order.SCHEME: np.asarray(points)[jaw_order.TURNED]})
+    spreads = dict(view.landmark_spread_px)
+    if (spread_px := spreads.get(jaw_order.SCHEME)) is not None:
+        spreads[jaw_order.SCHEME] = np.asarray(spread_px)[jaw_order.TURNED]
+    turned = {**view.landmarks, jaw_order.SCHEME: np.asarray(points)[jaw_order.TURNED]}
+    return replace(view, landmarks=turned, landmark_spread_px=spreads)

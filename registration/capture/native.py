@@ -98,6 +98,7 @@ def _read_view(root: Path, file_name: str, camera: Camera, settings: CaptureSett
         require_encoding(image, colour)
     conversion_of(image, colour)
     landmarks = _channel(root, "landmarks", relative, ".json")
+    marks = None if landmarks is None else read_landmarks(landmarks)
     return View(
         name=name,
         camera=camera,
@@ -109,7 +110,8 @@ def _read_view(root: Path, file_name: str, camera: Camera, settings: CaptureSett
         depth_unit_m=settings.depth_unit_m,
         confidence=_channel(root, "confidence", relative, ".png"),
         segmentation=_channel(root, "segmentation", relative, ".png"),
-        landmarks={} if landmarks is None else read_landmarks(landmarks),
+        landmarks={} if marks is None else marks.points,
+        landmark_spread_px={} if marks is None else marks.spread_px,
         colour=colour,
     )
 

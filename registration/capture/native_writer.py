@@ -12,6 +12,7 @@ from jaxtyping import Bool, Float, UInt8, UInt16
 
 from registration.capture.colmap import write_model
 from registration.capture.colour_settings import colours_to_toml
+from registration.capture.landmark_files import write_landmarks
 from registration.capture.scan import Scan
 from registration.errors import InputError
 from registration.frames import linear_to_srgb
@@ -34,6 +35,7 @@ class ViewArrays:
     confidence: Float[np.ndarray, "H W"] | None = None  # of normals and depth, in [0, 1]
     labels: UInt8[np.ndarray, "H W"] | None = None  # index into the capture's classes
     landmarks: Mapping[str, Float[np.ndarray, "L 3"]] = field(default_factory=dict)  # scheme -> x_px y_px confidence
+    landmark_spread_px: Mapping[str, Float[np.ndarray, "L"]] = field(default_factory=dict)  # of schemes that have it
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -121,8 +123,7 @@ def _write_view(root: Path, view: ViewArrays, bits: int) -> None:
     if view.labels is not None:
         _write_png(root / "segmentation", view, view.labels)
     if view.landmarks:
-        path = _file(root / "landmarks", view, ".json")
-        path.write_text(json.dumps({scheme: points.tolist() for scheme, points in view.landmarks.items()}), "utf-8")
+        write_landmarks(_file(root / "landmarks", view, ".json"), view.landmarks, view.landmark_spread_px)
 
 
 def _quantized(values: np.ndarray, bits: int) -> np.ndarray:

@@ -6,7 +6,7 @@ needs a few hundred MB. Every result is the mean over the pixels of a block that
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 
 import cv2
@@ -18,6 +18,7 @@ from registration.capture.dense_maps import block_depth, depth_normals, is_colma
 from registration.capture.file_colour import conversion_of
 from registration.capture.headers import require_complete, require_size, undecodable
 from registration.capture.label_maps import read_labels
+from registration.capture.landmark_files import moved_spread
 from registration.capture.masks import subject_coverage
 from registration.capture.tiff import decode_tiff, is_tiff
 from registration.errors import InputError
@@ -92,8 +93,20 @@ def downsampled_camera(camera: Camera, downsample: int) -> Camera:
 
 def undistort_landmarks(view: View, scheme: str) -> Float[np.ndarray, "L 3"]:
     """Return a view's landmarks (x_px, y_px, confidence) in the undistorted full-size image."""
-    landmarks = np.array(view.landmarks[scheme], np.float64)
-    camera = view.camera
+    return _undistorted(view.camera, np.array(view.landmarks[scheme], np.float64))
+
+
+def undistorted_spread(view: View, scheme: str) -> Float[np.ndarray, "L"]:
+    """Return the spread of a view's landmarks in the undistorted full-size image, px."""
+    spread_px = np.asarray(view.landmark_spread_px[scheme], np.float64)
+    if not view.camera.distortion:
+        return spread_px
+    return moved_spread(partial(_undistorted, view.camera), np.array(view.landmarks[scheme], np.float64), spread_px)
+
+
+def _undistorted(camera: Camera, landmarks: Float[np.ndarray, "L 3"]) -> Float[np.ndarray, "L 3"]:
+    """Rows (x_px, y_px, confidence) without the camera's distortion."""
+    landmarks = landmarks.copy()
     if camera.distortion and len(landmarks):
         criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 100, 1e-9)
         # Points and K have the same pixel convention, so that OpenCV's does not matter.

@@ -21,6 +21,7 @@ from jaxtyping import Float
 from registration.capture import native, pixels, triangulation
 from registration.capture.colmap import read_points, write_model
 from registration.capture.dense_maps import is_colmap_map
+from registration.capture.landmark_files import write_landmarks
 from registration.capture.native_writer import check_new
 from registration.capture.scan import read_scan
 from registration.degrading import degradation
@@ -178,9 +179,10 @@ def _write_view(root: Path, view: View, capture: Capture, errors: _ViewErrors) -
             scheme: degradation.degraded_landmarks(points, preset, for_landmarks) + [shift_px, 0, 0]
             for scheme, points in sorted(view.landmarks.items())
         }
-        path = root / "landmarks" / f"{view.name}.json"
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(json.dumps({scheme: points.tolist() for scheme, points in degraded.items()}), "utf-8")
+        spreads = {
+            scheme: np.hypot(spread_px, preset.landmark_std_px) for scheme, spread_px in view.landmark_spread_px.items()
+        }
+        write_landmarks(root / "landmarks" / f"{view.name}.json", degraded, spreads)
 
 
 def _write_png(path: Path, content: np.ndarray) -> None:

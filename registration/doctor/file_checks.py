@@ -27,8 +27,10 @@ ROLES: Mapping[str, str] = MappingProxyType(
 
 def without(view: View, field: str) -> View:
     """The view without one of its files, or landmarks."""
-    empty: Any = {} if field == "landmarks" else None
-    return replace(view, **{field: empty})
+    if field == "landmarks":
+        return replace(view, landmarks={}, landmark_spread_px={})
+    nothing: dict[str, Any] = {field: None}
+    return replace(view, **nothing)
 
 
 def check_count(capture: Capture) -> None:

@@ -16,7 +16,7 @@ from registration.capture import pixels
 from registration.capture.class_names import meaning
 from registration.capture.colmap import read_cameras, read_points, write_model
 from registration.capture.headers import read_header
-from registration.capture.landmark_files import read_landmarks
+from registration.capture.landmark_files import ViewLandmarks, moved_spread, read_landmarks, write_landmarks
 from registration.capture.native import read_capture
 from registration.capture.samples import ViewSample
 from registration.capture.scan import SCANS, read_scan_file, read_truth
@@ -85,22 +85,34 @@ class LandmarkFix(_Mend):
     views: Collection[str] | None = None
 
     def on_capture(self, capture: Capture) -> Capture:
-        return replace(capture, views=tuple(replace(v, landmarks=self._changed(v, v.landmarks)) for v in capture.views))
+        views = []
+        for view in capture.views:
+            changed = self._changed(view, ViewLandmarks(points=view.landmarks, spread_px=view.landmark_spread_px))
+            views.append(replace(view, landmarks=changed.points, landmark_spread_px=changed.spread_px))
+        return replace(capture, views=tuple(views))
 
     def on_folder(self, root: Path) -> None:
         for view in read_capture(root).views:
             if view.landmarks:
                 file = landmark_file(root, view)
-                changed = {name: points.tolist() for name, points in self._changed(view, read_landmarks(file)).items()}
-                file.write_text(json.dumps(changed), "utf-8")
+                changed = self._changed(view, read_landmarks(file))
+                write_landmarks(file, changed.points, changed.spread_px)
 
-    def _changed(self, view: View, landmarks: Mapping[str, Points]) -> dict[str, Points]:
+    def _changed(self, view: View, landmarks: ViewLandmarks) -> ViewLandmarks:
         if self.views is not None and view.name not in self.views:
-            return dict(landmarks)
-        return {
-            name: self.change(points, view.camera) if self.schemes is None or name in self.schemes else points
-            for name, points in landmarks.items()
+            return landmarks
+
+        def change(points: Points) -> Points:
+            return self.change(points, view.camera)
+
+        names = [name for name in landmarks.points if self.schemes is None or name in self.schemes]
+        points = {name: change(landmarks.points[name]) for name in names}
+        spreads = {
+            name: moved_spread(change, landmarks.points[name], landmarks.spread_px[name])
+            for name in names
+            if name in landmarks.spread_px
         }
+        return ViewLandmarks(points={**landmarks.points, **points}, spread_px={**landmarks.spread_px, **spreads})
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -252,7 +252,7 @@ def _read_again(capture: Capture, scheme: str, reading: Reading) -> Capture:
     for view in capture.views:
         if scheme in view.landmarks:
             changed = reading.read(view.landmarks[scheme], view.camera)
-            view = replace(view, landmarks={**view.landmarks, scheme: changed})
+            view = replace(view, landmarks={**view.landmarks, scheme: changed}, landmark_spread_px={})
         views.append(view)
     return replace(capture, views=tuple(views))
 
@@ -265,7 +265,9 @@ def _agreement(capture: Capture, scheme: str) -> float | None:
     if len(several) < _MIN_POINTS:
         return None
     tried = several[np.unique(np.linspace(0, len(several) - 1, _TRIED).astype(int))]
-    some = tuple(replace(view, landmarks={scheme: view.landmarks[scheme][tried]}) for view in views)
+    some = tuple(
+        replace(view, landmarks={scheme: view.landmarks[scheme][tried]}, landmark_spread_px={}) for view in views
+    )
     return float(triangulation.triangulate(replace(capture, views=some), scheme)[1].sum() / used[:, tried].sum())
 
 

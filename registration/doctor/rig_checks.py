@@ -172,7 +172,9 @@ def _agreement(capture: Capture, scheme: str) -> float | None:
     if len(several) < _MIN_LANDMARKS:
         return None
     tried = several[np.unique(np.linspace(0, len(several) - 1, _TRIED_LANDMARKS).astype(int))]
-    some = tuple(replace(view, landmarks={scheme: view.landmarks[scheme][tried]}) for view in views)
+    some = tuple(
+        replace(view, landmarks={scheme: view.landmarks[scheme][tried]}, landmark_spread_px={}) for view in views
+    )
     return float(triangulate(replace(capture, views=some), scheme)[1].sum() / used[:, tried].sum())
 
 

@@ -22,7 +22,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from registration.capture.landmark_files import read_landmarks
+from registration.capture.landmark_files import ViewLandmarks, read_landmarks
 from registration.capture.scan import SCANS
 from registration.errors import InputError
 from registration.formats.fields import number_array
@@ -92,11 +92,13 @@ def read(path: Path, options: ReadOptions) -> SourceCapture:
             T_cam_world=pose,
             distortion=Distortion(model="opencv", coefficients=tuple(lens.tolist())),
             mask=_mask(folder, name, image),
-            landmarks=read_landmarks(marks) if (marks := folder / "landmarks" / f"{name}.json").is_file() else {},
+            landmarks={} if marks is None else marks.points,
+            landmark_spread_px={} if marks is None else marks.spread_px,
         )
         for name, image, size, K, pose, lens in zip(
             _view_names(names, images, folder), images, sizes, intrinsics, poses, lenses, strict=True
         )
+        for marks in [_landmarks(folder / "landmarks" / f"{name}.json")]
     )
     return SourceCapture(
         format=FORMAT.name,
@@ -142,6 +144,10 @@ def _view_names(names: list[str], images: list[Path | VideoFrame], folder: Path)
     if len(files) < len(images) or any(image.parent.name == name for image, name in zip(files, names, strict=True)):
         return names
     return view_names(files, folder)
+
+
+def _landmarks(file: Path) -> ViewLandmarks | None:
+    return read_landmarks(file) if file.is_file() else None
 
 
 def _mask(folder: Path, name: str, image: Path | VideoFrame) -> Path | None:

@@ -1,6 +1,5 @@
 """Write a capture that a reader of this room returned as a native capture folder (docs/formats.md)."""
 
-import json
 import shutil
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -13,6 +12,7 @@ import numpy as np
 
 from registration.capture import pixels
 from registration.capture.colmap import write_model
+from registration.capture.landmark_files import moved_spread, write_landmarks
 from registration.capture.native import read_capture
 from registration.capture.native_writer import CaptureDescription, check_new, write_settings
 from registration.capture.scan import SCAN, SCANS, read_scan
@@ -136,9 +136,13 @@ def _write_view(root: Path, plan: ViewPlan, source: SourceCapture, unit_m: float
             stored = pixels.read_labels(view.segmentation, camera, source.classes, source.labels)
             _write_png(labels, stored if plan.lens is None else plan.lens.labels(stored))
     if view.landmarks:
-        moved = {name: _landmarks(plan, rows) for name, rows in view.landmarks.items()}
-        text = json.dumps({name: rows.tolist() for name, rows in moved.items()})
-        _target(root / "landmarks", view, ".json").write_text(text, "utf-8")
+        move = partial(_landmarks, plan)
+        moved = {name: move(rows) for name, rows in view.landmarks.items()}
+        spreads = {
+            name: spread_px if plan.lens is None else moved_spread(move, view.landmarks[name], spread_px)
+            for name, spread_px in view.landmark_spread_px.items()
+        }
+        write_landmarks(_target(root / "landmarks", view, ".json"), moved, spreads)
     return f"{view.name}{suffix}"
 
 

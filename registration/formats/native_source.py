@@ -68,6 +68,7 @@ def _view(view: View, lens: Distortion) -> SourceView:
         confidence=view.confidence,
         segmentation=view.segmentation,
         landmarks=view.landmarks,
+        landmark_spread_px=view.landmark_spread_px,
     )
 
 

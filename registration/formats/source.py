@@ -47,6 +47,7 @@ class SourceView:
     confidence: Path | None = None  # of normals and depths
     segmentation: Path | None = None
     landmarks: Mapping[str, Float[np.ndarray, "L 3"]] = field(default_factory=dict)  # x_px y_px confidence, distorted
+    landmark_spread_px: Mapping[str, Float[np.ndarray, "L"]] = field(default_factory=dict)  # of schemes that have it
 
 
 @dataclass(frozen=True, kw_only=True)

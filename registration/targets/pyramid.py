@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float
 
-from registration.capture.pixels import read_view, undistort_landmarks
+from registration.capture.pixels import read_view, undistort_landmarks, undistorted_spread
 from registration.capture.samples import sample_views
 from registration.geometry.surface_views import SurfaceViews
 from registration.targets.classes import BACKGROUND, ClassMap
@@ -40,6 +40,7 @@ class _ViewCrop:
     incidence: Float[np.ndarray, "H W"]  # cosine, where it is known without normals; else 1
     confidence: Float[np.ndarray, "H W"] | None  # of normals; None: 1
     landmarks: Mapping[str, Float[np.ndarray, "L 3"]]
+    landmark_spread_px: Mapping[str, Float[np.ndarray, "L"]]
     has_mask: bool
     has_classes: bool
     has_colours: bool
@@ -113,6 +114,7 @@ def _view_crop(view: View, capture: Capture, mapping: ClassMap, downsample: int)
         points = undistort_landmarks(view, scheme).copy()
         points[:, :2] /= downsample
         landmarks[scheme] = points
+    spreads = {scheme: undistorted_spread(view, scheme) / downsample for scheme in view.landmark_spread_px}
     full = _ViewCrop(
         name=view.name,
         camera=pixels.camera,
@@ -126,6 +128,7 @@ def _view_crop(view: View, capture: Capture, mapping: ClassMap, downsample: int)
         incidence=zeros + 1,
         confidence=pixels.confidence,
         landmarks=landmarks,
+        landmark_spread_px=spreads,
         has_mask=mask is not None,
         has_classes=pixels.label_coverage is not None,
         has_colours=capture.photographs,
@@ -198,6 +201,7 @@ def _halved(crop: _ViewCrop) -> _ViewCrop:
         crop,
         camera=crop.camera.scaled(width, height),
         landmarks={scheme: points * [0.5, 0.5, 1] for scheme, points in crop.landmarks.items()},
+        landmark_spread_px={scheme: spread_px / 2 for scheme, spread_px in crop.landmark_spread_px.items()},
         head_px=crop.head_px / 2,
         **means,
     )
@@ -221,7 +225,11 @@ def _targets(crops: list[_ViewCrop], mapping: ClassMap) -> Targets:
         mask=listed([crop.mask for crop in crops]),
         classes=listed([crop.classes for crop in crops]),
         landmarks={scheme: _stack_landmarks(crops, scheme) for scheme in schemes},
-        landmark_spread_px={},
+        landmark_spread_px={
+            scheme: _stack_spreads(crops, scheme)
+            for scheme in schemes
+            if any(scheme in crop.landmark_spread_px for crop in crops)
+        },
         px_per_head=float(np.median([crop.head_px for crop in crops])),
         **{name: listed([w[name] for w in weighted]) for name in weighted[0]},
     )
@@ -232,6 +240,15 @@ def _stack_landmarks(crops: list[_ViewCrop], scheme: str) -> torch.Tensor:
     count = max(len(crop.landmarks[scheme]) for crop in crops if scheme in crop.landmarks)
     absent = np.zeros((count, 3))
     return torch.as_tensor(np.stack([crop.landmarks.get(scheme, absent) for crop in crops]).astype(np.float32))
+
+
+def _stack_spreads(crops: list[_ViewCrop], scheme: str) -> torch.Tensor:
+    """(N, L) in float32; NaN in a view that does not state it."""
+    count = max(len(crop.landmarks[scheme]) for crop in crops if scheme in crop.landmarks)
+    unknown = np.full(count, np.nan)
+    return torch.as_tensor(
+        np.stack([crop.landmark_spread_px.get(scheme, unknown) for crop in crops]).astype(np.float32)
+    )
 
 
 def _apply_weights(crop: _ViewCrop) -> dict[str, np.ndarray]:

@@ -323,3 +323,19 @@ def test_a_surface_stands_in_for_missing_normal_maps(capture, pyramid):
     assert bare > 50
     for mine, theirs in zip(build_pyramid(capture, class_map(CLASSES), **settings), pyramid, strict=True):
         assert torch.equal(mine.normals, theirs.normals) and torch.equal(mine.rgb_weight, theirs.rgb_weight)
+
+
+def test_spread_of_landmarks_shrinks_with_the_pixels(tmp_path) -> None:
+    yaws = small.YAWS_RAD[:3]
+    views = [labelled_view(f"cam{i}", yaw_rad) for i, yaw_rad in enumerate(yaws)]
+    spread = np.linspace(1, 2, 68)
+    views = [views[0], *(replace(view, landmark_spread_px={"68": spread}) for view in views[1:])]
+    levels = build_pyramid(capture_of(tmp_path / "ball", views), class_map(CLASSES), finest_head_px=50, levels=2)
+    shrunk = views[0].camera.intrinsics[0, 0] / levels[0].pixels.cameras[0].intrinsics[0, 0]
+    assert shrunk == pytest.approx(2, rel=0.05)
+    for level in levels:
+        assert level.landmark_spread_px["68"][0].isnan().all()
+        np.testing.assert_allclose(level.landmark_spread_px["68"][1:], [spread / shrunk] * 2, rtol=1e-5)
+        shrunk *= 2
+    batch = levels[0].select([2, 0], torch.device("cpu"))
+    assert batch.landmark_spread_px["68"][0, 0] == pytest.approx(spread[0] / 2) and batch.landmarks["68"].shape[0] == 2
