@@ -121,6 +121,22 @@ class Renderer:
             image = _tensor(texels.table()).view(texture_size, texture_size, 4)
             return image[..., :3], image[..., 3]
 
+    def depth(self, vertices: Float[Tensor, "V 3"], pixels: Pixels) -> Float[Tensor, "P"]:
+        """Return the depth of the mesh at the pixels' centres. Not differentiable.
+
+        Args:
+            vertices: world, metres.
+            pixels: which pixels of which cameras.
+
+        Returns:
+            Distance along each camera's axis, metres; inf where the mesh is missed.
+        """
+        with torch.no_grad(), dr.suspend_grad():
+            self._update_vertices(vertices)
+            if self._last is not None and self._last[0] is pixels and len(self._pixel_offsets) == 1:
+                return _tensor(self._last[1].hits[0].depth)
+            return _tensor(self._cast(upload(pixels), _CENTRE).depth)
+
     def _update_vertices(self, vertices: Tensor) -> None:
         """Set the vertices; the cached forward pass of other vertices is dropped."""
         if self._scene.update_vertices(vertices):
