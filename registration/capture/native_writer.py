@@ -28,7 +28,8 @@ class ViewArrays:
 
     name: str  # may hold subfolders, as "left/cam00"; no suffix
     camera: Camera
-    rgb: Float[np.ndarray, "H W 3"] | UInt8[np.ndarray, "H W 3"] | UInt16[np.ndarray, "H W 3"]  # float is linear light
+    # Float is linear light; None: the image is not written.
+    rgb: Float[np.ndarray, "H W 3"] | UInt8[np.ndarray, "H W 3"] | UInt16[np.ndarray, "H W 3"] | None
     mask: Float[np.ndarray, "H W"] | Bool[np.ndarray, "H W"] | None = None  # coverage of the subject in [0, 1]
     normals: Float[np.ndarray, "H W 3"] | None = None  # unit, camera frame; 0 where there is none
     depth: Float[np.ndarray, "H W"] | None = None  # along the optical axis, metres; 0 where there is none
@@ -83,7 +84,7 @@ def write_capture(
     check_new(root)
     with atomic_directory(root) as temporary:
         for view in views:
-            _write_view(temporary, view, bits)
+            write_channels(temporary, view, bits)
         cameras = {f"{view.name}.png": view.camera for view in views}
         write_model(temporary / "sparse", cameras, np.zeros((0, 3)) if points is None else points)
         write_settings(temporary / "capture.toml", description)
@@ -106,9 +107,11 @@ def check_new(root: Path) -> None:
         )
 
 
-def _write_view(root: Path, view: ViewArrays, bits: int) -> None:
-    rgb = view.rgb if view.rgb.dtype.kind == "u" else _quantized(linear_to_srgb(view.rgb), bits)
-    _write_png(root / "images", view, rgb)
+def write_channels(root: Path, view: ViewArrays, bits: int = 8) -> None:
+    """Write the files of one view into a capture folder; `bits` as in `write_capture`."""
+    if view.rgb is not None:
+        rgb = view.rgb if view.rgb.dtype.kind == "u" else _quantized(linear_to_srgb(view.rgb), bits)
+        _write_png(root / "images", view, rgb)
     if view.mask is not None:
         _write_png(root / "masks", view, _quantized(view.mask.astype(np.float64), 8))
     if view.normals is not None:

@@ -84,6 +84,27 @@ def read_view(view: View, capture: Capture, *, downsample: int = 1) -> ViewPixel
     )
 
 
+def read_photograph(view: View, *, downsample: int = 1) -> tuple[UInt8[np.ndarray, "H W 3"], Camera]:
+    """Decode and undistort a view's image alone, as 8 bit sRGB, for detectors and stereo.
+
+    Args:
+        view: its image.
+        downsample: whole factor; the remainder at the right and at the bottom is cut off.
+
+    Returns:
+        The image, black where undistortion has no source, and its pinhole camera.
+
+    Raises:
+        InputError: as `read_image`.
+    """
+    strips = list(_strips(view.camera, downsample))
+    raw = read_image(view.image, view.camera, view.colour)
+    shape = (strips[-1].out.stop, strips[-1].columns)
+    values = _resample(raw, lambda part: part.astype(np.float32), strips, np.ones(shape, np.float32))
+    scale = np.float32(1 if raw.dtype == np.uint8 else 255 / 65535)
+    return np.round(values * scale).astype(np.uint8), downsampled_camera(view.camera, downsample)
+
+
 def downsampled_camera(camera: Camera, downsample: int) -> Camera:
     """Return the undistorted camera of `read_view`'s arrays, whose pixels are blocks of `downsample` x `downsample`."""
     columns, rows = camera.width_px // downsample, camera.height_px // downsample
