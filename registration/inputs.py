@@ -23,7 +23,7 @@ from registration.geometry.topology import edges
 from registration.model import gnm_npz
 from registration.model.atlas import texture_atlas
 from registration.model.jaw_order import SCHEME
-from registration.model.landmarks import LandmarkScheme, read_scheme, schemes_beside
+from registration.model.landmarks import LandmarkScheme, check_topology, read_scheme, schemes_beside, shipped_schemes
 from registration.model.regions import vertex_classes
 from registration.options import RegisterOptions
 from registration.storage import hashing
@@ -86,7 +86,7 @@ def read_inputs(
         start = load_registration(neutral)
         _check_topology(start, data, neutral, model_path)
         _check_subject(start, neutral, capture)
-    schemes = read_schemes(model_path, data, options.landmark_files)
+    schemes = used_schemes(read_schemes(model_path, data, options.landmark_files), capture)
     landmarks = _triangulated(selected, schemes)
     _check_head_can_be_found(selected, landmarks)
     scan = _scan_of_the_fit(selected, options)
@@ -110,14 +110,25 @@ def read_inputs(
 
 
 def read_schemes(model_path: Path, data: gnm_npz.GNMData, files: Mapping[str, Path]) -> dict[str, LandmarkScheme]:
-    """Return the landmark schemes next to a model's file, replaced or joined by those in `files`, by name.
+    """Return the landmark schemes of a model, by name: shipped maps, those next to its file, and those in `files`.
+
+    Of schemes of one name the latter count.
 
     Raises:
         InputError: a file that cannot be read as a scheme of this model.
     """
     template = data.template_vertex_positions
     given = {name: read_scheme(file, template, name) for name, file in files.items()}
-    return schemes_beside(model_path, template) | given
+    schemes = shipped_schemes(data) | schemes_beside(model_path, template) | given
+    for name, scheme in schemes.items():
+        check_topology(scheme, data, files.get(name, model_path))
+    return schemes
+
+
+def used_schemes(schemes: Mapping[str, LandmarkScheme], capture: Capture) -> dict[str, LandmarkScheme]:
+    """Return the schemes that count in a registration: all but shipped maps of landmarks that the capture lacks."""
+    captured = {name for view in capture.views for name in view.landmarks}
+    return {name: scheme for name, scheme in schemes.items() if not scheme.shipped or name in captured}
 
 
 def input_hash(
@@ -155,7 +166,9 @@ def _deciding(
     """Digests of the inputs, and the resolved options as JSON values."""
     recipe, selected = load_recipe(options.recipe), _select_views(capture, options.views)
     digests = {"capture": hashing.hash_capture(selected), "model": gnm_npz.content_hash(data)}
-    digests |= {f"landmarks {name}": hashing.hash_fields(scheme) for name, scheme in schemes.items()}
+    digests |= {
+        f"landmarks {name}": hashing.hash_fields(scheme) for name, scheme in used_schemes(schemes, capture).items()
+    }
     if neutral is not None:
         digests["neutral"] = hashing.hash_fields(neutral)
         recipe = expression_recipe(recipe)

@@ -49,6 +49,9 @@ def describe(path: Path, picture: Path | None = None, console: Console | None = 
     for table in (_file(Path(path), data), _dimensions(data), _parts(data), _joints(data), _regions(data)):
         console.print(table)
     console.print(f"landmark schemes: {', '.join(map(_scheme, schemes.values())) or 'none beside the file'}")
+    shipped = landmarks.shipped_schemes(data)
+    if others := [scheme for name, scheme in shipped.items() if name not in schemes]:
+        console.print(f"shipped landmark maps of this topology: {', '.join(map(_scheme, others))}")
     for remark in data.remarks:
         console.print(Text(f"note: {remark}"))
     if picture is not None:

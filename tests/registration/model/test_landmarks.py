@@ -1,3 +1,4 @@
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -6,6 +7,7 @@ import torch
 
 from registration.errors import InputError
 from registration.model import jaw_order, landmarks
+from registration.model.gnm_npz import topology_hash
 from registration.storage.hashing import hash_fields
 from tests.conftest import SHARED, needs_shared
 from tests.fixtures.make_fixtures import HERE, tiny_model
@@ -47,6 +49,12 @@ def test_rounded_weights_are_normalized_to_sum_to_one(tmp_path):
         ("0 0.5 1 0.7 2 0\n", "wrong weights"),
         ("zero 1 1 0 2 0\n", "cannot be read"),
         ("\xe9", "cannot be read"),
+        ("0 1 1 0 2 0 0.001\n0 1 1 0 2 0\n", "spreads in some rows only"),
+        ("0 1 1 0 2 0 0\n", "wrong spread"),
+        ("0 1 1 0 2 0 5\n", "wrong spread"),
+        ("0 1 1 0 2 0 0.1 1\n", "row 0"),
+        ("# a comment\n", "is empty"),
+        ("# kind: landmark map\n# version: 2\n0 1 1 0 2 0\n", "version that this project does not know"),
     ],
 )
 def test_bad_files_are_refused(tmp_path, text, message):
@@ -68,6 +76,38 @@ def test_schemes_in_the_folder_of_a_model(tmp_path):
         (tmp_path / f"head_sparse_{name}.txt").write_text("0 1 1 0 2 0\n")
     assert list(landmarks.schemes_beside(tmp_path / "model.npz", np.zeros((10, 3)))) == ["5", "68"]
     assert landmarks.read_scheme(tmp_path / "head_sparse_5.txt", np.zeros((10, 3)), name="mine").name == "mine"
+
+
+def test_spread_and_header_survive_a_round_trip(tmp_path):
+    data = tiny_model()
+    scheme = landmarks.LandmarkScheme(
+        name="two",
+        indices=np.array([[0, 1, 2], [3, 4, 5]]),
+        weights=np.array([[0.2, 0.3, 0.5], [1.0, 0, 0]]),
+        spread_m=np.array([2e-3, 0.0105]),
+        header={"kind": landmarks.KIND, "version": "1", "provider": "detector a1b2: the first"},
+    )
+    path = landmarks.write_scheme(scheme, tmp_path / "model.npz")
+    read = landmarks.read_scheme(path, data.template_vertex_positions)
+    np.testing.assert_array_equal(read.indices, scheme.indices)
+    np.testing.assert_allclose(read.weights, scheme.weights)
+    np.testing.assert_allclose(read.spread_m, scheme.spread_m)
+    assert read.header == scheme.header and not read.shipped
+    landmarks.check_topology(read, data, path)  # states none
+    other = replace(scheme, header={"topology": "0" * 64})
+    with pytest.raises(InputError, match="another topology"):
+        landmarks.check_topology(other, data, path)
+
+
+def test_shipped_maps_are_found_by_topology(tmp_path, monkeypatch):
+    data = tiny_model()
+    monkeypatch.setattr(landmarks, "SHIPPED", tmp_path)
+    assert landmarks.shipped_schemes(data) == {}
+    scheme = landmarks.LandmarkScheme(name="face478", indices=np.array([[0, 1, 2]]), weights=np.array([[1.0, 0, 0]]))
+    landmarks.write_scheme_file(scheme, landmarks.shipped_file("face478", topology_hash(data.triangles)))
+    found = landmarks.shipped_schemes(data)
+    assert list(found) == ["face478"] and found["face478"].shipped
+    assert landmarks.shipped_schemes(replace(data, triangles=data.triangles[:, ::-1])) == {}
 
 
 def check_68(points: np.ndarray) -> None:
