@@ -68,6 +68,8 @@ EXPRESSIONS: Mapping[str, Expression] = {
     "jaw_right": Expression(category="jaw", units={"jawRight": 1.0, "jawOpen": 0.1}),
     "wink_left": Expression(category="eyes", units={"eyeBlinkLeft": 1.0, "cheekSquintLeft": 0.7}),
     "wink_right": Expression(category="eyes", units={"eyeBlinkRight": 1.0, "cheekSquintRight": 0.7}),
+    "blink": Expression(category="eyes", units=_both("eyeBlink")),
+    "half_blink": Expression(category="eyes", units=_both("eyeBlink", weight=0.5)),
     "squint": Expression(category="eyes", units=_both("eyeSquint", "cheekSquint", weight=0.9)),
     "gaze_left": Expression(category="gaze", units=_looking("Left"), gaze_deg=(25.0, 0.0)),
     "gaze_up": Expression(category="gaze", units=_looking("Up"), gaze_deg=(0.0, 18.0)),
