@@ -16,7 +16,7 @@ from registration.stereo.depth_map import DepthMap
 from registration.stereo.local_planes import fit_planes
 from registration.stereo.pairs import choose_partners
 from registration.stereo.rectify import RectifiedPair, homography, rectify, turn_image
-from registration.stereo.views import HeadImage, StereoView, head_images, rays, relative_pose
+from registration.stereo.views import MOST_PX, HeadImage, StereoView, head_image, rays, relative_pose
 from registration.types import Camera
 
 _BLOCK = 5  # pixels
@@ -33,7 +33,7 @@ class FirstPassOptions:
 
     partners: int = 4  # of each view
     size_px: int = 480  # of the head's sphere in rectified images
-    most_px: int = 700  # of the head's sphere in the results
+    most_px: int = MOST_PX  # larger side of the windows: larger photographs are reduced
     agree_m: float = 1.5e-3  # between depths of two partners, and of another view; more where pixels are larger
     smoothing_px: float = 3.0  # standard deviation of the window in which normals are fitted
     workers: int = 2
@@ -63,7 +63,7 @@ def first_depths(
         InputError: fewer than two views show the head, or none overlap.
     """
     chosen = options or FirstPassOptions()
-    images = head_images(views, centre, radius_m, chosen.most_px)
+    images = [head_image(view, centre, radius_m, chosen.most_px) for view in views]
     shown = [k for k, image in enumerate(images) if image is not None]
     kept = [image for image in images if image is not None]
     partners = choose_partners([image.camera for image in kept], centre, chosen.partners)

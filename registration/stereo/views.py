@@ -1,6 +1,5 @@
 """Photographs as stereo takes them, and their windows around the head."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -9,8 +8,8 @@ from jaxtyping import Bool, Float, Num
 
 from registration.types import Camera
 
-MOST_PX = 700  # across the head's sphere: larger images are reduced
-_MARGIN = 1.05  # of the window around the sphere's outline
+MOST_PX = 720  # larger side of the window around the head: larger windows are reduced
+_MARGIN = 0.02  # of the size of what the window is around
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -40,7 +39,7 @@ def head_image(
         view: the photograph.
         centre: of the head, world, metres.
         radius_m: of a sphere around the head.
-        most_px: largest width of the sphere's window.
+        most_px: largest side of the window.
 
     Returns:
         The window; None where the sphere is behind the camera or outside the image.
@@ -49,23 +48,41 @@ def head_image(
         ValueError: the camera has distortion, or another size than the image.
     """
     camera = view.camera
+    local = camera.T_cam_world[:3, :3] @ np.asarray(centre, np.float64) + camera.T_cam_world[:3, 3]
+    if local[2] <= 1.2 * radius_m:
+        return None
+    (xy,), _ = camera.project(np.asarray(centre, np.float64)[None])
+    reach = radius_m * np.array([camera.intrinsics[0, 0], camera.intrinsics[1, 1]]) / (local[2] - radius_m / 2)
+    return _window(view, xy - reach, xy + reach, most_px)
+
+
+def surface_image(view: StereoView, points: Float[np.ndarray, "P 3"], most_px: int = MOST_PX) -> HeadImage | None:
+    """Cut the window around points, such as a mesh's vertices, out of a photograph; otherwise as `head_image`."""
+    camera = view.camera
+    depth = points @ camera.T_cam_world[2, :3] + camera.T_cam_world[2, 3]
+    if depth.min() <= 0:
+        return None
+    pixels, _ = camera.project(points)
+    return _window(view, pixels.min(0), pixels.max(0), most_px)
+
+
+def _window(
+    view: StereoView, first: Float[np.ndarray, "2"], last: Float[np.ndarray, "2"], most_px: int
+) -> HeadImage | None:
+    camera = view.camera
     if camera.distortion or view.image.shape[:2] != (camera.height_px, camera.width_px):
         raise ValueError("stereo needs an image without distortion, of its camera's size")
-    (xy,), (depth,) = camera.project(np.asarray(centre, np.float64)[None])
-    if depth <= 1.2 * radius_m:
+    size, margin = np.array([camera.width_px, camera.height_px]), _MARGIN * (last - first)
+    x, y = np.clip(np.floor(first - margin), 0, size).astype(int).tolist()
+    right, bottom = np.clip(np.ceil(last + margin), 0, size).astype(int).tolist()
+    width, height = right - x, bottom - y
+    if min(width, height) < 8:
         return None
-    reach = _MARGIN * radius_m * np.array([camera.intrinsics[0, 0], camera.intrinsics[1, 1]]) / (depth - radius_m / 2)
-    size = np.array([camera.width_px, camera.height_px])
-    first = np.clip(np.floor(xy - reach), 0, size).astype(int)
-    last = np.clip(np.ceil(xy + reach), 0, size).astype(int)
-    if (last - first < 8).any():
-        return None
-    (x, y), (width, height) = first.tolist(), (last - first).tolist()
-    window = np.s_[y : y + height, x : x + width]
+    window = np.s_[y:bottom, x:right]
     grey = _grey(view.image[window])
     mask: np.ndarray = np.ones(grey.shape, np.float32) if view.mask is None else view.mask[window].astype(np.float32)
     cropped = camera.cropped(x, y, width, height)
-    factor = min(1.0, most_px / (2 * float(reach.max())))
+    factor = most_px / max(width, height)
     if factor < 1:
         small = (max(8, round(width * factor)), max(8, round(height * factor)))
         grey, mask = (cv2.resize(values, small, interpolation=cv2.INTER_AREA) for values in (grey, mask))
@@ -84,13 +101,6 @@ def relative_pose(source: Camera, target: Camera) -> tuple[Float[np.ndarray, "3 
     """Return rotation and translation (m) from one camera's frame into another's."""
     rotation = target.T_cam_world[:3, :3] @ source.T_cam_world[:3, :3].T
     return rotation, target.T_cam_world[:3, 3] - rotation @ source.T_cam_world[:3, 3]
-
-
-def head_images(
-    views: Sequence[StereoView], centre: Float[np.ndarray, "3"], radius_m: float, most_px: int = MOST_PX
-) -> tuple[HeadImage | None, ...]:
-    """Cut the windows of several photographs, as `head_image`."""
-    return tuple(head_image(view, centre, radius_m, most_px) for view in views)
 
 
 def _grey(image: Num[np.ndarray, "h w"] | Num[np.ndarray, "h w 3"]) -> Float[np.ndarray, "h w"]:
