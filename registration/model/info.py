@@ -100,12 +100,12 @@ def draw(data: GNMData, path: Path, schemes: dict[str, landmarks.LandmarkScheme]
     figure = Figure(figsize=(13, 5.2), dpi=110, layout="constrained")
     FigureCanvasAgg(figure)
     for axes, (title, angle) in zip(figure.subplots(1, 3), _VIEWS.items(), strict=True):
-        rotation = _rotation_y(angle)
+        rotation = rotation_y(angle)
         rotated = (vertices - centre) @ rotation.T
-        polygons, shades = _shaded(rotated, data.triangles, colours)
+        polygons, shades = shaded(rotated, data.triangles, colours)
         axes.add_collection(PolyCollection(list(polygons), facecolors=shades, edgecolors=shades, linewidths=0.3))
         for scheme in schemes.values():
-            points, outward = _landmarks_in_view(scheme, rotated, data.triangles)
+            points, outward = landmarks_in_view(scheme, rotated, data.triangles)
             axes.scatter(*points[outward].T[:2], s=5, color="black", linewidths=0)
         axes.set(xlim=(-half, half), ylim=(-half, half), aspect="equal", title=title)
         axes.set_axis_off()
@@ -117,15 +117,16 @@ def draw(data: GNMData, path: Path, schemes: dict[str, landmarks.LandmarkScheme]
     figure.savefig(path)
 
 
-def _rotation_y(degrees: float) -> Float[np.ndarray, "3 3"]:
+def rotation_y(degrees: float) -> Float[np.ndarray, "3 3"]:
+    """Return the rotation about +Y."""
     c, s = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
     return np.array([[c, 0, s], [0, 1, 0], [-s, 0, c]])
 
 
-def _shaded(
+def shaded(
     vertices: Float[np.ndarray, "V 3"], triangles: Int[np.ndarray, "F 3"], colours: Float[np.ndarray, "V 3"]
 ) -> tuple[Float[np.ndarray, "G 3 2"], Float[np.ndarray, "G 3"]]:
-    """The triangles that face +Z, the most distant first, and their shaded colours."""
+    """Return the triangles that face +Z, the most distant first, and their shaded colours."""
     corners = vertices[triangles]
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     normals /= np.linalg.norm(normals, axis=1, keepdims=True) + 1e-20
@@ -136,9 +137,10 @@ def _shaded(
     return corners[front, :, :2], np.clip(colours[triangles[front]].mean(1) * shade[:, None], 0, 1)
 
 
-def _landmarks_in_view(
+def landmarks_in_view(
     scheme: landmarks.LandmarkScheme, vertices: Float[np.ndarray, "V 3"], triangles: Int[np.ndarray, "F 3"]
 ) -> tuple[Float[np.ndarray, "L 3"], np.ndarray]:
+    """Return a scheme's points on rotated vertices, and which of them lie on surfaces that face +Z."""
     corners = vertices[triangles]
     normals = np.zeros_like(vertices)
     np.add.at(normals, triangles, np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])[:, None])

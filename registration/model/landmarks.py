@@ -174,7 +174,12 @@ def check_topology(scheme: LandmarkScheme, data: gnm_npz.GNMData, path: object) 
 
 def write_scheme(scheme: LandmarkScheme, model_path: Path) -> Path:
     """Write a scheme as `head_sparse_NAME.txt` into a model file's folder. Returns its path."""
-    return write_scheme_file(scheme, Path(model_path).with_name(f"{_PREFIX}{scheme.name}.txt"))
+    return write_scheme_file(scheme, scheme_file(model_path, scheme.name))
+
+
+def scheme_file(model_path: Path, name: str) -> Path:
+    """Return where a scheme of a model lies: `head_sparse_NAME.txt` beside its file."""
+    return Path(model_path).with_name(f"{_PREFIX}{name}.txt")
 
 
 def write_scheme_file(scheme: LandmarkScheme, path: Path) -> Path:

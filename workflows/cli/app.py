@@ -57,6 +57,7 @@ GROUPS: Mapping[str, Mapping[str, Command]] = {
     "Model": {
         "coregister": coregister.coregister,
         "model bootstrap": model.bootstrap,
+        "model landmarks": model.landmarks,
         "model fetch": model.fetch,
         "model info": model.info,
         "model export": model.export,

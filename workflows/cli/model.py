@@ -5,7 +5,7 @@ from typing import Annotated, Literal
 
 from tyro.conf import Positional, arg
 
-from workflows.cli.options import Folder, OptionalFolder, OptionalImage, OptionalModel, Seed
+from workflows.cli.options import Folder, ModelFile, OptionalFile, OptionalFolder, OptionalImage, OptionalModel, Seed
 
 
 def info(file: Positional[Annotated[Path, arg(metavar="FILE")]], /, out: OptionalImage = None) -> int:
@@ -119,4 +119,37 @@ def bootstrap(out: OptionalModel = None) -> int:
     from coregister.first_model.build import bootstrap
 
     print(bootstrap(out))
+    return 0
+
+
+def landmarks(
+    model: ModelFile,
+    provider: Annotated[str, arg(metavar="NAME")] = "face478",
+    out: OptionalFile = None,
+    picture: OptionalImage = None,
+    identities: Annotated[int, arg(metavar="N")] = 24,
+    seed: Seed = 0,
+) -> int:
+    """Make the map of a detector's landmarks on a model: points of its surface, with a spread of each.
+
+    People of the model are rendered with expressions from several sides, and the detector is run on the pictures. The
+    map has the points of the surface that its landmarks mark, and how far they stray from them on people that were
+    left out. Lids, lips, irises and both sides are checked. Takes minutes.
+
+    Args:
+        model: The head model, a GNM NPZ file.
+        provider: The landmark provider: face478, or the import path of another one, as module:function.
+        out: The file to write; by default head_sparse_SCHEME.txt beside the model, where registrations find it.
+        picture: Picture of the points on the model, coloured by their spread.
+        identities: Number of rendered people.
+        seed: Seed of people, expressions, cameras and light.
+    """
+    from registration.detect.map_renders import RenderSettings
+    from registration.progress import console_progress
+    from workflows.steps.landmark_map import make_landmark_map
+
+    settings = RenderSettings(identities=identities, seed=seed)
+    with console_progress() as progress:
+        path, lines = make_landmark_map(model, provider, out, settings, picture, progress)
+    print("\n".join((*lines, str(path))))
     return 0
