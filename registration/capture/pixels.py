@@ -142,6 +142,15 @@ def _undistorted(camera: Camera, landmarks: Float[np.ndarray, "L 3"]) -> Float[n
     return landmarks
 
 
+def distort_points(camera: Camera, points: Float[np.ndarray, "P 2"]) -> Float[np.ndarray, "P 2"]:
+    """Return pixels of the stored image, with the lens' distortion, for pixels of the undistorted full-size image."""
+    if not camera.distortion or not len(points):
+        return points.copy()
+    rays = np.column_stack([points, np.ones(len(points))]) @ np.linalg.inv(camera.intrinsics).T
+    lens = np.array(camera.distortion)
+    return cv2.projectPoints(rays, np.zeros(3), np.zeros(3), camera.intrinsics, lens)[0][:, 0]
+
+
 def read_image(path: Path, camera: Camera, colour: Colour = _SRGB) -> np.ndarray:
     """Read an image as (H, W, 3) uint8 or uint16 sRGB, distorted. Grey is repeated; alpha and EXIF are ignored.
 

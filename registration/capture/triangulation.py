@@ -1,5 +1,7 @@
 """Triangulate landmarks over the views of a capture, robust to outliers and to miscalibrated views."""
 
+from collections.abc import Sequence
+from dataclasses import dataclass
 from itertools import combinations
 
 import numpy as np
@@ -13,6 +15,7 @@ from registration.types import Camera, Capture, View
 MIN_CONFIDENCE = 0.5  # a 2D landmark is used above it
 MAX_PAIRS = 400  # of views that propose a point; 29 views have 406
 MAX_RESIDUAL = 0.01  # of an inlier, as a fraction of the image's geometric mean side
+MAX_DEVIATION = 3.5  # of an inlier, as a multiple of its spread, where that is stated
 MIN_ANGLE = np.radians(0.5)  # between the widest two rays; below it depth is not determined
 
 
@@ -26,7 +29,9 @@ def triangulate(
     reweighted from algebraic to reprojection error. An outlier in one view therefore costs that view only.
 
     Args:
-        capture: its landmarks are used where their confidence is above `MIN_CONFIDENCE`.
+        capture: its landmarks are used where their confidence is above `MIN_CONFIDENCE`. Where the views state the
+            spread of the scheme's landmarks, they count by it, and what deviates by more than `MAX_DEVIATION` of it is
+            an outlier.
         scheme: name of the landmark scheme.
 
     Returns:
@@ -38,12 +43,37 @@ def triangulate(
     if not views:
         return np.zeros((0, 3)), np.zeros(0, np.int64), np.zeros(0)
     pixels = np.stack([undistort_landmarks(view, scheme) for view in views])  # N L 3
+    stated = all(scheme in view.landmark_spread_px for view in views)
+    spread_px = np.stack([view.landmark_spread_px[scheme] for view in views]) if stated else None
+    return triangulate_pixels([view.camera for view in views], pixels, spread_px)
+
+
+def triangulate_pixels(
+    cameras: Sequence[Camera],
+    pixels: Float[np.ndarray, "N L 3"],
+    spread_px: Float[np.ndarray, "N L"] | None = None,
+    *,
+    max_pairs: int = MAX_PAIRS,
+) -> tuple[Float[np.ndarray, "L 3"], Int[np.ndarray, "L"], Float[np.ndarray, "L"]]:
+    """Triangulate landmarks of undistorted images, as `triangulate`.
+
+    Args:
+        cameras: of the views; their distortion is ignored.
+        pixels: x_px, y_px, confidence.
+        spread_px: standard deviation along each axis; None: that of all is alike.
+        max_pairs: of views that propose a point.
+
+    Returns:
+        As `triangulate`.
+    """
     observed = (pixels[..., 2] > MIN_CONFIDENCE) & np.isfinite(pixels).all(-1)
-    rays = np.stack([_normalized(view.camera.intrinsics, xy) for view, xy in zip(views, pixels[..., :2], strict=True)])
-    origin = capture_origin([view.camera for view in views])
-    poses = np.stack([view.camera.relative_to(origin).T_cam_world[:3] for view in views])
-    focals = np.array([[view.camera.intrinsics[0, 0], view.camera.intrinsics[1, 1]] for view in views])
-    limits = np.array([inlier_limit_px(view.camera) for view in views])
+    rays = np.stack([_normalized(c.intrinsics, xy) for c, xy in zip(cameras, pixels[..., :2], strict=True)])
+    origin = capture_origin(cameras)
+    poses = np.stack([camera.relative_to(origin).T_cam_world[:3] for camera in cameras])
+    focals = np.array([[camera.intrinsics[0, 0], camera.intrinsics[1, 1]] for camera in cameras])
+    limits = np.repeat([[inlier_limit_px(camera)] for camera in cameras], pixels.shape[1], 1)
+    if spread_px is not None:
+        limits = MAX_DEVIATION * spread_px
 
     count = pixels.shape[1]
     points, used, residuals = np.full((count, 3), np.nan), np.zeros(count, np.int64), np.full(count, np.nan)
@@ -51,11 +81,24 @@ def triangulate(
         index = np.flatnonzero(observed[:, landmark])
         if len(index) < 2:
             continue
-        solution = _solve(rays[index, landmark], poses[index], focals[index], limits[index])
+        of_views = _Observations(
+            rays=rays[index, landmark], poses=poses[index], focals=focals[index], limits=limits[index, landmark]
+        )
+        solution = _solve(of_views, max_pairs, weighted=spread_px is not None)
         if solution is not None:
             points[landmark], inliers, residuals[landmark] = solution
             used[landmark] = inliers.sum()
     return points + origin, used, residuals
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Observations:
+    """One landmark in the views that see it."""
+
+    rays: Float[np.ndarray, "N 2"]
+    poses: Float[np.ndarray, "N 3 4"]
+    focals: Float[np.ndarray, "N 2"]
+    limits: Float[np.ndarray, "N"]  # px, of an inlier's error
 
 
 def _normalized(intrinsics: Float[np.ndarray, "3 3"], xy: Float[np.ndarray, "L 2"]) -> Float[np.ndarray, "L 2"]:
@@ -65,30 +108,29 @@ def _normalized(intrinsics: Float[np.ndarray, "3 3"], xy: Float[np.ndarray, "L 2
 
 
 def _solve(
-    rays: Float[np.ndarray, "N 2"],
-    poses: Float[np.ndarray, "N 3 4"],
-    focals: Float[np.ndarray, "N 2"],
-    limits: Float[np.ndarray, "N"],
+    of_views: _Observations, max_pairs: int, *, weighted: bool
 ) -> tuple[Float[np.ndarray, "3"], Bool[np.ndarray, "N"], float] | None:
-    """Solve one landmark: best pair, then its inliers together.
+    """Solve one landmark: best pair, then its inliers together; `weighted`: a view counts by its limit.
 
     Returns the point, its inliers and its rms error (px); None if no two views agree or their rays are parallel.
     """
+    rays, poses, focals, limits = of_views.rays, of_views.poses, of_views.focals, of_views.limits
     rows = rays[:, :, None] * poses[:, 2:3] - poses[:, :2]  # N 2 4: the two DLT equations of a view
     pairs = np.array(list(combinations(range(len(rays)), 2)))
-    if len(pairs) > MAX_PAIRS:
-        pairs = pairs[np.linspace(0, len(pairs) - 1, MAX_PAIRS).astype(int)]
+    if len(pairs) > max_pairs:
+        pairs = pairs[np.linspace(0, len(pairs) - 1, max_pairs).astype(int)]
     proposals = _null_points(rows[pairs].reshape(len(pairs), 4, 4))
     errors = _errors(proposals, rays, poses, focals)  # P N, px
     best = np.minimum(errors / limits, 1.0).sum(-1).argmin()
     inliers = errors[best] < limits
     point = proposals[best]
+    weights = limits.min() / limits if weighted else np.ones(len(limits))
     for _ in range(3):
         if inliers.sum() < 2:
             return None
         # Algebraic error is depth times reprojection error: dividing by the last depth leaves the latter.
         depth = poses[inliers, 2, :3] @ point + poses[inliers, 2, 3]
-        scaled = rows[inliers] * (focals[inliers] / depth[:, None])[:, :, None]
+        scaled = rows[inliers] * (weights[inliers, None] * focals[inliers] / depth[:, None])[:, :, None]
         point = _null_points(scaled.reshape(1, -1, 4))[0]
         error = _errors(point[None], rays, poses, focals)[0]
         inliers = error < limits

@@ -19,6 +19,7 @@ from jaxtyping import Float, UInt8
 from registration.detect import short_range
 from registration.detect.blendshapes import NAMES, SUBSET
 from registration.detect.crops import Crop
+from registration.detect.faces import distinct
 from registration.detect.facing import facing, seen
 from registration.detect.provider import Face
 from registration.detect.short_range import Detection
@@ -95,7 +96,7 @@ class Face478Provider:
         """
         detections = short_range.detect(self._nets.detector, image)[:MAX_FACES]
         faces = [face for detection in detections if (face := self._refine(image, detection)) is not None]
-        return _distinct(sorted(faces, key=lambda face: -face.presence))
+        return distinct(faces)
 
     def _refine(self, image: UInt8[np.ndarray, "H W 3"], detection: Detection) -> Face | None:
         points, presence = self._predict(image, detection.crop(SCALE))
@@ -147,15 +148,3 @@ class Face478Provider:
 def _crop_of(points: Float[np.ndarray, "478 2"]) -> Crop:
     across = points[LEFT_EYE] - points[RIGHT_EYE]
     return Crop.around(points, float(np.arctan2(across[1], across[0])), SCALE)
-
-
-def _distinct(faces: Sequence[Face]) -> list[Face]:
-    """The faces without those whose centre lies in the middle of a more certain one's box."""
-    kept: list[Face] = []
-    for face in faces:
-        centre = (face.box[:2] + face.box[2:]) / 2
-        sizes = [(other.box[2:] - other.box[:2]).max() for other in kept]
-        middles = [(other.box[:2] + other.box[2:]) / 2 for other in kept]
-        if all(np.linalg.norm(centre - m) > 0.4 * size for m, size in zip(middles, sizes, strict=True)):
-            kept.append(face)
-    return kept
