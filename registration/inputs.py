@@ -13,6 +13,8 @@ from registration.capture.native import read_capture
 from registration.capture.origin import capture_origin
 from registration.capture.scan import Scan, read_scan
 from registration.capture.triangulation import triangulate
+from registration.completion.plan import CompletionPlan, plan_completion
+from registration.detect.providers import load_provider
 from registration.doctor.ledger import Ledger
 from registration.doctor.validation import validate_capture
 from registration.errors import InputError
@@ -34,6 +36,9 @@ from registration.types import Capture, Registration
 NOT_HASHED = {  # fields of the options that decide nothing by themselves, and why
     "landmark_files": "their contents are hashed as the schemes",
     "views": "the names of the selected views are hashed",
+    "detect": "what is made is hashed",
+    "stereo": "what is made is hashed",
+    "detector": "its version is hashed where it is used",
 }
 
 
@@ -43,10 +48,12 @@ class RegistrationInputs:
 
     capture: Capture  # with the selected views only, and its landmarks in the schemes' order
     ledger: Ledger  # of all views
+    head_rows: Mapping[str, int] | None  # view's name -> height of the head, px of the stored image; None: unknown
     data: gnm_npz.GNMData
     schemes: Mapping[str, LandmarkScheme]
     origin: Float[np.ndarray, "3"]  # world, m: the fit's own world has its origin here
     landmarks: Mapping[str, Float[np.ndarray, "L 3"]]  # triangulated, world; of the shared schemes
+    plan: CompletionPlan  # of what the capture lacks
     recipe: Recipe
     neutral: Registration | None
     scan: Scan | None  # whose normals stand in for normal maps, or whose surface is fitted; None: neither
@@ -86,18 +93,23 @@ def read_inputs(
         start = load_registration(neutral)
         _check_topology(start, data, neutral, model_path)
         _check_subject(start, neutral, capture)
-    schemes = used_schemes(read_schemes(model_path, data, options.landmark_files), capture)
-    landmarks = _triangulated(selected, schemes)
-    _check_head_can_be_found(selected, landmarks)
+    every = read_schemes(model_path, data, options.landmark_files)
+    plan = completion_plan(selected, every, options)
+    schemes = used_schemes(every, capture, detected=load_provider(options.detector).scheme if plan.landmarks else None)
+    landmarks = triangulated_landmarks(selected, schemes)
+    if not plan.landmarks:
+        _check_head_can_be_found(selected, landmarks)
     scan = _scan_of_the_fit(selected, options)
-    digests, config = _deciding(capture, data, schemes, start, options)
+    digests, config = _deciding(capture, data, every, start, options)
     return RegistrationInputs(
         capture=selected,
         ledger=ledger,
+        head_rows=ledger.head_rows,
         data=data,
         schemes=schemes,
         origin=capture_origin([view.camera for view in capture.views]),
         landmarks=landmarks,
+        plan=plan,
         recipe=recipe if start is None else expression_recipe(recipe),
         neutral=start,
         scan=scan,
@@ -125,9 +137,30 @@ def read_schemes(model_path: Path, data: gnm_npz.GNMData, files: Mapping[str, Pa
     return schemes
 
 
-def used_schemes(schemes: Mapping[str, LandmarkScheme], capture: Capture) -> dict[str, LandmarkScheme]:
-    """Return the schemes that count in a registration: all but shipped maps of landmarks that the capture lacks."""
-    captured = {name for view in capture.views for name in view.landmarks}
+def completion_plan(
+    capture: Capture, schemes: Mapping[str, LandmarkScheme], options: RegisterOptions
+) -> CompletionPlan:
+    """Return what a registration makes of what the capture lacks. Raises InputError if there is no such detector."""
+    return plan_completion(
+        capture,
+        schemes,
+        detected=load_provider(options.detector).scheme if options.detect else None,
+        stereo=options.stereo,
+        use_scan=options.use_scan != "never",
+    )
+
+
+def used_schemes(
+    schemes: Mapping[str, LandmarkScheme], capture: Capture, *, detected: str | None = None
+) -> dict[str, LandmarkScheme]:
+    """Return the schemes that count in a registration: all but shipped maps of landmarks that the capture lacks.
+
+    Args:
+        schemes: of the model.
+        capture: with its own landmarks.
+        detected: scheme of landmarks that will be detected, if any.
+    """
+    captured = {name for view in capture.views for name in view.landmarks} | {detected}
     return {name: scheme for name, scheme in schemes.items() if not scheme.shipped or name in captured}
 
 
@@ -166,15 +199,19 @@ def _deciding(
     """Digests of the inputs, and the resolved options as JSON values."""
     recipe, selected = load_recipe(options.recipe), _select_views(capture, options.views)
     digests = {"capture": hashing.hash_capture(selected), "model": gnm_npz.content_hash(data)}
-    digests |= {
-        f"landmarks {name}": hashing.hash_fields(scheme) for name, scheme in used_schemes(schemes, capture).items()
-    }
+    plan = completion_plan(selected, schemes, options)
+    detected = None
+    if plan.landmarks:
+        provider = load_provider(options.detector)
+        detected, digests["detector"] = provider.scheme, provider.version
+    used = used_schemes(schemes, capture, detected=detected)
+    digests |= {f"landmarks {name}": hashing.hash_fields(scheme) for name, scheme in used.items()}
     if neutral is not None:
         digests["neutral"] = hashing.hash_fields(neutral)
         recipe = expression_recipe(recipe)
     chosen = replace(options, recipe=recipe)
     config = {name: hashing.to_jsonable(value) for name, value in hashing.hashed_fields(chosen, NOT_HASHED).items()}
-    return digests, {**config, "views": [view.name for view in selected.views]}
+    return digests, {**config, "views": [view.name for view in selected.views], "made": list(plan.channels)}
 
 
 def _reversed_files(capture: Capture, schemes: Mapping[str, LandmarkScheme]) -> tuple[str, ...]:
@@ -213,8 +250,14 @@ def _scan_of_the_fit(capture: Capture, options: RegisterOptions) -> Scan | None:
     return read_scan(capture.scan) if needed else None
 
 
-def _triangulated(capture: Capture, schemes: Mapping[str, LandmarkScheme]) -> dict[str, Float[np.ndarray, "L 3"]]:
-    """Triangulated landmarks (world, metres; NaN: failed) of every scheme that capture and model share."""
+def triangulated_landmarks(
+    capture: Capture, schemes: Mapping[str, LandmarkScheme]
+) -> dict[str, Float[np.ndarray, "L 3"]]:
+    """Return triangulated landmarks (world, metres; NaN: failed) of every scheme that capture and model share.
+
+    Raises:
+        InputError: a scheme has another length in the capture.
+    """
     landmarks = {}
     for name in sorted({name for view in capture.views for name in view.landmarks} & set(schemes)):
         landmarks[name] = triangulate(capture, name)[0]

@@ -47,6 +47,7 @@ _LANDMARK_FILES: PrimitiveConstructorSpec[Any] = PrimitiveConstructorSpec(
     is_instance=lambda value: isinstance(value, Mapping),
     str_from_instance=lambda value: [f"{scheme}={file}" for scheme, file in value.items()],
 )
+DETECTOR = "face478"
 _LANDMARKS_ARGUMENT = arg(name="landmarks", help_behavior_hint="(optional)")
 
 
@@ -67,6 +68,10 @@ class RegisterOptions:
         use_scan: Whether the capture's scan takes part in the fit. auto: its normals, in views without normal maps,
             and its surface, if no view has normal maps. always: its surface beside normal maps too. never: the scan
             is only measured, so that its distances judge the fit.
+        detect: Detect landmarks in the photographs where the capture lacks them or labels, and make masks and labels
+            with them.
+        stereo: Compute depths and normals from the photographs where the capture has neither normals nor a scan.
+        detector: The landmark provider: face478, or the import path MODULE:FUNCTION of a function that returns one.
         landmark_files: The model's vertices of landmark schemes, instead of the files next to the model.
     """
 
@@ -76,6 +81,9 @@ class RegisterOptions:
     deterministic: bool = False
     variant: Literal["llvm", "cuda"] = "llvm"
     use_scan: Literal["auto", "always", "never"] = "auto"
+    detect: bool = True
+    stereo: bool = True
+    detector: Annotated[str, arg(metavar="NAME")] = DETECTOR
     landmark_files: Annotated[Mapping[str, Path], _LANDMARK_FILES, _LANDMARKS_ARGUMENT] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -94,6 +102,9 @@ class RegisterOptions:
         words += ["--deterministic"] if self.deterministic else []
         words += ["--variant", self.variant] if self.variant != default.variant else []
         words += ["--use-scan", self.use_scan] if self.use_scan != default.use_scan else []
+        words += ["--no-detect"] if not self.detect else []
+        words += ["--no-stereo"] if not self.stereo else []
+        words += ["--detector", self.detector] if self.detector != default.detector else []
         if self.landmark_files:
             words += ["--landmarks", *(f"{scheme}={file}" for scheme, file in sorted(self.landmark_files.items()))]
         return words

@@ -105,6 +105,17 @@ def read_photograph(view: View, *, downsample: int = 1) -> tuple[UInt8[np.ndarra
     return np.round(values * scale).astype(np.uint8), downsampled_camera(view.camera, downsample)
 
 
+def read_coverage(view: View, *, downsample: int = 1) -> Float[np.ndarray, "H W"]:
+    """Decode and undistort a view's mask alone; arguments as `read_photograph`.
+
+    Raises:
+        InputError: as `read_mask`.
+    """
+    assert view.mask is not None
+    strips = list(_strips(view.camera, downsample))
+    return _resample(read_mask(view.mask, view.camera), _to_coverage, strips, _valid(view.camera, strips))
+
+
 def downsampled_camera(camera: Camera, downsample: int) -> Camera:
     """Return the undistorted camera of `read_view`'s arrays, whose pixels are blocks of `downsample` x `downsample`."""
     columns, rows = camera.width_px // downsample, camera.height_px // downsample

@@ -4,6 +4,7 @@ from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
+from registration.detect.providers import PROVIDERS
 from registration.errors import InputError
 from registration.fit.recipes import RECIPES, load_recipe, named_recipe
 from registration.options import RegisterOptions
@@ -32,10 +33,18 @@ def from_job(value: Mapping[str, Any] | None) -> RegisterOptions:
     """Return the options in a job's arguments, from an untrusted source; None: the defaults.
 
     Raises:
-        InputError: a field is unknown or has a wrong type; the recipe is an import path, which would run code of the
-            sender's; or landmark files are named, which could lie anywhere.
+        InputError: a field is unknown or has a wrong type; the recipe or the detector is an import path, which would
+            run code of the sender's; or landmark files are named, which could lie anywhere.
     """
     options: RegisterOptions = structure(value or {}, RegisterOptions, where="options", title="options of a job")
     if isinstance(options.recipe, str):
         named_recipe(options.recipe)
+    if options.detector not in PROVIDERS:
+        raise InputError(
+            "There is no such landmark provider",
+            where="detector",
+            expected=" or ".join(PROVIDERS),
+            got=options.detector,
+            fix="choose one of them",
+        )
     return to_job(options)
