@@ -5,10 +5,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 
 from registration.detect import face478_points as named
-from registration.detect.map_regions import lid_rims
+from registration.detect.map_regions import lid_edges
 from registration.frames import MM_PER_M
 from registration.model import regions
 from registration.model.gnm_npz import GNMData
@@ -16,7 +16,7 @@ from registration.model.info import COLOURS, landmarks_in_view, rotation_y, shad
 from registration.model.landmarks import LandmarkScheme
 
 CLOSED, OPEN_MOUTH = "closed lids", "jaw open"  # expressions that are checked where the basis can make them
-APERTURE_MM = 2.5  # largest difference of the lids' distance from that of the model's own rims
+APERTURE_MM = 2.0  # largest difference of the lids' distance from that of the model's own lids
 SYMMETRY_MM = 2.0  # largest distance of a point from its counterpart's mirror image
 PUPIL_MM = 2.0  # largest distance of the middle of an iris' border from its centre
 LEAST_OPENING = 0.7  # of the mouth, between the inner lines, of that of the lips
@@ -55,10 +55,9 @@ def check_map(
         expressions: displacements, metres, by name.
     """
     template = data.template_vertex_positions.astype(np.float64)
-    rim = lid_rims(data)
-    checks = [_lids(scheme, rim, template, "open")]
+    checks = [_lids(data, scheme, template, "open")]
     if CLOSED in expressions:
-        checks.append(_lids(scheme, rim, template + expressions[CLOSED], "closed"))
+        checks.append(_lids(data, scheme, template + expressions[CLOSED], "closed"))
     checks.append(_lips(scheme, template, "closed"))
     if OPEN_MOUTH in expressions:
         checks.append(_lips(scheme, template + expressions[OPEN_MOUTH], "open"))
@@ -67,27 +66,36 @@ def check_map(
 
 
 def lid_apertures(
-    scheme: LandmarkScheme, rim: Bool[np.ndarray, "V"], vertices: Float[np.ndarray, "V 3"]
+    data: GNMData, scheme: LandmarkScheme, vertices: Float[np.ndarray, "V 3"]
 ) -> dict[str, tuple[float, float]]:
-    """Return each eye's height in its middle: between the map's points, and between the model's rims; metres."""
-    points, edge = scheme.points(vertices), vertices[rim]
+    """Return the height of each eye's opening in its middle, metres: of the map's points, and of the model's lids.
+
+    Lids that overlap are closed: 0.
+
+    Args:
+        data: the model.
+        scheme: the map, of 478 points.
+        vertices: of a head in the model's frame.
+    """
+    points = scheme.points(vertices)
     result = {}
     for side, (upper, lower, _, _) in _LIDS.items():
+        tops, bottoms = (vertices[rows] for rows in lid_edges(data, left=side == "left"))
         heights, truth = [], []
         for top, bottom in zip(upper[3:6], lower[3:6], strict=True):
-            heights.append(np.linalg.norm(points[top] - points[bottom]))
+            heights.append(max(0.0, points[top, 1] - points[bottom, 1]))
             middle = (points[top, 0] + points[bottom, 0]) / 2
-            column = edge[np.abs(edge[:, 0] - middle) < _COLUMN_M]
-            truth.append(np.ptp(column, axis=0)[1:].max() if len(column) else np.nan)
+            above, below = (edge[np.abs(edge[:, 0] - middle) < _COLUMN_M, 1] for edge in (tops, bottoms))
+            truth.append(max(0.0, above.min() - below.max()) if len(above) and len(below) else np.nan)
         result[side] = (float(np.mean(heights)), float(np.nanmean(truth)))
     return result
 
 
-def _lids(scheme: LandmarkScheme, rim: Bool[np.ndarray, "V"], vertices: Float[np.ndarray, "V 3"], state: str) -> Check:
-    apertures = lid_apertures(scheme, rim, vertices)
+def _lids(data: GNMData, scheme: LandmarkScheme, vertices: Float[np.ndarray, "V 3"], state: str) -> Check:
+    apertures = lid_apertures(data, scheme, vertices)
     differences = [MM_PER_M * abs(own - truth) for own, truth in apertures.values()]
     detail = ", ".join(
-        f"{side} {MM_PER_M * own:.1f} mm (rims {MM_PER_M * truth:.1f})" for side, (own, truth) in apertures.items()
+        f"{side} {MM_PER_M * own:.1f} mm (lids {MM_PER_M * truth:.1f})" for side, (own, truth) in apertures.items()
     )
     return Check(name=f"lid aperture, {state}", passed=bool(max(differences) <= APERTURE_MM), detail=detail)
 

@@ -1,7 +1,7 @@
 """Where on a model the landmarks of a scheme may lie: skin; lips, lids and irises on their own parts."""
 
 import numpy as np
-from jaxtyping import Bool
+from jaxtyping import Bool, Float, Int
 
 from registration.detect import face478_points as named
 from registration.detect.face478 import SCHEME as FACE478
@@ -10,6 +10,7 @@ from registration.geometry.topology import edges
 from registration.model import regions
 from registration.model.gnm_npz import GNMData
 
+_EDGE_RINGS = 2
 _LID_BORDER_M = 5e-4  # by which a lid's points may lie beyond the line between the eye's corners
 
 
@@ -47,17 +48,38 @@ def lid_rims(data: GNMData) -> Bool[np.ndarray, "V"]:
     return rim
 
 
+def lid_edges(data: GNMData, *, left: bool) -> tuple[Int[np.ndarray, "U"], Int[np.ndarray, "W"]]:
+    """Return the vertices of one eye's upper and of its lower lid that may border the visible opening.
+
+    The skin of a lid ends behind its edge, on the eyeball: the rims and `_EDGE_RINGS` rings of skin around them.
+    """
+    a, b = edges(data.triangles).vertices.T
+    outside, near = regions.exterior(data), lid_rims(data)
+    for _ in range(_EDGE_RINGS):
+        grown = near.copy()
+        grown[a[near[b]]] = True
+        grown[b[near[a]]] = True
+        near = grown & outside
+    height = _above_the_corners(data, left=left)
+    return np.flatnonzero(near & (height > 0)), np.flatnonzero(near & (height < 0))
+
+
 def _upper_and_lower(
     data: GNMData, skin: Bool[np.ndarray, "V"], *, left: bool
 ) -> tuple[Bool[np.ndarray, "V"], Bool[np.ndarray, "V"]]:
     """The skin of one eye's lids above and below the line between its corners, in the template."""
+    height = _above_the_corners(data, left=left)
+    lids = skin & (regions.lids(data) > 0)
+    return lids & (height > -_LID_BORDER_M), lids & (height < _LID_BORDER_M)
+
+
+def _above_the_corners(data: GNMData, *, left: bool) -> Float[np.ndarray, "V"]:
+    """The template's height above the line between the corners of one eye, metres; NaN on the other side."""
     points = data.template_vertex_positions.astype(np.float64)
     side = (points[:, 0] > 0) == left
     rim = np.flatnonzero(lid_rims(data) & side)
     if not len(rim):
-        return skin & False, skin & False
+        return np.full(len(points), np.nan)
     inner, outer = points[rim[[points[rim, 0].argmin(), points[rim, 0].argmax()]]]
     slope = (outer[1] - inner[1]) / max(outer[0] - inner[0], 1e-6)
-    height = points[:, 1] - (inner[1] + slope * (points[:, 0] - inner[0]))
-    lids = skin & side & (regions.lids(data) > 0)
-    return lids & (height > -_LID_BORDER_M), lids & (height < _LID_BORDER_M)
+    return np.where(side, points[:, 1] - (inner[1] + slope * (points[:, 0] - inner[0])), np.nan)
