@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float
 
+from registration.capture.origin import in_world
 from registration.capture.visual_hull import outside_masks
 from registration.completion.complete import CODE, Completer
 from registration.completion.first_fit import HeadFitter
@@ -22,7 +22,6 @@ from registration.evaluate.evaluation import RegistrationEvaluation, evaluate_re
 from registration.evaluate.verdict import judge
 from registration.evaluate.viewpoint import intersection_figures
 from registration.fit.context import FitContext
-from registration.fit.initialization import select_spread_views
 from registration.fit.problem import FitProblem, FitTrace
 from registration.fit.recipes import Stage
 from registration.fit.start import initial_guess
@@ -38,9 +37,9 @@ from registration.options import RegisterOptions
 from registration.progress import NullProgress, Progress
 from registration.render import backend
 from registration.report.comparison import Comparison, compare_views
-from registration.report.inputs import ReportInputs, distance_heat_map, report_views
+from registration.report.inputs import ReportInputs, distance_heat_map
 from registration.report.page import render_report
-from registration.report.stage_snapshots import write_stage
+from registration.report.stage_snapshots import StageSnapshots
 from registration.storage import hashing
 from registration.storage.registration_folder import (
     FILES,
@@ -56,7 +55,6 @@ from registration.types import Camera, HeadPose, Registration, Status
 CONVERGED_MM = 0.05  # 95th percentile of vertex motion over the last tenth of the last stage
 MAX_LANDMARK_PX = 3.0  # median residual at 512 px of head height
 _NAMED_VIEW_RATIO = 2  # times MAX_LANDMARK_PX: views with a larger error are named
-_STAGE_VIEWS = 3
 
 
 def register(
@@ -105,8 +103,8 @@ def register(
     progress.message("comparing with the views")
     comparison = compare_views(fitted.problem)
     provenance = _provenance(capture, model, out, options, neutral)
-    collected = replace(_collect(inputs, fitted, comparison), provenance=provenance)
-    registration, page = _evaluate(inputs, comparison, collected, progress)
+    collected = _with_made(replace(_collect(inputs, fitted, comparison), provenance=provenance), completion)
+    registration, page = _evaluate(inputs, comparison, collected, completion, progress)
     save_registration(registration, out, page)
     return registration
 
@@ -136,11 +134,23 @@ def _completed(
         seed=options.seed,
         device=device,
     )
-    completer = Completer(inputs.plan, fitter, load_provider(options.detector), inputs.origin, progress)
+    provider = load_provider(options.detector)
+    completer = Completer(inputs.plan, fitter, provider, inputs.origin, progress)
     key = hashing.input_hash(inputs.digests, {"made": inputs.plan.channels, "seed": options.seed, "code": CODE})
-    completion = completed(inputs.capture, key, partial(completer.complete, inputs.capture), progress)
+    completion = completed(inputs.capture, key, partial(completer.complete, inputs.capture), provider.scheme, progress)
     landmarks = triangulated_landmarks(completion.capture, inputs.schemes)
     return replace(inputs, capture=completion.capture, landmarks=landmarks, head_rows=completion.head_rows), completion
+
+
+def _with_made(registration: Registration, completion: Completion | None) -> Registration:
+    """The registration with what was made for it: figures, notes, durations, and where the files are."""
+    if completion is None:
+        return registration
+    figures = {**registration.figures, "made": completion.figures}
+    figures["notes"] = [*completion.notes, *figures["notes"]]
+    seconds = {**{f"made: {step}": value for step, value in completion.seconds.items()}, **registration.seconds}
+    provenance = {**registration.provenance, "made": str(completion.folder)}
+    return replace(registration, figures=figures, seconds=seconds, provenance=provenance)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -169,7 +179,7 @@ def _fit(
     problem = FitProblem(context, initial)
     initial_time = time.perf_counter()
     seconds = {"targets": targets_time - start_time, "start": initial_time - targets_time}
-    snapshots = None if pictures is None else _Snapshots(problem, pictures, inputs.origin)
+    snapshots = None if pictures is None else StageSnapshots(problem, pictures, inputs.origin)
     steps = _StepProgress(inputs.recipe.stages, progress)
 
     def on_step(stage: Stage, step: int) -> None:
@@ -243,30 +253,6 @@ class _StepProgress:
         self._progress.update(self._done, self._total, stage)
 
 
-class _Snapshots:
-    """Writes an image and the mesh of the fit after its initial guess and after each stage."""
-
-    def __init__(self, problem: FitProblem, folder: Path, origin: Float[np.ndarray, "3"]):
-        self._problem, self._folder, self._origin = problem, folder, origin
-        self._views = select_spread_views(problem.context.pyramid[0].pixels.cameras, _STAGE_VIEWS)
-        self._states = ["start"]  # what the mesh is the result of, in order
-
-    def stage_begins(self, name: str) -> None:
-        """Write the state before stage `name`, once."""
-        if name == self._states[-1]:
-            return
-        views = report_views(*self._problem.render_views(self._views))
-        vertices = _in_world(self._problem.vertices().cpu().numpy(), self._origin)
-        label = f"{len(self._states) - 1:02d}_{self._states[-1]}"
-        write_stage(self._folder, label, views, vertices, self._problem.context.data.triangles)
-        self._states.append(name)
-
-
-def _in_world(points: Float[np.ndarray, "*P 3"], origin: Float[np.ndarray, "3"]) -> Float[np.ndarray, "*P 3"]:
-    """Points of the fit in the capture's world: as they are, or in float64 where its origin is far."""
-    return points + origin if origin.any() else points
-
-
 def _collect(inputs: RegistrationInputs, fitted: _Fitted, comparison: Comparison) -> Registration:
     """The result as arrays, with its status."""
     problem, trace = fitted.problem, fitted.trace
@@ -287,15 +273,15 @@ def _collect(inputs: RegistrationInputs, fitted: _Fitted, comparison: Comparison
         identity=array(parameters.identity),
         expression=array(parameters.expression),
         rotations=array(parameters.rotations),
-        translation=_in_world(array(parameters.translation), inputs.origin),
+        translation=in_world(array(parameters.translation), inputs.origin),
         scale=array(parameters.scale),
         offsets=array(offsets),
-        vertices=_in_world(vertices, inputs.origin),
+        vertices=in_world(vertices, inputs.origin),
         triangles=inputs.data.triangles,
         confidence=comparison.confidence,
         texture=array(problem.appearance.texture),
         corner_uvs=problem.context.corner_uvs,
-        landmarks={name: _in_world(scheme.points(vertices), inputs.origin) for name, scheme in inputs.schemes.items()},
+        landmarks={name: in_world(scheme.points(vertices), inputs.origin) for name, scheme in inputs.schemes.items()},
         seconds=fitted.seconds,
         history=trace.history,
         figures={
@@ -356,7 +342,11 @@ def _status(
 
 
 def _evaluate(
-    inputs: RegistrationInputs, comparison: Comparison, registration: Registration, progress: Progress
+    inputs: RegistrationInputs,
+    comparison: Comparison,
+    registration: Registration,
+    completion: Completion | None,
+    progress: Progress,
 ) -> tuple[Registration, str]:
     """The registration with its metrics, including those against a scan, and the report's page."""
     evaluation: RegistrationEvaluation | None = None
@@ -391,6 +381,7 @@ def _evaluate(
             class_names=comparison.class_names,
             heat_map=None if evaluation is None else distance_heat_map(registration, evaluation.vertex_distance_mm),
             versions=hashing.versions(),
+            made=None if completion is None else completion.sheet.read_bytes(),
             files={name: meaning for name, meaning in FILES.items() if name != REPORT},
         )
     )

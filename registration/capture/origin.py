@@ -22,3 +22,8 @@ def capture_origin(cameras: Sequence[Camera]) -> Float[np.ndarray, "3"]:
     across = np.eye(3) - axes[:, :, None] * axes[:, None]
     matrix = across.sum(0) + _TOWARDS_CAMERAS * len(cameras) * np.eye(3)
     return local_origin(middle + np.linalg.solve(matrix, np.einsum("nij,nj->i", across, centres - middle)))
+
+
+def in_world(points: Float[np.ndarray, "*P 3"], origin: Float[np.ndarray, "3"]) -> Float[np.ndarray, "*P 3"]:
+    """Return points of a fit in the capture's world: as they are, or in float64 where its origin is far."""
+    return points + origin if origin.any() else points

@@ -59,7 +59,7 @@ class Completer:
         self._origin, self._progress = origin, progress
         self._root = Path()  # of the written channels
         self._seconds: dict[str, float] = {}
-        self._figures: dict[str, Any] = {}
+        self._figures: dict[str, Any] = {"channels": list(plan.channels)}
         self._notes: list[str] = []
 
     def complete(self, capture: Capture, root: Path) -> dict[str, Any]:

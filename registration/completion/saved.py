@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from registration.completion.channels import attach
+from registration.completion.pictures import SHEET, draw_made
 from registration.progress import Progress
 from registration.segment.fitted import CLASSES
 from registration.storage.cache import cache_folder, make_cache_folder
@@ -28,14 +29,22 @@ class Completion:
     figures: Mapping[str, Any]
     seconds: Mapping[str, float]  # step -> duration
 
+    @property
+    def sheet(self) -> Path:
+        """The picture of what was made."""
+        return self.folder / SHEET
 
-def completed(capture: Capture, key: str, make: Callable[[Path], Mapping[str, Any]], progress: Progress) -> Completion:
+
+def completed(
+    capture: Capture, key: str, make: Callable[[Path], Mapping[str, Any]], scheme: str, progress: Progress
+) -> Completion:
     """Return the completion of a capture from the cache, or make it.
 
     Args:
         capture: as it was given.
         key: digest of all that decides the result.
         make: writes the channels into a folder and returns the record of it (`Completer.complete`).
+        scheme: of the landmarks that the picture shows.
         progress: where to report to.
 
     Raises:
@@ -48,6 +57,7 @@ def completed(capture: Capture, key: str, make: Callable[[Path], Mapping[str, An
         with atomic_directory(folder) as temporary:
             made = {"kind": KIND, "schema": SCHEMA, "key": key, **make(temporary)}
             write_json(temporary / RECORD, made)
+            draw_made(attach(capture, temporary, CLASSES), scheme, temporary / SHEET)
         record = read_json_of_kind(folder / RECORD, KIND)
         assert record is not None
         _prune(folder)

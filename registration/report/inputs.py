@@ -53,6 +53,7 @@ class ReportInputs:
     thumbnails: tuple[ReportView, ...] = ()  # all views, small
     class_names: tuple[str, ...] = ()
     heat_map: HeatMap | None = None
+    made: bytes | None = None  # a JPEG of the channels that were made from the photographs
     versions: Mapping[str, str] = field(default_factory=dict)
     files: Mapping[str, str] = field(default_factory=dict)  # of the registration folder -> what each is
 

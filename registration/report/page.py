@@ -1,5 +1,6 @@
 """The HTML page of one registration: self-contained, no external resources."""
 
+import base64
 import json
 from collections.abc import Mapping
 from typing import Any
@@ -48,6 +49,8 @@ def render_report(inputs: ReportInputs) -> str:
             _view(view_images(view), by_view.get(view.name, {}), _THUMBNAIL_QUALITY) for view in inputs.thumbnails
         ],
         open_views=_OPEN_VIEWS,
+        made="" if inputs.made is None else f"data:image/jpeg;base64,{base64.b64encode(inputs.made).decode()}",
+        made_channels=", ".join(registration.figures.get("made", {}).get("channels", [])),
         legend=[(name, CLASS_COLOURS[k % len(CLASS_COLOURS)]) for k, name in enumerate(inputs.class_names)],
         curves=Markup(loss_curves(registration.history)),
         times=[

@@ -6,10 +6,15 @@ import numpy as np
 from jaxtyping import Float, Int
 from PIL import Image
 
+from registration.capture.origin import in_world
+from registration.fit.initialization import select_spread_views
+from registration.fit.problem import FitProblem
 from registration.frames import linear_to_srgb
-from registration.report.inputs import ReportView
+from registration.report.inputs import ReportView, report_views
 from registration.storage.files import atomic_file
 from registration.storage.mesh import write_ply
+
+_STAGE_VIEWS = 3
 
 
 def write_stage(
@@ -47,3 +52,22 @@ def write_stage(
     with atomic_file(mesh) as temporary:
         write_ply(temporary, vertices, triangles)
     return mesh
+
+
+class StageSnapshots:
+    """Writes an image and the mesh of the fit after its initial guess and after each stage."""
+
+    def __init__(self, problem: FitProblem, folder: Path, origin: Float[np.ndarray, "3"]):
+        self._problem, self._folder, self._origin = problem, folder, origin
+        self._views = select_spread_views(problem.context.pyramid[0].pixels.cameras, _STAGE_VIEWS)
+        self._states = ["start"]  # what the mesh is the result of, in order
+
+    def stage_begins(self, name: str) -> None:
+        """Write the state before stage `name`, once."""
+        if name == self._states[-1]:
+            return
+        views = report_views(*self._problem.render_views(self._views))
+        vertices = in_world(self._problem.vertices().cpu().numpy(), self._origin)
+        label = f"{len(self._states) - 1:02d}_{self._states[-1]}"
+        write_stage(self._folder, label, views, vertices, self._problem.context.data.triangles)
+        self._states.append(name)
