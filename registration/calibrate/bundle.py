@@ -1,6 +1,6 @@
 """Bundle adjustment: cameras, focal lengths and points that explain image positions best.
 
-Levenberg-Marquardt on the normal equations, points eliminated by the Schur complement [Triggs et al. 2000, section 6],
+Levenberg-Marquardt on the normal equations, points eliminated by the Schur complement [Triggs 2000],
 outliers by Cauchy weights. Priors of points, focal lengths and distortion are residuals of their own; what neither
 images nor priors determine (the gauge) stays where it was.
 
@@ -19,7 +19,8 @@ from scipy.spatial.transform import Rotation
 _POSE, _OWN = 6, 7  # columns of a view: rotation, translation, and the deviation of its focal length
 _GROUP = 2  # columns of a group: logarithm of the focal length, k1
 _CAUCHY = 2.0  # standard deviations at which an observation's weight is halved
-_GAIN = 1e-7  # relative decrease of the cost below which the adjustment has converged
+_GAIN = 1e-6  # relative decrease of the cost below which the adjustment has converged
+_CHUNK = 2048  # points that are eliminated at a time
 _MIN_DEPTH_M = 1e-3  # points nearer to a camera, or behind it, have no image there
 
 
@@ -78,7 +79,7 @@ class Priors:
     point_sigma_m: Float[np.ndarray, "P"]
     focals_px: Float[np.ndarray, "G"]
     focal_sigma: Float[np.ndarray, "G"]  # of the logarithm
-    k1_sigma: float = 0.0  # around 0
+    k1_sigma: Float[np.ndarray, "G"] | float = 0.0  # around 0
     deviation_sigma: float = 0.0  # of a view's focal length from its group's, of the logarithm
 
 
@@ -162,7 +163,7 @@ def _prior_residuals(rig: Rig, points: np.ndarray, priors: Priors) -> list[np.nd
     return [
         (points - priors.points) * _inverse(priors.point_sigma_m)[:, None],
         np.log(rig.focals_px / priors.focals_px) * _inverse(priors.focal_sigma),
-        rig.k1 * _inverse(np.array(priors.k1_sigma)),
+        rig.k1 * _inverse(np.asarray(priors.k1_sigma, np.float64)),
         rig.deviation * _inverse(np.array(priors.deviation_sigma)),
     ]
 
@@ -194,17 +195,21 @@ class _System:
         residual, weight, kept = residual[seen] * weight[seen, None], weight[seen], observations.where(seen)
         cameras, structure = self._jacobians(kept, weight)
         columns = _OWN * len(rig.group) + _GROUP * len(rig.focals_px)
-        views, groups = kept.view, rig.group[kept.view]
-        own = _OWN * views[:, None] + np.arange(_OWN)
-        shared = _OWN * len(rig.group) + _GROUP * groups[:, None] + np.arange(_GROUP)
-        camera_columns = np.concatenate([own, shared], 1)
-        point_columns = 3 * kept.point[:, None] + np.arange(3)
-        A = _rows(cameras, camera_columns, columns)
-        B = _rows(structure, point_columns, 3 * len(points))
-        right = residual.ravel()
-        self.camera = (A.T @ A).toarray()
-        self.camera_right = A.T @ right
+        views = kept.view
+        own = _OWN * np.arange(len(rig.group))[:, None] + np.arange(_OWN)
+        shared = _OWN * len(rig.group) + _GROUP * rig.group[:, None] + np.arange(_GROUP)
+        columns_of_view = np.concatenate([own, shared], 1)
+        B = _rows(structure, 3 * kept.point[:, None] + np.arange(3), 3 * len(points))
+        self.camera, self.camera_right = np.zeros((columns, columns)), np.zeros(columns)
+        for view in np.arange(len(rig.group)):
+            rows = np.flatnonzero(views == view)
+            jacobian = cameras[rows].reshape(2 * len(rows), _OWN + _GROUP)
+            of_view = columns_of_view[view]
+            self.camera[np.ix_(of_view, of_view)] += jacobian.T @ jacobian
+            self.camera_right[of_view] += jacobian.T @ residual[rows].ravel()
+        A = _rows(cameras, columns_of_view[views], columns)
         self._mixed = (A.T @ B).tocsr()
+        right = residual.ravel()
         self._blocks = np.zeros((len(points), 3, 3))
         np.add.at(self._blocks, kept.point, np.einsum("mki,mkj->mij", structure, structure))
         self._point_right = (B.T @ right).reshape(-1, 3)
@@ -216,7 +221,7 @@ class _System:
             free[_POSE : _OWN * len(rig.group) : _OWN] = False
         first = _OWN * len(rig.group)
         free[first::_GROUP] = (priors.focal_sigma > 0) & np.isin(np.arange(len(rig.focals_px)), rig.group)
-        free[first + 1 :: _GROUP] = priors.k1_sigma > 0
+        free[first + 1 :: _GROUP] = np.asarray(priors.k1_sigma) > 0
         self.free = np.flatnonzero(free)
 
     def _jacobians(self, kept: Observations, weight: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -255,39 +260,38 @@ class _System:
         own = _OWN * np.arange(views) + _POSE
         for columns, sigma, residual in (
             (focal, priors.focal_sigma, by_focal),
-            (focal + 1, np.array(priors.k1_sigma), by_k1),
+            (focal + 1, np.asarray(priors.k1_sigma, np.float64), by_k1),
             (own, np.array(priors.deviation_sigma), by_deviation),
         ):
             self.camera[columns, columns] += _inverse(sigma) ** 2
             self.camera_right[columns] += _inverse(sigma) * residual
 
-    def reduced(self, damping: float) -> tuple[np.ndarray, np.ndarray, np.ndarray, sparse.csr_array]:
-        """The system of the free camera columns, and what gives the points' steps from theirs."""
+    def reduced(self, damping: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """The system of the free camera columns, and the inverted blocks of the points."""
         blocks = self._blocks.copy()
         diagonal = np.einsum("pii->pi", blocks)
         # A point without two rays has a direction without information: the floor leaves it where it is.
         diagonal[:] = diagonal * (1 + damping) + 1e-9 * diagonal.sum(1, keepdims=True) + 1e-9
         inverse = np.linalg.inv(blocks)
-        index = 3 * np.arange(len(blocks))[:, None, None]
-        rows = np.broadcast_to(index + np.arange(3)[:, None], inverse.shape).ravel()
-        columns = np.broadcast_to(index + np.arange(3), inverse.shape).ravel()
-        size = 3 * len(blocks)
-        inverse = sparse.csr_array((inverse.ravel(), (rows, columns)), shape=(size, size))
         camera = self.camera.copy()
         camera[np.diag_indices_from(camera)] *= 1 + damping
-        mixed = self._mixed[self.free]
-        carried = mixed @ inverse
-        matrix = camera[np.ix_(self.free, self.free)] - (carried @ mixed.T).toarray()
-        right = self.camera_right[self.free] - carried @ self._point_right.ravel()
-        return matrix, right, inverse @ self._point_right.ravel(), carried
+        matrix, right = camera[np.ix_(self.free, self.free)], self.camera_right[self.free].copy()
+        mixed = self._mixed[self.free].tocsc()
+        for first in range(0, len(blocks), _CHUNK):  # dense products are faster, but whole ones would fill the memory
+            part = inverse[first : first + _CHUNK]
+            dense = mixed[:, 3 * first : 3 * (first + len(part))].T.toarray()  # its rows are the points'
+            carried = (part @ dense.reshape(len(part), 3, -1)).reshape(dense.shape)
+            matrix -= carried.T @ dense
+            right -= carried.T @ self._point_right[first : first + _CHUNK].ravel()
+        return matrix, right, inverse
 
     def step(self, damping: float) -> tuple[Rig, np.ndarray]:
         """The state after one damped step."""
-        matrix, right, point_step, carried = self.reduced(damping)
-        camera_step = -_solved(matrix, right)
-        points = self._points - (point_step + carried.T @ camera_step).reshape(-1, 3)
+        matrix, right, inverse = self.reduced(damping)
         full = np.zeros(len(self.camera))
-        full[self.free] = camera_step
+        full[self.free] = -_solved(matrix, right)
+        point_right = self._point_right + (self._mixed.T @ full).reshape(-1, 3)
+        points = self._points - np.einsum("pij,pj->pi", inverse, point_right)
         rig, views = self._rig, len(self._rig.group)
         own, shared = full[: _OWN * views].reshape(views, _OWN), full[_OWN * views :].reshape(-1, _GROUP)
         turn = Rotation.from_rotvec(own[:, :3]).as_matrix()

@@ -21,7 +21,7 @@ import tyro
 from registration.errors import InputError
 from registration.storage.files import DiskFull
 from registration.terminal import escaped_output, printable
-from workflows.cli import capture, coregister, export, farm, importing, model, register, stabilize, store
+from workflows.cli import calibration, capture, coregister, export, farm, importing, model, register, stabilize, store
 from workflows.cli.arguments import (
     PRINT_COMPLETION,
     SHELLS,
@@ -39,6 +39,7 @@ HELP = ("-h", "--help")
 GROUPS: Mapping[str, Mapping[str, Command]] = {
     "Capture": {
         "capture import": importing.import_capture,
+        "capture calibrate": calibration.calibrate,
         "capture check": capture.check,
         "capture synth": capture.synth,
         "capture degrade": capture.degrade,
