@@ -55,6 +55,7 @@ class RegistrationInputs:
     landmarks: Mapping[str, Float[np.ndarray, "L 3"]]  # triangulated, world; of the shared schemes
     plan: CompletionPlan  # of what the capture lacks
     recipe: Recipe
+    camera_sigma_px: float  # expected error of the given cameras, px of the stored images; 0: they are exact
     neutral: Registration | None
     scan: Scan | None  # whose normals stand in for normal maps, or whose surface is fitted; None: neither
     fits_scan: bool  # whether its surface is fitted
@@ -111,6 +112,7 @@ def read_inputs(
         landmarks=landmarks,
         plan=plan,
         recipe=recipe if start is None else expression_recipe(recipe),
+        camera_sigma_px=options.camera_sigma_px,
         neutral=start,
         scan=scan,
         fits_scan=scan is not None

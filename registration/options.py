@@ -3,6 +3,7 @@
 Imports neither torch nor NumPy: the command line shows these fields before anything heavy is loaded.
 """
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -72,6 +73,8 @@ class RegisterOptions:
             with them.
         stereo: Compute depths and normals from the photographs where the capture has neither normals nor a scan.
         detector: The landmark provider: face478, or the import path MODULE:FUNCTION of a function that returns one.
+        camera_sigma_px: Expected error of the given cameras: rms shift of the head in the stored images, pixels. Above
+            0, the fit corrects poses and focal lengths, with this prior. 0: the cameras are exact.
         landmark_files: The model's vertices of landmark schemes, instead of the files next to the model.
     """
 
@@ -84,10 +87,19 @@ class RegisterOptions:
     detect: bool = True
     stereo: bool = True
     detector: Annotated[str, arg(metavar="NAME")] = DETECTOR
+    camera_sigma_px: Annotated[float, arg(name="camera-sigma", metavar="PX")] = 0.0
     landmark_files: Annotated[Mapping[str, Path], _LANDMARK_FILES, _LANDMARKS_ARGUMENT] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         check_seed(self.seed)
+        if not (math.isfinite(self.camera_sigma_px) and self.camera_sigma_px >= 0):
+            raise InputError(
+                "The cameras' expected error is no distance",
+                where="--camera-sigma",
+                expected="pixels, at least 0",
+                got=self.camera_sigma_px,
+                fix="give the calibration's rms reprojection error, or 0 for exact cameras",
+            )
 
     def arguments(self) -> list[str]:
         """Return the arguments of `gnmreg register` that give these options; defaults are omitted.
@@ -105,6 +117,7 @@ class RegisterOptions:
         words += ["--no-detect"] if not self.detect else []
         words += ["--no-stereo"] if not self.stereo else []
         words += ["--detector", self.detector] if self.detector != default.detector else []
+        words += ["--camera-sigma", f"{self.camera_sigma_px:g}"] if self.camera_sigma_px else []
         if self.landmark_files:
             words += ["--landmarks", *(f"{scheme}={file}" for scheme, file in sorted(self.landmark_files.items()))]
         return words

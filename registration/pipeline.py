@@ -21,6 +21,7 @@ from registration.evaluate.audit import audit_penetration
 from registration.evaluate.evaluation import RegistrationEvaluation, evaluate_registration, without_scan
 from registration.evaluate.verdict import judge
 from registration.evaluate.viewpoint import intersection_figures
+from registration.fit import camera_refinement
 from registration.fit.context import FitContext
 from registration.fit.problem import FitProblem, FitTrace
 from registration.fit.recipes import Stage
@@ -105,7 +106,7 @@ def register(
     provenance = _provenance(capture, model, out, options, neutral)
     collected = _with_made(replace(_collect(inputs, fitted, comparison), provenance=provenance), completion)
     registration, page = _evaluate(inputs, comparison, collected, completion, progress)
-    save_registration(registration, out, page)
+    save_registration(registration, out, page, camera_refinement.writer(fitted.problem.refinement, inputs.capture))
     return registration
 
 
@@ -221,6 +222,7 @@ def _context(inputs: RegistrationInputs, seed: int, device: torch.device, progre
         else replace(inputs.neutral, translation=inputs.neutral.translation - inputs.origin),
         triangulated={name: points - inputs.origin for name, points in inputs.landmarks.items()},
         scan=planes,
+        camera_sigma_px=camera_refinement.level_sigma_px(inputs.camera_sigma_px, inputs.capture, pyramid[0]),
     )
 
 
@@ -258,7 +260,7 @@ def _collect(inputs: RegistrationInputs, fitted: _Fitted, comparison: Comparison
     problem, trace = fitted.problem, fitted.trace
     parameters, offsets = problem.variables.parameters()
     vertices, errors = problem.vertices().cpu().numpy(), problem.view_errors()
-    local = {name: points - inputs.origin for name, points in inputs.landmarks.items()}
+    local = camera_refinement.located(problem.refinement, inputs.capture, inputs.landmarks, inputs.origin)
     landmark_px = problem.landmark_residuals_px(local)
     skin = exterior(inputs.data)
     inside = [name for name, scheme in inputs.schemes.items() if not skin[scheme.indices].any()]
@@ -294,6 +296,7 @@ def _collect(inputs: RegistrationInputs, fitted: _Fitted, comparison: Comparison
             "notes": [*inputs.notes, *fitted.initial.notes],
             **{name: inputs.capture.tags[name] for name in ("scan_hygiene",) if name in inputs.capture.tags},
             **({"warnings": list(inputs.ledger.warnings)} if inputs.ledger.warnings else {}),
+            **camera_refinement.figures(problem.refinement, inputs.capture, inputs.camera_sigma_px),
             **({} if inputs.scan is None else {"scan_in_fit": _scan_in_fit(inputs, problem)}),
             "residuals": comparison.residuals,
         },

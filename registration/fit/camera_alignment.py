@@ -146,7 +146,7 @@ def from_landmarks(
         cameras: of all views, without distortion.
         points: where the landmarks are about; world, metres; NaN where that is unknown.
         detected: x_px, y_px and weight in each view; a weight of 0 is no detection.
-        spread_px: standard deviation of each detection; None: it is measured from the differences alone.
+        spread_px: standard deviation of each detection, NaN where unknown: the differences alone tell.
     """
     equations = CameraEquations.zeros(len(cameras))
     seen = (detected[..., 2] > 0) & np.isfinite(points).all(1)
@@ -157,7 +157,7 @@ def from_landmarks(
     seen, detected = seen[:, known], detected[:, known]
     weight = detected[..., 2] * seen
     spread = np.full(seen.shape, _LANDMARK_STD_PX) if spread_px is None else spread_px[:, known]
-    spread = np.maximum(spread, _LANDMARK_STD_PX)
+    spread = np.fmax(spread, _LANDMARK_STD_PX)
     located = points[known]
     for _ in range(_ROUNDS):
         difference = np.stack([c.project(located)[0] for c in cameras]) - detected[..., :2]

@@ -44,6 +44,8 @@ class FitContext:
     # Landmarks of the capture by scheme, triangulated over its views; world, metres; NaN where not possible.
     triangulated: Mapping[str, Float[np.ndarray, "L 3"]] = field(default_factory=dict)
     scan: NearestPlanes | None = None  # whose surface is fitted; world, metres
+    # Expected error of each given camera, rms shift of the head's points, px of level 0; None: cameras are exact.
+    camera_sigma_px: Float[np.ndarray, "N"] | None = None
 
     @property
     def device(self) -> torch.device:

@@ -10,6 +10,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from registration.fit.appearance import Appearance
+from registration.fit.camera_refinement import CameraRefinement
 from registration.fit.context import FitContext
 from registration.fit.initialization import PoseCandidate, rate_candidate
 from registration.fit.optimizer import AdamBlock, AdamUniformBlock, History, ParameterBlock, minimize
@@ -67,6 +68,12 @@ class FitProblem:
             name: initial.landmarks_used.get(name, np.ones(len(scheme.indices), bool))
             for name, scheme in context.captured_schemes.items()
         }
+        self.refinement = None if context.camera_sigma_px is None else CameraRefinement(context, self.vertices())
+
+    @property
+    def pyramid(self) -> tuple[Targets, ...]:
+        """The targets, with the cameras as they are corrected."""
+        return self.context.pyramid if self.refinement is None else self.refinement.pyramid
 
     def vertices(self) -> Float[Tensor, "V 3"]:
         """Return the mesh as it is: world, metres, without gradients."""
@@ -87,6 +94,8 @@ class FitProblem:
         seconds: dict[str, float] = {}
         motion_mm, failure = float("inf"), None
         self.view_weights = ViewWeights.from_errors(self.view_errors())
+        if self.refinement is not None:
+            self.refinement.start(self.view_weights, self.landmarks_used)
         for stage in stages:
             start_time = time.perf_counter()
             trace = self._run_stage(stage, on_step)
@@ -166,7 +175,10 @@ class FitProblem:
         return blocks
 
     def _losses(self, stage: Stage, terms: Sequence[Term], step: int) -> dict[str, Tensor]:
-        """The weighted losses of one step, by name. Updates texture and exposures too."""
+        """The weighted losses of one step, by name. Updates cameras, texture and exposures too."""
+        if self.refinement is not None and self.refinement.is_due(stage, step):
+            used, weights = self.landmarks_used, self.view_weights
+            self.refinement.update(stage, self.vertices(), self.appearance, weights, used)
         state = self._step_state(stage, step)
         if stage.texture:
             self.appearance.fit_exposures(state.rendered, state.batch, state.agree, state.views)
@@ -196,7 +208,7 @@ class FitProblem:
 
     def _batch(self, level: int, views: Sequence[int]) -> Targets:
         """The targets of some views with their weights."""
-        return self.view_weights.apply(self.context.pyramid[level].select(views, self.context.device), views)
+        return self.view_weights.apply(self.pyramid[level].select(views, self.context.device), views)
 
     def _all_views(self, stage: Stage) -> list[tuple[Targets, Tensor]]:
         """All views in batches, and the pixels where they agree with the mesh as it is."""
@@ -228,11 +240,11 @@ class FitProblem:
         return torch.cat(list(residuals_px.values()), 1).nanmedian(1).values
 
     def _coarsest_targets(self) -> Targets:
-        return self.context.pyramid[-1].select(range(self.context.view_count), self.context.device)
+        return self.pyramid[-1].select(range(self.context.view_count), self.context.device)
 
     def _landmark_residuals_by_view(self, vertices: Float[Tensor, "V 3"]) -> dict[str, Float[Tensor, "N L"]]:
         """Per scheme, px at 512 px of head height; NaN where not detected or not used."""
-        finest, residuals = self.context.pyramid[0], {}
+        finest, residuals = self.pyramid[0], {}
         for name, scheme in self.context.captured_schemes.items():
             detected = finest.landmarks[name].to(self.context.device)
             residual_px, counted = landmark.residuals(
@@ -251,7 +263,7 @@ class FitProblem:
         points = self.context.triangulated.get(scheme)
         if points is None:
             return residual_px
-        finest = self.context.pyramid[0]
+        finest = self.pyramid[0]
         detected, located = (
             torch.as_tensor(values, dtype=residual_px.dtype, device=residual_px.device)
             for values in (finest.landmarks[scheme], points)
@@ -273,7 +285,7 @@ class FitProblem:
         Returns:
             Scheme -> px at 512 px of head height; NaN for a scheme without a triangulated landmark.
         """
-        finest, mesh, residuals = self.context.pyramid[0], self.vertices().double().cpu().numpy(), {}
+        finest, mesh, residuals = self.pyramid[0], self.vertices().double().cpu().numpy(), {}
         for name, scheme in self.context.captured_schemes.items():
             points = scheme.points(mesh)
             distance = np.linalg.norm(points - triangulated[name], axis=1)[self.landmarks_used[name]]
@@ -286,7 +298,7 @@ class FitProblem:
 
     def render_views(self, views: Sequence[int]) -> tuple[Targets, Rendered]:
         """Return targets of some views at the finest level, and the mesh rendered there, exposed as their cameras."""
-        batch = self.context.pyramid[0].select(views, self.context.device)
+        batch = self.pyramid[0].select(views, self.context.device)
         with torch.no_grad():
             rendered = self.context.renderer(self.vertices(), self.appearance.texture, batch.pixels)
             return batch, self.appearance.apply_exposure(rendered, batch, views)

@@ -40,7 +40,7 @@ def compare_views(problem: FitProblem) -> Comparison:
     count, vertices = context.view_count, problem.vertices().cpu().numpy()
     trusted = [view for view in range(count) if weights.geometry[view] > 0.5]
     others = sorted(set(range(count)) - set(trusted))
-    names, cameras = context.pyramid[0].names, context.pyramid[0].pixels.cameras
+    names, cameras = context.pyramid[0].names, problem.pyramid[0].pixels.cameras
     suspects = [view for view in range(count) if names[view] in weights.notes][:_SHOWN_SUSPECTS]
     rest = [view for view in range(count) if view not in suspects]
     spread = select_spread_views([cameras[view] for view in rest], _SHOWN - len(suspects)) if rest else []

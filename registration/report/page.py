@@ -52,6 +52,8 @@ def render_report(inputs: ReportInputs) -> str:
         made="" if inputs.made is None else f"data:image/jpeg;base64,{base64.b64encode(inputs.made).decode()}",
         made_channels=", ".join(registration.figures.get("made", {}).get("channels", [])),
         legend=[(name, CLASS_COLOURS[k % len(CLASS_COLOURS)]) for k, name in enumerate(inputs.class_names)],
+        cameras=_camera_rows(registration.figures.get("cameras", {})),
+        camera_sigma_px=registration.figures.get("cameras", {}).get("sigma_px", 0.0),
         curves=Markup(loss_curves(registration.history)),
         times=[
             (stage, 100 * value / longest_s, format_duration(value)) for stage, value in registration.seconds.items()
@@ -110,4 +112,14 @@ def _residual_rows(figure: Mapping[str, Any]) -> list[tuple[str, str, str, str, 
     return [
         (kind.title, "–" if overall is None else kind.text(overall), kind.text(worst), view, kind.meaning)
         for kind, overall, worst, view in residual_rows(figure)
+    ]
+
+
+def _camera_rows(figure: Mapping[str, Any]) -> list[tuple[str, float, str]]:
+    """View, length of its bar in percent, and its correction as text, the largest first."""
+    views = figure.get("views", {})
+    largest = max((row["shift_px"] for row in views.values()), default=0.0) or 1.0
+    return [
+        (name, 100 * row["shift_px"] / largest, f"{row['shift_px']:.2f} px, {row['sigmas']:.1f} sigma")
+        for name, row in sorted(views.items(), key=lambda item: -item[1]["shift_px"])
     ]

@@ -64,6 +64,7 @@ def remarks(registration: Assessed) -> list[str]:
         f"View {view} disagrees with the others and counts little: {why}. Look at its camera, image, mask and labels."
         for view, why in figures.get("views_not_trusted", {}).items()
     ]
+    lines += [str(warning) for warning in figures.get("cameras", {}).get("warnings", [])]
     lines += [f"{note[:1].upper()}{note[1:]}." for note in figures.get("notes", [])]
     lines += _scan_in_fit(figures.get("scan_in_fit", {}))
     unmeasured = figures.get("unmeasured", {})

@@ -5,7 +5,7 @@ A folder appears, or is replaced, in one rename; its content id is a digest of i
 
 import math
 import os
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -36,6 +36,7 @@ FILES = {  # and what each is, for people
     "history.json": "the loss terms of every step",
     REPORT: "this page",
 }
+SPARSE = "sparse"  # a COLMAP model of the corrected cameras, where the fit corrected them
 # Axis letters of the arrays in registration.npz; one letter is one length within a file.
 AXES = {
     "identity": "I",
@@ -95,7 +96,7 @@ def check_output_folder(out: Path) -> None:
     if out.is_dir() and (names := sorted(p.name for p in out.iterdir())):
         if not is_registration(out):
             raise InputError.output_folder(out, expected=ours, got=f"a folder that holds {_listed(names)}")
-        if foreign := [name for name in names if name not in FILES]:
+        if foreign := [name for name in names if name not in (*FILES, SPARSE)]:
             fix = "move these files elsewhere: they would be lost"
             raise InputError.output_folder(out, expected=ours, got=f"also {_listed(foreign)}", fix=fix)
     parent = out.parent
@@ -111,7 +112,12 @@ def is_registration(path: Path) -> bool:
     return has_kind(Path(path) / MANIFEST, KIND)
 
 
-def save_registration(registration: Registration, out: Path, report_html: str | None = None) -> Path:
+def save_registration(
+    registration: Registration,
+    out: Path,
+    report_html: str | None = None,
+    write_sparse: Callable[[Path], None] | None = None,
+) -> Path:
     """Write the whole folder; one that we wrote before is replaced in one rename.
 
     Arrays are stored as float32 (triangles as int32; translation, vertices and landmarks as float64 where the world's
@@ -121,6 +127,8 @@ def save_registration(registration: Registration, out: Path, report_html: str | 
         registration: the result.
         out: the folder.
         report_html: the content of `report.html`; None: no report.
+        write_sparse: writes the COLMAP model of corrected cameras into the folder that it is given; None: there are
+            none.
 
     Returns:
         The folder, as an absolute path.
@@ -143,6 +151,8 @@ def save_registration(registration: Registration, out: Path, report_html: str | 
         write_json(temporary / "history.json", registration.history)
         if report_html is not None:
             (temporary / REPORT).write_text(report_html, encoding="utf-8")
+        if write_sparse is not None:
+            write_sparse(temporary / SPARSE)
         _manifest(registration, content_id(arrays, texture)).write(temporary / MANIFEST)
     return out
 

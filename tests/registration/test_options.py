@@ -27,9 +27,10 @@ def parsed(words: str) -> RegisterOptions:
 
 def test_the_command_line_sets_every_field() -> None:
     assert parsed("") == RegisterOptions()
-    words = "--recipe my:own --views 3 --seed 4 --deterministic --variant cuda --landmarks 68=a.txt 5=b=c.txt"
-    assert parsed(words) == RegisterOptions(
+    words = "--recipe my:own --views 3 --seed 4 --deterministic --variant cuda --camera-sigma 0.5"
+    assert parsed(f"{words} --landmarks 68=a.txt 5=b=c.txt") == RegisterOptions(
         recipe="my:own",
+        camera_sigma_px=0.5,
         views=3,
         seed=4,
         deterministic=True,
@@ -48,6 +49,16 @@ def test_help_shows_every_field_with_its_docstring(
     for option in ("recipe NAME", "views N", "seed S", "deterministic", "variant", "landmarks"):
         assert f"--{option}" in text
     assert "SCHEME=FILE" in text and "spread around the head" in text and "(default: draft)" in text
+
+
+@pytest.mark.parametrize("sigma_px", [-0.1, float("nan"), float("inf")])
+def test_a_sigma_that_is_no_distance_is_refused(sigma_px: float) -> None:
+    with pytest.raises(InputError, match="no distance"):
+        RegisterOptions(camera_sigma_px=sigma_px)
+
+
+def test_the_options_give_back_their_arguments() -> None:
+    assert RegisterOptions(camera_sigma_px=0.75).arguments() == ["--camera-sigma", "0.75"]
 
 
 @pytest.mark.parametrize("pair", ["68", "68=", "=file.txt"])
@@ -190,6 +201,7 @@ def test_a_new_field_anywhere_changes_the_hash(
         ("options.seed", 1),
         ("options.deterministic", True),
         ("options.variant", "cuda"),
+        ("options.camera_sigma_px", 1.0),
         ("options.recipe.stages.0.weights", Weights(rgb=0.25)),
         ("options.recipe.stages.0.free", (("identity", Rate(start=1.0, end=0.5)),)),
         ("options.recipe.regions", (OffsetRegion(name="lips"),)),

@@ -44,6 +44,8 @@ def register(
             capture, fit = scan.capture(model, out, fit, progress)
         result = register(capture, model, out, fit, neutral=neutral, force=force, progress=progress)
     print_assessment(result.figures)
+    for warning in result.figures.get("cameras", {}).get("warnings", []):
+        print(f"warning: {warning}")
     print(f"{result.status}: {result.reason}\n{out}")
     return 1 if result.status == "failed" else 0
 

@@ -199,6 +199,19 @@ def test_remarks_name_low_weights_exclusions_and_intersections():
     assert "<ul>" not in render_report(some_inputs())
 
 
+def test_corrections_of_cameras_are_shown_the_largest_first():
+    row = {"T_cam_world": [], "intrinsics": [], "distortion": [], "focal_factor": 1.0}
+    views = {"cam<1>": {**row, "shift_px": 0.4, "sigmas": 0.8}, "cam2": {**row, "shift_px": 1.6, "sigmas": 3.2}}
+    warning = "The camera of view cam2 is corrected by 3.2 times the stated sigma: it may have moved."
+    figures = {"cameras": {"sigma_px": 0.5, "views": views, "warnings": [warning]}}
+    page = render_report(some_inputs(registration=a_registration(figures=figures)))
+    check_page(page)
+    assert f"<li>{warning}</li>" in page and "the stated sigma is 0.5 px" in page
+    first, second = page.index("<span>cam2</span>"), page.index("<span>cam&lt;1&gt;</span>")
+    assert first < second and "1.60 px, 3.2 sigma" in page[first:second] and "width:25.0%" in page[second:]
+    assert "stated sigma" not in render_report(some_inputs())
+
+
 def test_the_command_the_paths_and_the_files_are_on_the_page():
     command = "gnmreg register /captures/anna --model '/my models/gnm.npz' --out /out/anna"
     origin = {"command": command, "capture": "/captures/anna", "model": "/my models/gnm.npz"}
