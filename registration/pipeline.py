@@ -4,7 +4,6 @@ import shlex
 import time
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -13,10 +12,7 @@ import torch
 
 from registration.capture.origin import in_world
 from registration.capture.visual_hull import outside_masks
-from registration.completion.complete import CODE, Completer
-from registration.completion.first_fit import HeadFitter
-from registration.completion.saved import Completion, completed
-from registration.detect.providers import load_provider
+from registration.completion.saved import Completion
 from registration.evaluate.audit import audit_penetration
 from registration.evaluate.evaluation import RegistrationEvaluation, evaluate_registration, without_scan
 from registration.evaluate.verdict import judge
@@ -30,11 +26,12 @@ from registration.fit.variables import InitialGuess
 from registration.fit.view_weights import ViewErrors
 from registration.geometry.nearest_planes import CloudPlanes, MeshPlanes, NearestPlanes
 from registration.geometry.surface_views import SurfaceViews
-from registration.inputs import RegistrationInputs, read_inputs, triangulated_landmarks
+from registration.inputs import RegistrationInputs, read_inputs
 from registration.model.atlas import texture_atlas
 from registration.model.gnm import GNM
 from registration.model.regions import exterior
 from registration.options import RegisterOptions
+from registration.preparation import complete_inputs
 from registration.progress import NullProgress, Progress
 from registration.render import backend
 from registration.report.comparison import Comparison, compare_views
@@ -99,7 +96,7 @@ def register(
         return same
     device = backend.activate(options.variant, deterministic=options.deterministic)
     torch.manual_seed(options.seed)
-    inputs, completion = _completed(inputs, options, device, progress)
+    inputs, completion = complete_inputs(inputs, options, device, progress)
     fitted = _fit(inputs, options.seed, device, pictures, progress)
     progress.message("comparing with the views")
     comparison = compare_views(fitted.problem)
@@ -119,28 +116,6 @@ def _provenance(
     words = ["gnmreg", "register", paths["capture"], "--model", paths["model"], "--out", str(out.absolute())]
     words += ["--neutral", paths["neutral"]] if neutral is not None else []
     return {"command": shlex.join([*words, *options.arguments()]), **paths}
-
-
-def _completed(
-    inputs: RegistrationInputs, options: RegisterOptions, device: torch.device, progress: Progress
-) -> tuple[RegistrationInputs, Completion | None]:
-    """The inputs with the channels that the capture lacked, and how they were made."""
-    if inputs.plan.empty:
-        return inputs, None
-    neutral = inputs.neutral
-    fitter = HeadFitter(
-        inputs.data,
-        inputs.schemes,
-        neutral=None if neutral is None else replace(neutral, translation=neutral.translation - inputs.origin),
-        seed=options.seed,
-        device=device,
-    )
-    provider = load_provider(options.detector)
-    completer = Completer(inputs.plan, fitter, provider, inputs.origin, progress)
-    key = hashing.input_hash(inputs.digests, {"made": inputs.plan.channels, "seed": options.seed, "code": CODE})
-    completion = completed(inputs.capture, key, partial(completer.complete, inputs.capture), provider.scheme, progress)
-    landmarks = triangulated_landmarks(completion.capture, inputs.schemes)
-    return replace(inputs, capture=completion.capture, landmarks=landmarks, head_rows=completion.head_rows), completion
 
 
 def _with_made(registration: Registration, completion: Completion | None) -> Registration:

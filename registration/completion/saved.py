@@ -14,6 +14,7 @@ from registration.storage.cache import cache_folder, make_cache_folder
 from registration.storage.files import atomic_directory, read_json_of_kind, write_json
 from registration.types import Capture
 
+CHANNELS = ("landmarks", "masks", "segmentation", "normals", "depth", "confidence")  # folders of the made files
 RECORD, KIND, SCHEMA = "completion.json", "gnm-completion", 1
 _MOST_BYTES = 4 * 2**30  # of all completions; the oldest are deleted
 

@@ -6,11 +6,9 @@ the capture only, not on the preset or on faults of other views.
 """
 
 import json
-import re
 import shutil
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 from types import MappingProxyType
 
@@ -24,12 +22,12 @@ from registration.capture.dense_maps import is_colmap_map
 from registration.capture.landmark_files import write_landmarks
 from registration.capture.native_writer import check_new
 from registration.capture.scan import read_scan
+from registration.capture.settings_text import without_tables
 from registration.degrading import degradation
 from registration.degrading.degradation import FAULTS, DegradationPreset
 from registration.doctor.validation import validate_capture
 from registration.errors import InputError, check_seed
 from registration.storage.files import atomic_directory
-from registration.storage.reading import parse_toml
 from registration.types import Camera, Capture, Colour, View
 
 MIN_VIEWS = 2  # of a capture
@@ -215,15 +213,7 @@ def _write_settings(path: Path, capture: Capture, description: str) -> None:
         changed.add("segmentation")
     if any(view.colour != Colour() for view in capture.views):  # the copy's images are sRGB
         changed.add("colour")
-    if changed:
-        blocks = re.split(r"(?m)^(?=[ \t]*\[+[^,\[\]]+\]+[ \t]*(?:#.*)?$)", settings)
-        own = re.compile(rf"\s*\[\s*(?:{'|'.join(sorted(changed))})\s*[.\]]")
-        settings = "".join(block for block in blocks if not own.match(block)).rstrip() + "\n"
-        if "segmentation" in changed:
-            settings += f"\n[segmentation]\nclasses = {json.dumps(capture.classes)}\n"
-        fix = f"write {' and '.join(sorted(changed))} as tables of their own"
-        refuse = partial(InputError, "capture.toml cannot be rewritten", where=source, fix=fix)
-        kept = parse_toml(settings.encode(), refuse)
-        if "colour" in changed and "colour" in kept:
-            raise refuse(expected="[colour] as a table", got="colour = ...")
+    settings = without_tables(source, settings, changed)
+    if "segmentation" in changed:
+        settings += f"\n[segmentation]\nclasses = {json.dumps(capture.classes)}\n"
     path.write_text(f"{_TAG} = {json.dumps(description, ensure_ascii=False)}\n{settings}", "utf-8")

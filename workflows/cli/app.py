@@ -41,6 +41,7 @@ GROUPS: Mapping[str, Mapping[str, Command]] = {
         "capture import": importing.import_capture,
         "capture calibrate": calibration.calibrate,
         "capture check": capture.check,
+        "capture complete": capture.complete,
         "capture synth": capture.synth,
         "capture degrade": capture.degrade,
         "dataset synth": capture.synth_dataset,

@@ -7,18 +7,22 @@ from typing import Annotated, Literal
 from tyro.conf import arg
 
 from registration.errors import InputError
+from registration.options import RegisterOptions
 from workflows.cli.options import (
     NOT_SET,
     CaptureFolder,
+    Folder,
+    ModelFile,
     OptionalFolder,
     OptionalImage,
+    OptionalRegistration,
     OutputFolder,
     Seed,
     StudioOptions,
     weights,
 )
 
-_STUDIO = StudioOptions()
+_STUDIO, _DEFAULTS = StudioOptions(), RegisterOptions()
 
 
 def check(
@@ -68,6 +72,38 @@ def check(
     if out is not None and not usable:
         print(f"{out} was not drawn: the contact sheet shows captures without errors", file=sys.stderr)
     return 0 if usable else 2
+
+
+def complete(
+    capture: CaptureFolder,
+    /,
+    *,
+    model: ModelFile,
+    out: Folder,
+    neutral: OptionalRegistration = None,
+    fit: RegisterOptions = _DEFAULTS,
+) -> int:
+    """Write a copy of a capture with the landmarks, masks, labels and normals that it lacks.
+
+    They are made from its photographs, as `gnmreg register` makes them. Look at made.jpg, correct the files in
+    landmarks, masks and segmentation, and register the copy: what it has is not made again.
+
+    Args:
+        capture: The capture folder; it is not changed.
+        model: The head model, a GNM NPZ file.
+        out: The capture folder to write; it must not exist.
+        neutral: The registration of the same subject's neutral, for an expression.
+        fit: How the capture would be registered; its views, detector and stereo count here.
+    """
+    from registration.preparation import write_completed
+    from registration.progress import console_progress
+
+    with console_progress() as progress:
+        made = write_completed(capture, model, out, fit, neutral=neutral, progress=progress)
+    for note in made.notes:
+        print(f"note: {note}")
+    print(f"made {', '.join(made.figures['channels'])}: look at {out / 'made.jpg'}\n{out}")
+    return 0
 
 
 def synth(
