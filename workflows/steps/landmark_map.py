@@ -41,7 +41,11 @@ EXPRESSIONS: Mapping[str, Mapping[str, float]] = {  # of the rendered heads: wei
 
 
 def expressions(data: GNMData) -> dict[str, Float[np.ndarray, "V 3"]]:
-    """Return the displacements, metres, of the expressions whose every shape the model's basis can make."""
+    """Return the displacements, metres, of the expressions whose every shape the model's basis can make.
+
+    Raises:
+        InputError: the model lacks the edges of lids or lips, by which the shapes are defined.
+    """
     shapes = arkit_shapes(data, data.template_vertex_positions.astype(np.float64)).displacements
     return {
         name: np.sum([weight * shapes[shape] for shape, weight in weights.items()], axis=0)
@@ -79,7 +83,11 @@ def make_landmark_map(
     if picture is not None:
         check_output_file(picture)
     progress.message("solving the expressions of the rendered heads")
-    performed = expressions(data)
+    try:
+        performed = expressions(data)
+    except InputError as error:  # a model without the anatomy that the shapes need still has a neutral face
+        progress.message(f"heads are rendered without expressions: {error}")
+        performed = {}
     made = make_map(data, detector, performed, settings, progress)
     if picture is not None:
         draw_map(data, made.scheme, picture)
