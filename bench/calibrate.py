@@ -1,6 +1,6 @@
 """Calibrate the photographs of captures without their cameras, and measure the result against these.
 
-    python -m bench.calibrate --model gnm_head.npz CAPTURE ... [--views 22] [--focal-px 6375]
+    python -m bench.calibrate --model gnm_head.npz CAPTURE ... [--views 22] [--focal-px 6375] [--distance-of-cameras]
 
 Printed per capture: views with a camera, the reprojection error of the scan's points by the estimated cameras against
 the true ones after the best similarity transform (rms, and of the worst view), that transform's scale (1 if the metric
@@ -9,6 +9,7 @@ scale is right) beside its stated standard deviation, the focal length against t
 
 import argparse
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -65,6 +66,7 @@ def main() -> None:
     parser.add_argument("--focal-px", type=float)
     parser.add_argument("--focal-spread", type=float, default=0.02)
     parser.add_argument("--distortion", action="store_true")
+    parser.add_argument("--distance-of-cameras", action="store_true", help="the true one of first and last gives scale")
     arguments = parser.parse_args()
     options = CalibrateOptions(
         focal_px=arguments.focal_px, distortion=arguments.distortion, focal_spread=arguments.focal_spread
@@ -75,6 +77,10 @@ def main() -> None:
         views = capture.views
         if arguments.views:
             views = tuple(views[i] for i in np.unique(np.linspace(0, len(views) - 1, arguments.views).astype(int)))
+        if arguments.distance_of_cameras:
+            a, b = views[0], views[-1]
+            metres = float(np.linalg.norm(a.camera.centre - b.camera.centre))
+            options = replace(options, camera_distance=(a.image.stem, b.image.stem, metres))
         start = time.perf_counter()
         result = calibrate_photographs([view.image for view in views], arguments.model, options)
         seconds = time.perf_counter() - start
@@ -86,7 +92,7 @@ def main() -> None:
         name = f"{root.parent.name}/{root.name}"[-26:]
         print(
             f"{name:26} {len(errors):2}/{len(views):2} {rms:7.2f} {errors[worst]:6.2f} {worst[-8:]:8} {scale:6.4f} "
-            f"{result.scale_sigma:6.3f} {focal:7.1f} {true:7.1f} {seconds:6.1f}",
+            f"{result.size.sigma:6.3f} {focal:7.1f} {true:7.1f} {seconds:6.1f}",
             flush=True,
         )
         for name, reason in result.left_out.items():

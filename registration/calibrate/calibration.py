@@ -11,6 +11,7 @@ import numpy as np
 from registration.calibrate.assembly import Assembled, Evidence, assemble, match_pairs
 from registration.calibrate.bundle import Observations
 from registration.calibrate.features import MIN_MATCHES, Features, Matches, find_features, match, mirrored, tracks
+from registration.calibrate.lengths import check_lengths, sized
 from registration.calibrate.metric import fit_model
 from registration.calibrate.options import CalibrateOptions
 from registration.calibrate.photographs import (
@@ -69,6 +70,7 @@ def calibrate_photographs(
     data = gnm_npz.read(Path(model))
     provider = load_provider(options.provider) if provider is None else provider
     scheme = _scheme(Path(model), data, provider) if scheme is None else scheme
+    check_lengths(options, photographs, scheme.name)
     copies = duplicates(photographs)
     left_out = {photographs[i].name: f"the same file as {photographs[j].relative}" for i, j in copies.items()}
     photographs = [photograph for i, photograph in enumerate(photographs) if i not in copies]
@@ -108,12 +110,14 @@ def calibrate_photographs(
     left_out |= {photographs[view].name: reason for view, reason in reasons.items()}
     if assembled.posed.sum() < 2:
         raise _too_few(root, assembled, left_out)
+    assembled, size = sized(assembled, photographs, options, left_out)
     return collect(
         root,
         photographs,
         focals=focals,
         assembled=assembled,
         left_out=left_out,
+        size=size,
         notes=notes,
         scheme=scheme.name,
     )

@@ -12,6 +12,9 @@ from registration.model.landmarks import LandmarkScheme
 
 DEFAULT_SPREAD_M = 3e-3  # of a landmark whose map states none
 EXPRESSION_SIGMA = 0.5  # standard deviation of expression coefficients; that of identity coefficients is 1
+# Relative standard deviation of people's faces about the size that the fit makes of their shape, measured on twelve
+# people of another head model (4.7 %). The coefficients' covariance alone states 1.3 %.
+SIZE_SIGMA = 0.045
 _ALIKE = 10.0  # neighbouring landmarks err alike: so many count as one
 _CAUCHY = 2.0  # standard deviations at which a landmark's weight is halved
 _ITERATIONS = 12
@@ -86,7 +89,7 @@ def fit_model(
         shift=shift,
         landmarks=landmarks,
         distance_m=distance,
-        scale_sigma=float(np.sqrt(covariance[0, 0])),
+        scale_sigma=float(np.hypot(np.sqrt(covariance[0, 0]), SIZE_SIGMA)),
     )
 
 

@@ -9,6 +9,7 @@ from jaxtyping import Bool, Float
 
 from registration.calibrate.assembly import Assembled
 from registration.calibrate.features import MIN_MATCHES
+from registration.calibrate.lengths import Size
 from registration.calibrate.photographs import Photograph
 from registration.calibrate.start import Focals
 from registration.frames import MM_PER_M
@@ -50,7 +51,10 @@ class FocalGroup:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Calibration:
-    """Cameras in the head's frame (+Y up, +Z out of the face, +X the subject's left), metres."""
+    """Cameras in the frame of the head model (+Y up, +Z out of the face, +X the subject's left), metres.
+
+    The head has `size.head_scale` times the size of the model fitted to the landmarks.
+    """
 
     root: Path  # of the photographs
     views: tuple[CalibratedView, ...]
@@ -59,7 +63,7 @@ class Calibration:
     points: Float[np.ndarray, "P 3"]  # of the tracks
     landmarks: Float[np.ndarray, "L 3"]  # NaN where fewer than two views show it
     scheme: str
-    scale_sigma: float  # relative standard deviation of the metric scale
+    size: Size  # how metres were found
     landmark_distance_mm: float  # median, from the fitted head model
     notes: tuple[str, ...]
 
@@ -76,6 +80,7 @@ def collect(
     focals: Focals,
     assembled: Assembled,
     left_out: Mapping[str, str],
+    size: Size,
     notes: Sequence[str],
     scheme: str,
 ) -> Calibration:
@@ -87,6 +92,7 @@ def collect(
         focals: what was known of the focal lengths.
         assembled: the posed views.
         left_out: photograph -> why it has no camera.
+        size: how metres were found.
         notes: of what was seen before.
         scheme: of the landmarks.
     """
@@ -122,7 +128,7 @@ def collect(
         points=assembled.adjusted.points[count:][used[count:]],
         landmarks=landmarks,
         scheme=scheme,
-        scale_sigma=assembled.model.scale_sigma,
+        size=size,
         landmark_distance_mm=float(np.nanmedian(distance)) * MM_PER_M,
         notes=(*notes, *_remarks(views, groups, assembled)),
     )
@@ -181,7 +187,7 @@ def summary(calibration: Calibration) -> str:
     """Return what a terminal shows: focal lengths, residuals, and what was left out and why."""
     lines = [
         f"{len(calibration.views)} photographs calibrated, {len(calibration.points)} points; "
-        f"metric scale +- {100 * calibration.scale_sigma:.1f} % by the head model"
+        f"metric scale +- {100 * calibration.size.sigma:.1f} % by {calibration.size.source}"
     ]
     for group in calibration.groups:
         distortion = f", k1 {group.k1:.3g} +- {group.k1_sigma:.2g}" if group.k1_sigma else ""

@@ -49,7 +49,8 @@ def write_calibration(calibration: Calibration, out: Path, options: CalibrateOpt
             shutil.copyfile(view.photograph.file, image)
             cameras[view.photograph.relative.as_posix()] = view.camera
         write_model(temporary / "sparse", cameras, calibration.points)
-        head = HeadPose(rotation=np.eye(3), translation=np.zeros(3))  # the world is the head's frame
+        # The world is the head's frame, but for its size where a length was measured.
+        head = HeadPose(rotation=np.eye(3), translation=np.zeros(3), scale=calibration.size.head_scale)
         write_settings(
             temporary / "capture.toml",
             CaptureDescription(subject=subject, expression=options.expression, head=head),
@@ -66,7 +67,9 @@ def record(calibration: Calibration) -> dict[str, Any]:
         "kind": KIND,
         "schema": SCHEMA,
         "frame": "the head model's: +Y up, +Z out of the face, +X the subject's left; metres",
-        "scale_sigma": calibration.scale_sigma,
+        "scale_source": calibration.size.source,
+        "scale_sigma": calibration.size.sigma,
+        "head_scale": calibration.size.head_scale,
         "landmark_scheme": calibration.scheme,
         "landmark_distance_mm": calibration.landmark_distance_mm,
         "points": len(calibration.points),

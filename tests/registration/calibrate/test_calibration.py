@@ -2,6 +2,7 @@ import json
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -121,6 +122,32 @@ def test_a_mirrored_photograph_and_a_copy_are_left_out_with_the_reason(capture: 
     assert compare(result, capture)[1] and max(compare(result, capture)[1].values()) < 1.0
 
 
+def test_a_known_distance_of_cameras_gives_the_scale(capture: Capture, calibration: Calibration) -> None:
+    centres = {view.name: view.camera.centre for view in capture.views}
+    metres = float(np.linalg.norm(centres["cam06"] - centres["cam09"]))
+    images = [view.image for view in capture.views if view.name in ("cam06", "cam07", "cam09")]
+    options = CalibrateOptions(camera_distance=("cam06", "cam09", metres))
+    result = calibrate_photographs(images, MODEL, options, provider=StoredLandmarks(capture))
+    found = {name: camera.centre for name, camera in result.cameras.items()}
+    assert np.linalg.norm(found["cam06"] - found["cam09"]) == pytest.approx(metres)
+    assert compare(result, capture)[0] == pytest.approx(1.0, abs=0.02)
+    assert result.size.sigma < 0.01 and result.size.head_scale != 1 and calibration.size.head_scale == 1
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"camera_distance": ("cam06", "cam99", 1.0)},
+        {"camera_distance": ("cam06", "cam06", 1.0)},
+        {"pupil_distance_mm": 63.0},  # of landmarks without pupils
+    ],
+)
+def test_lengths_that_cannot_be_used_are_refused(capture: Capture, changes: dict[str, Any]) -> None:
+    images = [view.image for view in capture.views]
+    with pytest.raises(InputError):
+        calibrate_photographs(images, MODEL, CalibrateOptions(**changes), provider=StoredLandmarks(capture))
+
+
 def test_two_photographs_need_a_focal_length(capture: Capture) -> None:
     images = [view.image for view in capture.views if view.name in ("cam07", "cam08")]
     with pytest.raises(InputError) as error:
@@ -147,7 +174,9 @@ def test_photographs_without_faces_and_models_without_a_map_are_refused(capture:
         calibrate_photographs(images, MODEL, provider=Other(capture))
 
 
-@pytest.mark.parametrize("changes", [{"focal_px": -3.0}, {"focal_px": float("nan")}, {"focal_spread": 2.0}])
+@pytest.mark.parametrize(
+    "changes", [{"focal_px": -3.0}, {"focal_px": float("nan")}, {"focal_spread": 2.0}, {"pupil_distance_mm": 0.063}]
+)
 def test_options_out_of_range_are_refused(changes: dict[str, float]) -> None:
     with pytest.raises(InputError, match="out of range"):
         CalibrateOptions(**changes)  # type: ignore[arg-type]
