@@ -209,6 +209,8 @@ class Targets:
     mask_weight: Float[Tensor, "P"]
     classes: Float[Tensor, "P K"]
     class_weight: Float[Tensor, "P"]
+    # Along the optical axes, metres, float32 in levels too; 0: none. Weighs as the normals. None: no view has depths.
+    depth: Float[Tensor, "P"] | None = None
     landmarks: Mapping[str, Float[Tensor, "N L 3"]]  # scheme -> x_px y_px confidence
     landmark_spread_px: Mapping[str, Float[Tensor, "N L"]] = field(default_factory=dict)  # NaN: unknown
     px_per_head: float  # the subject's height in pixels, median over views
@@ -250,6 +252,15 @@ class Rendered:
     normals: Float[Tensor, "P 3"]  # world frame, unit, of the visible side; 0 on a miss
     classes: Float[Tensor, "P K"]  # soft membership of each class; 0 on a miss
     mask: Float[Tensor, "P"]  # 1 on a hit
+
+
+@dataclass(frozen=True, kw_only=True)
+class SurfaceHits:
+    """The points of a mesh at the centres of some pixels of a list."""
+
+    pixel: Int[Tensor, "H"]  # position in the list, as the next in int64
+    face: Int[Tensor, "H"]
+    barycentric: Float[Tensor, "H 3"]
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -26,7 +26,7 @@ class ResidualKind:
     def text(self, value: float) -> str:
         """Return a value with its unit."""
         space = "" if self.unit == "°" else "\N{NO-BREAK SPACE}"
-        return f"{value:.1f}{space}{self.unit}"
+        return f"{value:.{2 if self.unit == 'mm' else 1}f}{space}{self.unit}"
 
 
 RESIDUALS: Mapping[str, ResidualKind] = {
@@ -34,6 +34,7 @@ RESIDUALS: Mapping[str, ResidualKind] = {
         title="silhouette", unit="px", meaning="mean distance of the outlines; the head is 512 px high"
     ),
     "normals_deg": ResidualKind(title="normals", unit="°", meaning="median angle between the normals"),
+    "depth_mm": ResidualKind(title="depth", unit="mm", meaning="median distance of the depth maps from the skin"),
     "colour_levels": ResidualKind(
         title="colour", unit="levels", meaning="mean difference of the colours, of 255 sRGB levels"
     ),
@@ -45,7 +46,10 @@ RESIDUALS: Mapping[str, ResidualKind] = {
 
 
 def view_residuals(
-    targets: Targets, rendered: Rendered, landmark_px: Float[Tensor, "N"]
+    targets: Targets,
+    rendered: Rendered,
+    landmark_px: Float[Tensor, "N"],
+    depth_mm: Float[Tensor, "N"] | None = None,
 ) -> dict[str, dict[str, float]]:
     """Measure the residuals in each view of a batch.
 
@@ -53,6 +57,7 @@ def view_residuals(
         targets: of the views.
         rendered: the registration at the pixels of `targets`, with the colours of each camera's exposure.
         landmark_px: median distance of each view's landmarks, px at 512 px of head height; NaN without landmarks.
+        depth_mm: median distance of each view's depth map from the mesh; NaN without one, None: no view has any.
 
     Returns:
         View -> key of `RESIDUALS` -> value; a kind that cannot be measured in a view is missing there.
@@ -62,6 +67,7 @@ def view_residuals(
     means = {
         "silhouette_px": outline_px.cpu().numpy(),
         "normals_deg": _by_view(*_normal_angles(targets, rendered), targets, np.median),
+        "depth_mm": np.full(count, np.nan) if depth_mm is None else depth_mm.cpu().numpy(),
         "colour_levels": _by_view(*_colour_differences(targets, rendered), targets, np.mean),
         "labels_percent": _by_view(*_wrong_labels(targets, rendered), targets, np.mean),
         "landmarks_px": landmark_px.cpu().numpy(),

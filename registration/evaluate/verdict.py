@@ -38,6 +38,7 @@ SCAN_LIMITS = {
 RESIDUAL_LIMITS = {
     "silhouette_px": Limit(look=1.5, wrong=5.0),
     "normals_deg": Limit(look=5.0, wrong=15.0),
+    "depth_mm": Limit(look=0.6, wrong=2.0),
     "colour_levels": Limit(look=10.0),
     "labels_percent": Limit(look=5.0),
     "landmarks_px": Limit(look=5.0, wrong=12.0),

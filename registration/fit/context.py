@@ -6,12 +6,14 @@ from functools import cached_property
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
 
 from registration.fit.recipes import Recipe
 from registration.fit.variables import skin_triangles, skin_vertices
 from registration.geometry.large_steps import normalised_laplacian, spacing
 from registration.geometry.nearest_planes import NearestPlanes
+from registration.losses import depth
 from registration.losses.scan import ScanDistance
 from registration.losses.self_intersection import SelfIntersectionPenalty
 from registration.losses.uv_ssim import UVSSIM
@@ -21,7 +23,7 @@ from registration.model.landmarks import LandmarkScheme
 from registration.model.regions import crossing_parts, head_skin, offset_regions, vertex_classes
 from registration.render.renderer import Renderer
 from registration.targets.classes import ClassMap
-from registration.types import Registration, Targets
+from registration.types import Registration, Rendered, SurfaceHits, Targets
 
 # Surfaces of their own: where a pixel shows one and its target another, only classes are compared.
 _SEPARATE_SURFACES = ("left_eye", "right_eye", "mouth_interior")
@@ -104,6 +106,26 @@ class FitContext:
         shown = finest.pixels.image(compared.float()[:, None])[..., 0].numpy() > 0
         rows = np.flatnonzero(head_skin(self.data))
         return ScanDistance(self.scan, rows, self.data.triangles, finest.pixels.cameras, list(shown))
+
+    @cached_property
+    def triangles(self) -> Int[Tensor, "F 3"]:
+        """Those of the model's mesh."""
+        return torch.as_tensor(self.data.triangles.astype(np.int64), device=self.device)
+
+    def depth_distances(
+        self, vertices: Float[Tensor, "V 3"], rendered: Rendered, targets: Targets, agree: Bool[Tensor, "P"]
+    ) -> tuple[SurfaceHits, Float[Tensor, "H"], Float[Tensor, "H"]]:
+        """Return where the skin is compared with depth maps, its distances (m), and their weights.
+
+        Args:
+            vertices: of the mesh, in which the distances are differentiable; world, metres.
+            rendered: the mesh at the targets' pixels.
+            targets: with depths.
+            agree: pixels where both show the same kind of surface.
+        """
+        shown = self.renderer.surface(vertices.detach(), targets.pixels)
+        hits, weight = depth.compared(shown, rendered, targets, self.separate_surfaces, agree)
+        return hits, depth.distances(vertices, self.triangles, hits, rendered, targets), weight
 
     @cached_property
     def uv_ssim(self) -> UVSSIM | None:

@@ -296,6 +296,20 @@ class FitProblem:
             residuals[name] = float(np.median(distance)) * px_per_m if len(distance) else float("nan")
         return residuals
 
+    def depth_mm_by_view(self, targets: Targets, rendered: Rendered) -> Float[Tensor, "N"] | None:
+        """Return the median distance of each view's depths from the mesh; NaN without any; None: no view has depths.
+
+        Args:
+            targets: of some views.
+            rendered: the mesh as it is at their pixels.
+        """
+        if targets.depth is None:
+            return None
+        agree = image.pixel_agreement(rendered, targets, self.context.separate_surfaces)
+        hits, distance, _ = self.context.depth_distances(self.vertices(), rendered, targets, agree)
+        view, size_mm = targets.pixels.view.index_select(0, hits.pixel), distance.abs() * MM_PER_M
+        return torch.stack([size_mm[view == number].nanmedian() for number in range(len(targets.names))])
+
     def render_views(self, views: Sequence[int]) -> tuple[Targets, Rendered]:
         """Return targets of some views at the finest level, and the mesh rendered there, exposed as their cameras."""
         batch = self.pyramid[0].select(views, self.context.device)

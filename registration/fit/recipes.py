@@ -46,6 +46,8 @@ class Weights:
     contacts: float = 0.0  # per mm^2 of excess depth, summed over the vertices inside another part
     tongue: float = 1e-5  # the same of the tongue, which is mostly occluded: about as strong as its prior
     slide: float = 0.0  # dissimilarity of the neutral's texture and the unwrapped images; expressions only
+    depth: float = 1e5  # per m^2 of robust squared distance from the depth maps, where there are any
+    depth_scale_mm: float = 5.0  # distance at which the pull of depths fades: wrong ones, hair, holes that were filled
     scan: float = 0.0  # per m^2 of robust squared distance from the scan, where it is fitted
     scan_scale_mm: float = 1.0  # distance at which the scan's pull fades: hair, holes filled by a program, noise
 
@@ -144,6 +146,7 @@ def _offsets(
             landmarks=0.01,
             contacts=2e-4,
             slide=0.5,
+            depth_scale_mm=max(0.5, 0.3 * smoothing_mm),
             scan=_SCAN if smoothing_mm < _COARSE_MM else 0.0,
             scan_scale_mm=max(0.5, 0.3 * smoothing_mm),
         ),

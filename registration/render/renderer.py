@@ -24,7 +24,7 @@ from registration.render.adjoint import Adjoint, RowSum, unit_of
 from registration.render.cameras import PixelList, upload
 from registration.render.scene import TriangleScene
 from registration.render.shading import GROUPS, NO_FACE, ForwardState, Hits, RenderMesh, rows, rows_of_four
-from registration.types import Pixels, Rendered
+from registration.types import Pixels, Rendered, SurfaceHits
 
 _CENTRE = (0.5, 0.5)
 _PARTIAL_RAYS = 16  # of a partly covered pixel, if anti-aliased: coverage error 0.035 rms; with 4 rays 0.1
@@ -106,12 +106,7 @@ class Renderer:
             The weighted sum of `values` in each texel, and the sum of weights.
         """
         with torch.no_grad(), dr.suspend_grad():
-            self._update_vertices(vertices)
-            # Usually the same pixels were rendered just before: reuse their hits.
-            if self._last is not None and self._last[0] is pixels and len(self._pixel_offsets) == 1:
-                hits = self._last[1].hits[0]
-            else:
-                hits = self._cast(upload(pixels), _CENTRE)
+            hits = self._hits(vertices, pixels)
             weighted = torch.cat([values * weights[:, None], weights[:, None]], -1)
             texels = RowSum(texture_size**2, unit_of([weighted]))
             if hits.count:
@@ -120,6 +115,19 @@ class Renderer:
                 interior.splat(texels, footprint, dr.gather(mi.Vector4f, _flat(weighted), hits.pixel))
             image = _tensor(texels.table()).view(texture_size, texture_size, 4)
             return image[..., :3], image[..., 3]
+
+    def surface(self, vertices: Float[Tensor, "V 3"], pixels: Pixels) -> SurfaceHits:
+        """Return which points of the mesh the centres of pixels show. Not differentiable.
+
+        Args:
+            vertices: world, metres.
+            pixels: which pixels of which cameras.
+        """
+        with torch.no_grad(), dr.suspend_grad():
+            hits = self._hits(vertices, pixels)
+            pixel, face = (_tensor(mi.Int64(index)) for index in (hits.pixel, hits.face))
+            barycentric = torch.stack([_tensor(share) for share in hits.barycentric], -1)
+            return SurfaceHits(pixel=pixel, face=face, barycentric=barycentric)
 
     def depth(self, vertices: Float[Tensor, "V 3"], pixels: Pixels) -> Float[Tensor, "P"]:
         """Return the depth of the mesh at the pixels' centres. Not differentiable.
@@ -132,10 +140,14 @@ class Renderer:
             Distance along each camera's axis, metres; inf where the mesh is missed.
         """
         with torch.no_grad(), dr.suspend_grad():
-            self._update_vertices(vertices)
-            if self._last is not None and self._last[0] is pixels and len(self._pixel_offsets) == 1:
-                return _tensor(self._last[1].hits[0].depth)
-            return _tensor(self._cast(upload(pixels), _CENTRE).depth)
+            return _tensor(self._hits(vertices, pixels).depth)
+
+    def _hits(self, vertices: Tensor, pixels: Pixels) -> Hits:
+        """Those of the pixels' centres. Usually the same pixels were rendered just before: their hits are reused."""
+        self._update_vertices(vertices)
+        if self._last is not None and self._last[0] is pixels and len(self._pixel_offsets) == 1:
+            return self._last[1].hits[0]
+        return self._cast(upload(pixels), _CENTRE)
 
     def _update_vertices(self, vertices: Tensor) -> None:
         """Set the vertices; the cached forward pass of other vertices is dropped."""

@@ -54,7 +54,8 @@ def compare_views(problem: FitProblem) -> Comparison:
         for first in range(0, len(members), _BATCH):
             batch_views = members[first : first + _BATCH]
             targets, rendering = problem.render_views(batch_views)
-            residuals.update(view_residuals(targets, rendering, landmark_px[batch_views]))
+            depth_mm = problem.depth_mm_by_view(targets, rendering)
+            residuals.update(view_residuals(targets, rendering, landmark_px[batch_views], depth_mm))
             for view, images in zip(batch_views, report_views(targets, rendering), strict=True):
                 thumbnails[images.name] = thumbnail(images)
                 if view in shown:

@@ -12,6 +12,7 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float
 
+from registration.capture.dense_maps import block_depth
 from registration.capture.pixels import read_view, undistort_landmarks, undistorted_spread
 from registration.capture.samples import sample_views
 from registration.geometry.surface_views import SurfaceViews
@@ -38,13 +39,15 @@ class _ViewCrop:
     excluded: Float[np.ndarray, "H W"]
     valid: Float[np.ndarray, "H W"]
     incidence: Float[np.ndarray, "H W"]  # cosine, where it is known without normals; else 1
-    confidence: Float[np.ndarray, "H W"] | None  # of normals; None: 1
+    confidence: Float[np.ndarray, "H W"] | None  # of normals and depth; None: 1
+    depth: Float[np.ndarray, "H W"] | None  # along the optical axis, metres; 0 where none
     landmarks: Mapping[str, Float[np.ndarray, "L 3"]]
     landmark_spread_px: Mapping[str, Float[np.ndarray, "L"]]
     has_mask: bool
     has_classes: bool
     has_colours: bool
-    has_normals: bool  # from a file: colours count where these do
+    has_normals: bool  # from a file
+    has_holes: bool  # in the normals, as stereo leaves them: colours count beside them too
     head_px: float
 
 
@@ -127,12 +130,14 @@ def _view_crop(view: View, capture: Capture, mapping: ClassMap, downsample: int)
         valid=pixels.valid,
         incidence=zeros + 1,
         confidence=pixels.confidence,
+        depth=pixels.depth,
         landmarks=landmarks,
         landmark_spread_px=spreads,
         has_mask=mask is not None,
         has_classes=pixels.label_coverage is not None,
         has_colours=capture.photographs,
         has_normals=pixels.normals is not None,
+        has_holes=pixels.depth is not None or pixels.confidence is not None,
         head_px=float(shape[0]),
     )
     return _crop_to_head(full)
@@ -196,6 +201,8 @@ def _halved(crop: _ViewCrop) -> _ViewCrop:
         return value.reshape(h, 2, w, 2, *value.shape[2:]).mean((1, 3))
 
     means = _each(crop, mean)
+    if (depth := crop.depth) is not None:
+        means["depth"] = block_depth(mean((depth > 0).astype(np.float32)), means["depth"], mean(depth**2))
     height, width = means["mask"].shape
     return replace(
         crop,
@@ -216,6 +223,10 @@ def _targets(crops: list[_ViewCrop], mapping: ClassMap) -> Targets:
     def listed(values: list[np.ndarray]) -> torch.Tensor:
         return torch.as_tensor(np.stack([value.astype(np.float16) for value in values])[indices])
 
+    depth = None
+    if any(crop.depth is not None for crop in crops):  # float16 has steps of half a millimetre at a metre
+        known = [np.zeros_like(crop.mask) if crop.depth is None else crop.depth for crop in crops]
+        depth = torch.as_tensor(np.stack(known).astype(np.float32)[indices])
     schemes = sorted({scheme for crop in crops for scheme in crop.landmarks})
     return Targets(
         names=tuple(crop.name for crop in crops),
@@ -224,6 +235,7 @@ def _targets(crops: list[_ViewCrop], mapping: ClassMap) -> Targets:
         rgb=listed([crop.rgb for crop in crops]),
         mask=listed([crop.mask for crop in crops]),
         classes=listed([crop.classes for crop in crops]),
+        depth=depth,
         landmarks={scheme: _stack_landmarks(crops, scheme) for scheme in schemes},
         landmark_spread_px={
             scheme: _stack_spreads(crops, scheme)
@@ -259,11 +271,14 @@ def _apply_weights(crop: _ViewCrop) -> dict[str, np.ndarray]:
     has_normal = inside * (length > _MIN_NORMAL_LENGTH)
     normals = crop.normals / np.maximum(length, 1e-6)[..., None] * has_normal[..., None]
     facing = np.clip(-(_directions(crop.camera) * normals).sum(-1), 0, 1)
+    incidence = facing if crop.has_normals else crop.incidence
+    if crop.has_holes:
+        incidence = np.where(has_normal > 0, facing, crop.incidence)
     core = cv2.erode(inside.astype(np.uint8), np.ones((3, 3), np.uint8)).astype(np.float32)
     return {
         "normals": normals,
         "normal_weight": facing if crop.confidence is None else facing * crop.confidence,
-        "rgb_weight": core * (facing if crop.has_normals else crop.incidence) * float(crop.has_colours),
+        "rgb_weight": core * incidence * float(crop.has_colours),
         "mask_weight": _silhouette_weight(crop) * valid if crop.has_mask else 0 * valid,
         "class_weight": inside * (crop.classes.sum(-1) > 0.5),
     }

@@ -1,6 +1,6 @@
 """The loss terms of a fit. A new one is a factory in a module of this package and a line in `TERMS`."""
 
-from registration.fit.terms import contacts, image, landmarks, priors, scan, sliding
+from registration.fit.terms import contacts, depth, image, landmarks, priors, scan, sliding
 from registration.fit.terms.term import StageContext, StepState, Term, TermFactory
 
 __all__ = ["TERMS", "StageContext", "StepState", "Term", "TermFactory", "make_terms"]
@@ -14,6 +14,7 @@ TERMS: tuple[TermFactory, ...] = (
     contacts.contacts,
     sliding.sliding,
     scan.scan,
+    depth.depth,
     priors.identity,
     priors.expression,
     priors.joints,

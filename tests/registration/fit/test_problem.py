@@ -13,7 +13,7 @@ from registration.fit import terms
 from registration.fit.context import FitContext, ViewOrder
 from registration.fit.initialization import from_landmarks
 from registration.fit.problem import FitProblem, assess, refine
-from registration.fit.recipes import Recipe, Stage, preview
+from registration.fit.recipes import Rate, Recipe, Stage, Weights, preview
 from registration.fit.terms import StageContext, StepState, Term
 from registration.fit.variables import InitialGuess
 from registration.geometry.nearest_planes import MeshPlanes
@@ -71,6 +71,36 @@ def test_stages_have_the_losses_of_their_weights_and_variables(context: FitConte
     assert set(trace.history[offsets.name]) == IMAGES | OFFSETS | {"rgb", "ssim", "eyes"}
     assert all(len(values) == 2 for losses in trace.history.values() for values in losses.values())
     assert set(trace.seconds) == {model.name, offsets.name}
+
+
+def test_depths_are_fitted_where_there_are_any(context: FitContext, initial: InitialGuess) -> None:
+    """Depths of the truth's mesh draw an initial guess that is moved away from the cameras back."""
+    vertices = FitProblem(context, initial).vertices()
+    levels = []
+    for targets in context.pyramid:
+        rendered = context.renderer(vertices, None, targets.pixels)
+        hits = context.renderer.surface(vertices, targets.pixels)
+        assert rendered.mask.sum() == len(hits.pixel)
+        corners = torch.as_tensor(context.data.triangles.astype(np.int64))[hits.face]
+        points = (vertices[corners] * hits.barycentric[..., None]).sum(1)
+        depth = torch.zeros(len(targets.pixels.view))
+        for view, camera in enumerate(targets.pixels.cameras):
+            members = targets.pixels.view[hits.pixel] == view
+            projected, z = camera.project(points[members].double().numpy())
+            pixel = hits.pixel[members]
+            centres = torch.stack([targets.pixels.x[pixel], targets.pixels.y[pixel]], -1).numpy() + 0.5
+            np.testing.assert_allclose(projected, centres, atol=2e-2)
+            depth[pixel] = torch.as_tensor(z, dtype=torch.float32)
+        levels.append(replace(targets, depth=depth))
+    with_depth = replace(context, pyramid=tuple(levels))
+    moved = replace(initial, position=initial.position + np.array([0.002, 0.0, 0.003]))
+    only = Weights(normals=0, mask=0, classes=0, landmarks=0, tongue=0, depth_scale_mm=10)
+    stage = Stage(name="pose", steps=25, level=1, weights=only, free=(("position", Rate(start=5e-4, end=1e-4)),))
+    problem = FitProblem(with_depth, moved)
+    before = (problem.vertices() - vertices).norm(dim=-1).mean()
+    trace = problem.run([stage])
+    after = (problem.vertices() - vertices).norm(dim=-1).mean()
+    assert set(trace.history["pose"]) == {"depth"} and after < 0.2 * before
 
 
 def test_a_scan_is_fitted_in_the_finer_stages_only(

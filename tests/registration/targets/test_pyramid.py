@@ -339,3 +339,44 @@ def test_spread_of_landmarks_shrinks_with_the_pixels(tmp_path) -> None:
         shrunk *= 2
     batch = levels[0].select([2, 0], torch.device("cpu"))
     assert batch.landmark_spread_px["68"][0, 0] == pytest.approx(spread[0] / 2) and batch.landmarks["68"].shape[0] == 2
+
+
+def test_depths_at_every_level_and_their_holes(tmp_path):
+    """Those of the ball at each level's own pixels; confidences scale normals, and colours count beside holes."""
+    views = []
+    for i, yaw_rad in enumerate(small.YAWS_RAD):
+        view = labelled_view(f"cam{i}", yaw_rad)
+        world, _ = world_directions(view.camera)
+        along = (small.RADIUS_M * world) @ view.camera.T_cam_world[2, :3] + view.camera.T_cam_world[2, 3]
+        depth = np.where(view.mask, along, 0)
+        depth[60:90, 50:70] = 0
+        confidence = np.full(depth.shape, 0.4)
+        normals = np.where(depth[..., None] > 0, view.normals, 0)
+        views.append(replace(view, depth=depth, confidence=confidence, normals=normals))
+    views[-1] = labelled_view("cam4", small.YAWS_RAD[-1])
+    levels = build_pyramid(
+        capture_of(tmp_path / "ball", views), class_map(CLASSES), finest_head_px=10_000, levels=LEVELS
+    )
+    for number, targets in enumerate(levels):
+        assert targets.depth is not None and targets.depth.dtype == torch.float32
+        depth, weight = images(targets, "depth")[..., 0], images(targets, "normal_weight")[..., 0]
+        colour = images(targets, "rgb_weight")[..., 0]
+        for view, camera in enumerate(targets.pixels.cameras[:4]):
+            world, inside = world_directions(camera)
+            expected = (small.RADIUS_M * world) @ camera.T_cam_world[2, :3] + camera.T_cam_world[2, 3]
+            pixel_m = 0.45 / camera.intrinsics[0, 0]
+            known = (depth[view] > 0) & (weight[view] > 0.2) & (inside > 2 * pixel_m)
+            assert known.sum() > 1500 / 4**number
+            bend = pixel_m**2 / small.RADIUS_M  # of the surface within a pixel
+            assert np.median(np.abs(depth[view] - expected)[known]) < 1e-5 + bend
+            # beside a hole the mean is that of the remaining pixels
+            assert (np.abs(depth[view] - expected)[known] < 1e-5 + 8 * bend + 0.5 * pixel_m).all()
+            facing = weight[view][known] / 0.4
+            assert facing.max() <= 1.001 and facing.max() > 0.95
+            hole = (depth[view] == 0) & (inside > 4 * pixel_m) & (colour[view] > 0)
+            assert hole.sum() > 100 / 4**number
+        assert not depth[4].any()
+
+
+def test_captures_without_depths_have_no_such_channel(pyramid):
+    assert all(targets.depth is None and targets.select([0], torch.device("cpu")).depth is None for targets in pyramid)
