@@ -27,12 +27,18 @@ from registration.segment.views import SegmentView, depth_in, ellipse
 from registration.stereo.depth_map import DepthMap
 
 _ROUNDS = 6  # of averaging over neighbours: about 10 mm
-_LOOK = {HAIR: 1.6, BEARD: 1.6, CLOTH: 2.2}  # mean difference from skin, in its standard deviations, of each kind
+_LOOK = {
+    HAIR: 1.6,
+    BEARD: 1.6,
+    CLOTH: 2.2,
+    GLASSES: 1.6,
+}  # mean difference from skin, in its standard deviations, of each kind
 _BRIGHTER = 0.4  # weight of what is brighter than skin
 _FRINGE = 1.5  # times the limit, on the forehead and temples: hair may hang there
 _FRINGE_M = 0.03  # how far below the hairline
 _LEAST_M2 = {HAIR: 6e-4, BEARD: 3e-4, CLOTH: 6e-4, GLASSES: 2e-4}  # smaller patches are stains
 _FRONT_M = {HAIR: 4e-3, BEARD: 4e-3, CLOTH: 5e-3, GLASSES: 4e-3}  # in front of the surface, beside the fit's error
+_MOST_FRONT = 3.0  # times `_FRONT_M`: more counts no more
 _DEPTH_CONFIDENCE = 0.5
 _LEAST_COSINE = 0.4
 _DEPTH_VIEWS = 2
@@ -94,11 +100,13 @@ def foreign_vertices(
         HAIR: np.maximum(total, 0) / _LOOK[HAIR],
         BEARD: np.where(darker + look["grain"] > 0.5, total, 0) / _LOOK[BEARD],
         CLOTH: clothing / _LOOK[CLOTH],
-        GLASSES: np.zeros(len(total)),
+        GLASSES: total / _LOOK[GLASSES],
     }
     shares = {}
     for name, value in evidence.items():
-        value = value + np.maximum(offset - accuracy_m, 0) / _FRONT_M[name]
+        # What looks like skin and lies in front of the fitted surface is skin, and the fit is wrong.
+        front_share = np.clip((offset - accuracy_m) / _FRONT_M[name], 0, _MOST_FRONT)
+        value = value * (front_share if name == GLASSES else 1 + front_share)
         root = places[HAIR] == 1 if name == HAIR else None
         share = _patches(head, np.clip(value * places[name] - 0.5, 0, 1), _LEAST_M2[name], root)
         shares[name] = share

@@ -2,14 +2,16 @@
 
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 
 import cv2
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
-from registration.capture.class_names import BACKGROUND
+from registration.capture.class_names import BACKGROUND, NECK
+from registration.model.regions import head_skin
+from registration.segment.borders import Face, closed, refine_borders
 from registration.segment.fitted import CLASSES, INDEX, UNLABELLED, FittedHead
 from registration.segment.foreign import Foreign, foreign_pixels, foreign_vertices
 from registration.segment.masks import THREADS, UNCERTAIN
@@ -68,7 +70,8 @@ def fitted_labels(
         if window is not None
     ]
     foreign = foreign_vertices(head, shown, subjects, given, accuracy_m)
-    label = partial(_label, head=head, foreign=foreign, accuracy_m=accuracy_m)
+    shut = closed([view.landmarks for view in views])
+    label = partial(_label, head=head, foreign=foreign, accuracy_m=accuracy_m, shut=shut)
     with ThreadPoolExecutor(THREADS) as pool:
         return list(pool.map(label, views, masks, windows))
 
@@ -85,8 +88,6 @@ def _distance(view: SegmentView, sphere: HeadSphere) -> float:
 
 def head_sphere(head: FittedHead) -> HeadSphere:
     """The sphere around a fitted head's skull and face, for `masks.first_masks` and windows."""
-    from registration.model.regions import head_skin
-
     points = head.vertices[head_skin(head.data)]
     centre = (points.min(0) + points.max(0)) / 2
     return HeadSphere(centre=centre, radius_m=_RADIUS * float(np.ptp(points, axis=0).max()) / 2)
@@ -99,6 +100,7 @@ def _label(
     head: FittedHead,
     foreign: Foreign,
     accuracy_m: float,
+    shut: frozenset[str],
 ) -> Labelled:
     shape = view.image.shape[:2]
     if window is None:
@@ -106,12 +108,16 @@ def _label(
         return Labelled(name=view.name, mask=np.full(shape, UNCERTAIN, np.float32), labels=labels)
     fitted = head.view(window.camera(view.camera))
     coverage = window.cut(mask)
-    px_per_m = fitted.camera.intrinsics[0, 0] / max(np.median(fitted.depth[fitted.inside]), 1e-3)
-    core = cv2.erode(fitted.inside.astype(np.uint8), ellipse((2 * accuracy_m + 1e-3) * px_per_m)) > 0
+    px_per_m = float(fitted.camera.intrinsics[0, 0]) / _distance(view, head_sphere(head))
+    # A bust ends elsewhere than the model's: below the chin the fitted silhouette says nothing.
+    head_alone = fitted.inside & (fitted.labels != INDEX[NECK])
+    core = cv2.erode(head_alone.astype(np.uint8), ellipse((2 * accuracy_m + 1e-3) * px_per_m)) > 0
     coverage = np.where(core, 1, coverage)
     unknown = np.abs(coverage - UNCERTAIN) < _KNOWN
-    tolerance = (2 * accuracy_m + _TOLERANCE_M) * px_per_m
-    labels = foreign_pixels(window.cut(view.image), head, fitted, foreign, coverage > 0.5, tolerance)
+    image, tolerance = window.cut(view.image), (2 * accuracy_m + _TOLERANCE_M) * px_per_m
+    face = Face(image=image, landmarks=_landmarks(view, window), px_per_m=px_per_m, error_m=accuracy_m, closed=shut)
+    fitted = replace(fitted, labels=refine_borders(face, fitted.labels))
+    labels = foreign_pixels(image, head, fitted, foreign, coverage > 0.5, tolerance)
     wide = _wide(unknown)
     labels[wide] = INDEX[UNLABELLED]
     full = window.paste(labels.astype(np.uint8), shape, smooth=False)
@@ -119,6 +125,13 @@ def _label(
     improved = np.where(filled & ~_outside(shape, window), 1, mask).astype(np.float32)
     full[(improved < 0.5 - _KNOWN) & (full != INDEX[BACKGROUND])] = INDEX[BACKGROUND]
     return Labelled(name=view.name, mask=improved, labels=full)
+
+
+def _landmarks(view: SegmentView, window: Window) -> Float[np.ndarray, "L 3"] | None:
+    """The view's landmarks in the window's pixels."""
+    if view.landmarks is None:
+        return None
+    return np.column_stack([window.points(view.landmarks[:, :2]), view.landmarks[:, 2]])
 
 
 def _wide(unknown: Bool[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:

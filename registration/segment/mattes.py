@@ -40,6 +40,25 @@ def refine(
     kernel = ellipse(band_px)
     inside = cv2.erode(rough.astype(np.uint8), kernel) > 0
     outside = cv2.dilate(rough.astype(np.uint8), kernel) == 0
+    return refine_between(image, rough, inside, outside, window_px)
+
+
+def refine_between(
+    image: UInt8[np.ndarray, "H W 3"],
+    rough: Bool[np.ndarray, "H W"],
+    inside: Bool[np.ndarray, "H W"],
+    outside: Bool[np.ndarray, "H W"],
+    window_px: float,
+) -> Matte:
+    """Return the coverage of a subject whose border lies somewhere between two regions.
+
+    Args:
+        image: any colours.
+        rough: the subject where its border is not seen.
+        inside: what is surely the subject.
+        outside: what is surely not.
+        window_px: side of the square whose colours describe the two sides of the border.
+    """
     band = ~inside & ~outside
     seen = np.ones(rough.shape, bool)
     if not band.any() or not inside.any() or not outside.any():

@@ -20,7 +20,7 @@ class SegmentView:
     name: str
     image: UInt8[np.ndarray, "H W 3"]  # red green blue, sRGB
     camera: Camera  # without distortion, of the image's size
-    landmarks: Float[np.ndarray, "L 3"] | None = None  # x_px y_px confidence
+    landmarks: Float[np.ndarray, "L 3"] | None = None  # of scheme "face478": x_px y_px confidence
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
