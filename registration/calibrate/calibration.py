@@ -10,7 +10,17 @@ import numpy as np
 
 from registration.calibrate.assembly import Assembled, Evidence, assemble, match_pairs
 from registration.calibrate.bundle import Observations
-from registration.calibrate.features import MIN_MATCHES, Features, Matches, find_features, match, mirrored, tracks
+from registration.calibrate.features import (
+    MIN_MATCHES,
+    Features,
+    Matches,
+    find_features,
+    joined,
+    match,
+    mirrored,
+    tracks,
+)
+from registration.calibrate.guided import FaceImage, guided_match
 from registration.calibrate.lengths import check_lengths, sized
 from registration.calibrate.metric import fit_model
 from registration.calibrate.options import CalibrateOptions
@@ -22,7 +32,7 @@ from registration.calibrate.photographs import (
     read_pixels,
 )
 from registration.calibrate.result import Calibration, collect
-from registration.calibrate.start import EXIF_SIGMA, Focals, Start, landmark_observations, start_from_faces
+from registration.calibrate.start import EXIF_SIGMA, Focals, Start, angles, landmark_observations, start_from_faces
 from registration.detect.provider import Face, LandmarkProvider
 from registration.detect.providers import load_provider
 from registration.errors import InputError
@@ -32,8 +42,14 @@ from registration.progress import NullProgress, Progress
 
 MAX_SIDE_PX = 2400  # of the images that features and faces are searched in
 _MAX_ANGLE = np.radians(65.0)  # between the viewing directions of views that are matched
-_USUAL_TRACKS = 60  # of a view, by the median: then a view with next to none is wrong
+_USUAL_MATCHES = 150  # of a view with all others, by the median: then one with next to none is wrong
+_NEXT_TO_NONE = 0.05  # of the usual ones
+_FEW_KEPT = 0.2  # of the usual number of points in a view: below, it is compared as a mirror image
+_NEAR = np.radians(35.0)  # between the viewing directions of views whose features should match
 _MIN_PRESENCE = 0.5
+_FEW_MATCHES = 200  # of a view with all others: below, faces are matched by their landmarks' help
+_NEIGHBOURS = 4  # with which they are
+_SEEN = 0.3  # confidence of a landmark, above which the camera sees it
 _DEFAULTS = CalibrateOptions()
 
 
@@ -84,7 +100,8 @@ def calibrate_photographs(
     centres = np.array([photograph.centre_px for photograph in photographs])
     mean = scheme.points(data.template_vertex_positions.astype(np.float64))
     start = start_from_faces(landmarks, mean, scheme.spread_m, centres, group, focals)
-    matches = _match(features, match_pairs(start, _MAX_ANGLE), progress)
+    plain = _match(features, match_pairs(start, _MAX_ANGLE), progress)
+    matches = plain | _match_faces(photographs, faces, features, start, plain)
     evidence = _evidence(start, landmarks, features, matches, photographs)
 
     def run(evidence: Evidence, start: Start) -> Assembled:
@@ -99,7 +116,7 @@ def calibrate_photographs(
         )
 
     assembled = run(evidence, start)
-    wrong = _disagreeing(assembled, start, features, matches)
+    wrong = _disagreeing(assembled, features, plain)
     if wrong:
         start, evidence = _without(start, evidence, list(wrong))
         assembled = run(evidence, start)
@@ -243,6 +260,40 @@ def _match(
     return found
 
 
+def _match_faces(
+    photographs: Sequence[Photograph],
+    faces: Sequence[Face | None],
+    features: list[Features],
+    start: Start,
+    matches: Matches,
+) -> dict[tuple[int, int], np.ndarray]:
+    """Match faces of views with few matches, guided by landmarks; their features are added to `features`."""
+    total = np.zeros(len(photographs), np.int64)
+    for pair, found in matches.items():
+        total[list(pair)] += len(found)
+    shown = [view for view in np.flatnonzero(start.posed).tolist() if faces[view] is not None]
+    pairs: set[tuple[int, int]] = set()
+    for view in (view for view in shown if total[view] < _FEW_MATCHES):
+        angle = angles(start.rig, view)
+        near = sorted((other for other in shown if other != view), key=lambda other: float(angle[other]))
+        pairs |= {(min(view, other), max(view, other)) for other in near[:_NEIGHBOURS] if angle[other] < _MAX_ANGLE}
+    added = {}
+    for i, j in sorted(pairs):
+        first, second = (_face_image(photographs[view], faces[view]) for view in (i, j))
+        seen, new = guided_match(first, second, features[j])
+        if len(new):
+            plain = matches.get((i, j), np.zeros((0, 2), np.int64))
+            added[i, j] = np.concatenate([plain, new + [len(features[i].xy_px), 0]])
+            features[i] = joined(features[i], seen)
+    return added
+
+
+def _face_image(photograph: Photograph, face: Face | None) -> FaceImage:
+    assert face is not None
+    pixels, factor = read_pixels(photograph, MAX_SIDE_PX)
+    return FaceImage(pixels=pixels, points=face.points / factor, seen=face.confidence > _SEEN, factor=factor)
+
+
 def _evidence(
     start: Start,
     landmarks: Observations,
@@ -265,27 +316,39 @@ def _evidence(
     )
 
 
-def _disagreeing(assembled: Assembled, start: Start, features: Sequence[Features], matches: Matches) -> dict[int, str]:
-    """Views whose features fit no other view, although those of the other views do: view -> what it seems to be."""
-    seen = assembled.observations
-    count = np.bincount(seen.view[~assembled.of_landmarks], minlength=len(assembled.posed))
-    posed = np.flatnonzero(assembled.posed).tolist()
-    if np.median(count[posed]) < _USUAL_TRACKS:
+def _disagreeing(assembled: Assembled, features: Sequence[Features], plain: Matches) -> dict[int, str]:
+    """Views of which next to no feature matches a near view, although those of others do: view -> what it seems to be.
+
+    Matches that landmarks guided do not count: symmetric faces, and faces of two people, have some.
+    """
+    total, posed = np.zeros(len(assembled.posed), np.int64), np.flatnonzero(assembled.posed).tolist()
+    for pair, found in plain.items():
+        if assembled.posed[list(pair)].all():
+            total[list(pair)] += len(found)
+    usual = float(np.median(total[posed]))
+    if usual < _USUAL_MATCHES:
         return {}
+    kept = np.bincount(assembled.observations.view[~assembled.of_landmarks], minlength=len(total))
     wrong = {}
     for view in posed:
-        if count[view] >= MIN_MATCHES:
+        angle = angles(assembled.adjusted.rig, view)
+        others = [other for other in posed if other != view]
+        near = any(angle[other] < _NEAR for other in others)
+        few = total[view] < max(MIN_MATCHES, _NEXT_TO_NONE * usual)
+        if not near or not (few or kept[view] < _FEW_KEPT * np.median(kept[posed])):
             continue
         turned = mirrored(features[view])
-        others = [other for other in posed if other != view]
-        as_is = sum(len(pair) for key, pair in matches.items() if view in key)
         flipped = sum(len(match(turned, features[other])) for other in others)
-        wrong[int(view)] = (
-            f"it is mirrored: {flipped} features match the other photographs when it is turned over, {as_is} as it is"
-            if flipped > 3 * max(as_is, MIN_MATCHES)
-            else f"its features do not agree with the other photographs ({count[view]} of "
-            f"{len(features[view].xy_px)}): another person, another moment, or blur"
-        )
+        if flipped > 3 * max(total[view], MIN_MATCHES):
+            wrong[view] = (
+                f"it is mirrored: {flipped} of its features match the other photographs when it is turned over, "
+                f"{total[view]} as it is"
+            )
+        elif few:
+            wrong[view] = (
+                f"its features do not agree with the other photographs ({total[view]} match, usual are {usual:.0f}): "
+                "another person, another moment, or blur"
+            )
     return wrong
 
 

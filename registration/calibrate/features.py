@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
-from jaxtyping import Float, Int, UInt8
+from jaxtyping import Bool, Float, Int, UInt8
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
@@ -55,6 +55,16 @@ def find_features(pixels: UInt8[np.ndarray, "H W 3"], factor: float = 1.0) -> Fe
     )
 
 
+def joined(a: Features, b: Features) -> Features:
+    """Return the features of both, of one photograph; those of `b` follow."""
+    return Features(
+        xy_px=np.concatenate([a.xy_px, b.xy_px]),
+        sigma_px=np.concatenate([a.sigma_px, b.sigma_px]),
+        descriptors=np.concatenate([a.descriptors, b.descriptors]),
+        factor=a.factor,
+    )
+
+
 def mirrored(features: Features) -> Features:
     """Return the features as they would be found in the mirrored image, at the same positions.
 
@@ -70,13 +80,23 @@ def match(a: Features, b: Features) -> Int[np.ndarray, "M 2"]:
     pairs = _mutual(a.descriptors, b.descriptors)
     if len(pairs) < MIN_MATCHES:
         return pairs[:0]
-    limit = _EPIPOLAR_PX * max(a.factor, b.factor)
-    first, second = a.xy_px[pairs[:, 0]], b.xy_px[pairs[:, 1]]
-    matrix, inlier = cv2.findFundamentalMat(first, second, cv2.USAC_MAGSAC, limit, 0.999, 5000)
-    if matrix is None or inlier is None:
-        return pairs[:0]
-    kept = pairs[inlier.ravel() > 0]
-    return kept if len(kept) >= max(MIN_MATCHES, _MIN_SHARE * len(pairs)) else pairs[:0]
+    return pairs[epipolar(a.xy_px[pairs[:, 0]], b.xy_px[pairs[:, 1]], max(a.factor, b.factor))]
+
+
+def epipolar(first: Float[np.ndarray, "M 2"], second: Float[np.ndarray, "M 2"], factor: float) -> Bool[np.ndarray, "M"]:
+    """Return which matches obey one epipolar geometry; none if these are too few.
+
+    Args:
+        first: positions in one view, px of the file.
+        second: in the other.
+        factor: px of the file per px of the image that the features were found in.
+    """
+    none = np.zeros(len(first), bool)
+    if len(first) < MIN_MATCHES:
+        return none
+    inlier = cv2.findFundamentalMat(first, second, cv2.USAC_MAGSAC, _EPIPOLAR_PX * factor, 0.999, 5000)[1]
+    obeys = none if np.ndim(inlier) == 0 else inlier.ravel() > 0  # None where there is no such geometry
+    return obeys if obeys.sum() >= max(MIN_MATCHES, _MIN_SHARE * len(first)) else none
 
 
 def _mutual(a: Float[np.ndarray, "K 128"], b: Float[np.ndarray, "L 128"]) -> Int[np.ndarray, "M 2"]:

@@ -151,3 +151,9 @@ def with_pose(rig: Rig, view: int, rotation: np.ndarray, translation: np.ndarray
     rotations, translations = rig.rotations.copy(), rig.translations.copy()
     rotations[view], translations[view] = rotation, translation
     return replace(rig, rotations=rotations, translations=translations)
+
+
+def angles(rig: Rig, view: int) -> Float[np.ndarray, "N"]:
+    """Return the angles between the directions from the world's origin, the head, to one camera and to all, rad."""
+    directions = rig.positions / np.maximum(np.linalg.norm(rig.positions, axis=1, keepdims=True), 1e-9)
+    return np.arccos(np.clip(directions @ directions[view], -1, 1))

@@ -97,7 +97,9 @@ def test_the_capture_can_be_read_and_says_how_it_was_made(
 
 
 @pytest.mark.slow
-def test_a_mirrored_photograph_and_a_copy_are_left_out_with_the_reason(capture: Capture, tmp_path: Path) -> None:
+def test_a_mirrored_photograph_a_copy_and_a_stranger_are_left_out_with_the_reason(
+    capture: Capture, tmp_path: Path
+) -> None:
     files = []
     for view in capture.views:
         pixels = cv2.imread(str(view.image))
@@ -105,6 +107,9 @@ def test_a_mirrored_photograph_and_a_copy_are_left_out_with_the_reason(capture: 
         cv2.imwrite(str(file), pixels[:, ::-1] if view.name == "cam08" else pixels)
         files.append(file)
     (tmp_path / "copy.png").write_bytes(files[1].read_bytes())
+    other = read_capture(SHARED / "data/captures/gnm_identity_a/neutral")
+    (stranger,) = [view for view in other.views if view.name == "cam07"]
+    (tmp_path / "stranger.png").write_bytes(stranger.image.read_bytes())
 
     class Mirrored(StoredLandmarks):
         """A face that is mirrored is a face."""
@@ -115,9 +120,12 @@ def test_a_mirrored_photograph_and_a_copy_are_left_out_with_the_reason(capture: 
             pixels = cv2.imread(str(turned.image), cv2.IMREAD_COLOR_RGB)
             (other,) = [view for view in capture.views if view.name == "cam07"]
             self._known[np.ascontiguousarray(pixels[:, ::-1]).tobytes()] = ("cam08", other.landmarks["68"][:, :2])
+            pixels = cv2.imread(str(stranger.image), cv2.IMREAD_COLOR_RGB)
+            self._known[pixels.tobytes()] = ("stranger", stranger.landmarks["68"][:, :2])
 
     result = calibrate_photographs(tmp_path, MODEL, provider=Mirrored(capture))
-    assert "cam08" in result.left_out and len(result.left_out) == 2
+    assert {"cam08", "stranger"} < set(result.left_out) and len(result.left_out) == 3
+    assert "another person" in result.left_out["stranger"]
     assert "mirrored" in result.left_out["cam08"]
     assert compare(result, capture)[1] and max(compare(result, capture)[1].values()) < 1.0
 
