@@ -101,7 +101,7 @@ def _near(pairs: Sequence[tuple[int, int]], count: int) -> list[list[int]]:
 
 def _match(
     first: HeadImage, second: HeadImage, centre: Float[np.ndarray, "3"], radius: float, options: FirstPassOptions
-) -> tuple[Float[np.ndarray, "h w"], Float[np.ndarray, "h w"]]:
+) -> tuple[Float[np.ndarray, "_ _"], Float[np.ndarray, "_ _"]]:
     """Depths of one pair in the windows of both; 0 where there are none."""
     pair, forward = rectify(first.camera, second.camera, centre, radius, options.size_px)
     left, right = (first, second) if forward else (second, first)
@@ -216,7 +216,7 @@ def _merged(
 def _confirmed(
     view: int,
     near: Sequence[int],
-    merged: Sequence[tuple[Float[np.ndarray, "h w"], Float[np.ndarray, "h w"]]],
+    merged: Sequence[tuple[Float[np.ndarray, "_ _"], Float[np.ndarray, "_ _"]]],
     images: Sequence[HeadImage],
     options: FirstPassOptions,
 ) -> DepthMap:
