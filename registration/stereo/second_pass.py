@@ -19,7 +19,7 @@ from registration.stereo.depth_map import DepthMap
 from registration.stereo.local_planes import fit_planes
 from registration.stereo.pairs import MOST_DEG, choose_partners, view_angles
 from registration.stereo.search import Found, Partner, Surface, search
-from registration.stereo.views import MOST_PX, HeadImage, StereoView, rays, surface_image
+from registration.stereo.views import MOST_PX, HeadImage, StereoView, camera_image, rays, surface_image
 
 _STEP_PX = 0.4  # of the widest partner's image, between two offsets
 _MOST_OFFSETS = 24  # of a search; wider ranges begin at smaller images
@@ -28,6 +28,7 @@ _LEAST_COSINE = 0.2  # of incidence, below which a view says nothing about a sur
 _HIDDEN = 1.5  # times the reach: depth by which the surface in front of a point may be wrong
 _FILL_PX, _FILL_SHARE = 8.0, 0.05  # wider window that counts a little where offsets are smoothed
 _SURFACE_WEIGHT = 1e-2  # per mm^2, of the surface itself there
+_OWN_SURFACE_PX = 3.0  # window in which the first pass's depths are smoothed
 _CONFIDENT_M = 2e-4  # standard deviation of a depth that has half of the confidence
 
 
@@ -69,25 +70,88 @@ def refined_depths(
         InputError: fewer than two views show the surface, or none overlap.
     """
     chosen = options or SecondPassOptions()
-    low, high = np.min(vertices, 0), np.max(vertices, 0)
-    centre = (low + high) / 2
+    centre = (np.min(vertices, 0) + np.max(vertices, 0)) / 2
     windows = [surface_image(view, vertices, chosen.most_px) for view in views]
+    cameras = [window.camera for window in windows if window is not None]
+    choose_partners(cameras, centre)  # refuses before the surface is prepared
+    surfaces = SurfaceViews(vertices, triangles, cameras, smoothing_m=0)
+
+    def surface_in(image: HeadImage, _: int) -> Surface:
+        seen = surfaces.view(image.camera)
+        depth = np.where(np.isfinite(seen.depth), seen.depth, 0).astype(np.float32)
+        return Surface(depth=depth, trusted=seen.weight > _LEAST_COSINE)
+
+    return _refined(windows, surface_in, centre, chosen, progress)
+
+
+def sharpened_depths(
+    views: Sequence[StereoView],
+    maps: Sequence[DepthMap | None],
+    centre: Float[np.ndarray, "3"],
+    options: SecondPassOptions | None = None,
+    progress: Callable[[float], None] | None = None,
+) -> tuple[DepthMap | None, ...]:
+    """Search around the first pass's own depths, smoothed, where there is no fitted surface yet.
+
+    Args:
+        views: photographs without distortion.
+        maps: of the first pass.
+        centre: of the head, world, metres.
+        options: settings.
+        progress: called with the fraction done.
+
+    Returns:
+        As `refined_depths`, on the windows of `maps`.
+    """
+    chosen = options or SecondPassOptions(reach_m=2e-3)
+    windows = [None if one is None else camera_image(view, one.camera) for view, one in zip(views, maps, strict=True)]
+    shown = [one for one in maps if one is not None]
+    smooth = [fit_planes(one.depth, one.confidence, rays(one.camera), _OWN_SURFACE_PX)[0] for one in shown]
+
+    def surface_in(image: HeadImage, view: int) -> Surface:
+        height, width = image.grey.shape
+        depth = cv2.resize(smooth[view], (width, height), interpolation=cv2.INTER_NEAREST)
+        return Surface(depth=np.asarray(depth, np.float32), trusted=np.asarray(depth > 0))
+
+    return _refined(windows, surface_in, centre, chosen, progress)
+
+
+def _refined(
+    windows: Sequence[HeadImage | None],
+    surface_in: Callable[[HeadImage, int], Surface],
+    centre: Float[np.ndarray, "3"],
+    options: SecondPassOptions,
+    progress: Callable[[float], None] | None,
+) -> tuple[DepthMap | None, ...]:
+    """Measure in all views, then join them; `surface_in`: what a view (its index among those shown) sees."""
     shown = [k for k, window in enumerate(windows) if window is not None]
     images = [window for window in windows if window is not None]
-    cameras = [image.camera for image in images]
-    partners = choose_partners(cameras, centre, chosen.partners)
-    job = _Job(images, partners, SurfaceViews(vertices, triangles, cameras, smoothing_m=0), centre, chosen)
+    partners = choose_partners([image.camera for image in images], centre, options.partners)
+    job = _Job(images, partners, surface_in, centre, options)
     measured: list[Measured] = []
-    with ThreadPoolExecutor(chosen.workers) as pool:
+    with ThreadPoolExecutor(options.workers) as pool:
         for done, one in enumerate(pool.map(job.measure, range(len(images)))):
             measured.append(one)
             if progress is not None:
                 progress((done + 1) / len(images))
-        maps = list(pool.map(lambda k: _joined_map(k, partners, measured, chosen), range(len(images))))
-    result: list[DepthMap | None] = [None] * len(views)
-    for k, depth_map in zip(shown, maps, strict=True):
+    result: list[DepthMap | None] = [None] * len(windows)
+    for k, depth_map in zip(shown, joined_maps(partners, measured, options), strict=True):
         result[k] = depth_map
     return tuple(result)
+
+
+def joined_maps(
+    partners: Sequence[Sequence[int]], measured: Sequence[Measured], options: SecondPassOptions
+) -> list[DepthMap]:
+    """Average depths of all views where they agree; compute normals and confidences.
+
+    Args:
+        partners: of each view.
+        measured: what each view found.
+        options: settings.
+    """
+    with ThreadPoolExecutor(options.workers) as pool:
+        return list(pool.map(lambda k: _joined_map(k, partners, measured, options), range(len(measured))))
 
 
 class _Job:
@@ -97,7 +161,7 @@ class _Job:
         self,
         images: Sequence[HeadImage],
         partners: Sequence[Sequence[int]],
-        surface: SurfaceViews,
+        surface_in: Callable[[HeadImage, int], Surface],
         centre: Float[np.ndarray, "3"],
         options: SecondPassOptions,
     ):
@@ -110,7 +174,7 @@ class _Job:
         self._images = [images]
         for _ in range(self._levels):
             self._images.append([_halved(image) for image in self._images[-1]])
-        self._surfaces = [[_surface(surface, image) for image in level] for level in self._images]
+        self._surfaces = [[surface_in(image, k) for k, image in enumerate(level)] for level in self._images]
 
     def measure(self, view: int) -> Measured:
         """Search coarse to fine, then once more around the smoothed result."""
@@ -172,12 +236,6 @@ def _halved(image: HeadImage) -> HeadImage:
     grey = cv2.resize(image.grey, (width, height), interpolation=cv2.INTER_AREA)
     mask = cv2.resize(image.mask.astype(np.float32), (width, height), interpolation=cv2.INTER_AREA) > 0.5
     return HeadImage(grey=grey, camera=image.camera.scaled(width, height), mask=mask)
-
-
-def _surface(surface: SurfaceViews, image: HeadImage) -> Surface:
-    seen = surface.view(image.camera)
-    depth = np.where(np.isfinite(seen.depth), seen.depth, 0).astype(np.float32)
-    return Surface(depth=depth, trusted=seen.weight > _LEAST_COSINE)
 
 
 def _smoothed(

@@ -66,6 +66,18 @@ def surface_image(view: StereoView, points: Float[np.ndarray, "P 3"], most_px: i
     return _window(view, pixels.min(0), pixels.max(0), most_px)
 
 
+def camera_image(view: StereoView, camera: Camera) -> HeadImage:
+    """Cut the window that a map was made on, of this camera, out of its photograph."""
+    scale = (
+        camera.intrinsics[0, 0] / view.camera.intrinsics[0, 0],
+        camera.intrinsics[1, 1] / view.camera.intrinsics[1, 1],
+    )
+    first = view.camera.intrinsics[:2, 2] - camera.intrinsics[:2, 2] / scale
+    x, y = np.round(first).astype(int).tolist()
+    width, height = round(camera.width_px / scale[0]), round(camera.height_px / scale[1])
+    return _cut(view, (x, y, width, height), (camera.width_px, camera.height_px))
+
+
 def _window(
     view: StereoView, first: Float[np.ndarray, "2"], last: Float[np.ndarray, "2"], most_px: int
 ) -> HeadImage | None:
@@ -78,16 +90,21 @@ def _window(
     width, height = right - x, bottom - y
     if min(width, height) < 8:
         return None
-    window = np.s_[y:bottom, x:right]
+    factor = min(1.0, most_px / max(width, height))
+    return _cut(view, (x, y, width, height), (max(8, round(width * factor)), max(8, round(height * factor))))
+
+
+def _cut(view: StereoView, box: tuple[int, int, int, int], size: tuple[int, int]) -> HeadImage:
+    """A part of a photograph (x, y, width, height), reduced to a size (width, height)."""
+    x, y, width, height = box
+    window = np.s_[y : y + height, x : x + width]
     grey = _grey(view.image[window])
     mask: np.ndarray = np.ones(grey.shape, np.float32) if view.mask is None else view.mask[window].astype(np.float32)
-    cropped = camera.cropped(x, y, width, height)
-    factor = most_px / max(width, height)
-    if factor < 1:
-        small = (max(8, round(width * factor)), max(8, round(height * factor)))
-        grey, mask = (cv2.resize(values, small, interpolation=cv2.INTER_AREA) for values in (grey, mask))
-        cropped = cropped.scaled(*small)
-    return HeadImage(grey=grey, camera=cropped, mask=mask > 0.5)
+    camera = view.camera.cropped(x, y, width, height)
+    if size != (width, height):
+        grey, mask = (cv2.resize(values, size, interpolation=cv2.INTER_AREA) for values in (grey, mask))
+        camera = camera.scaled(*size)
+    return HeadImage(grey=grey, camera=camera, mask=mask > 0.5)
 
 
 def rays(camera: Camera) -> Float[np.ndarray, "h w 3"]:

@@ -9,22 +9,30 @@ from jaxtyping import Float, Int
 from registration.frames import compact
 
 
-def write_ply(file: Path, vertices: Float[np.ndarray, "V 3"], faces: Int[np.ndarray, "F S"]) -> None:
+def write_ply(
+    file: Path,
+    vertices: Float[np.ndarray, "V 3"],
+    faces: Int[np.ndarray, "F S"],
+    normals: Float[np.ndarray, "V 3"] | None = None,
+) -> None:
     """Write a binary little-endian PLY with exactly these vertices in this order, without uvs.
 
-    Coordinates are float32, or float64 where float32 would lose micrometres.
+    Coordinates are float32, or float64 where float32 would lose micrometres; `normals`, if given, are of the vertices.
     """
     vertices = compact(vertices)
     kind, code = ("double", "<f8") if vertices.dtype == np.float64 else ("float", "<f4")
+    names = ("x", "y", "z") if normals is None else ("x", "y", "z", "nx", "ny", "nz")
+    columns = vertices if normals is None else np.concatenate([vertices, normals], axis=1)
     header = (
         "ply\nformat binary_little_endian 1.0\n"
-        f"element vertex {len(vertices)}\nproperty {kind} x\nproperty {kind} y\nproperty {kind} z\n"
-        f"element face {len(faces)}\nproperty list uchar int vertex_indices\nend_header\n"
+        f"element vertex {len(vertices)}\n"
+        + "".join(f"property {kind} {name}\n" for name in names)
+        + f"element face {len(faces)}\nproperty list uchar int vertex_indices\nend_header\n"
     )
     corners = faces.shape[1]
     rows = np.empty(len(faces), [("count", "u1"), ("corners", "<i4", corners)])
     rows["count"], rows["corners"] = corners, faces
-    file.write_bytes(header.encode("ascii") + vertices.astype(code).tobytes() + rows.tobytes())
+    file.write_bytes(header.encode("ascii") + columns.astype(code).tobytes() + rows.tobytes())
 
 
 def write_obj(

@@ -21,7 +21,19 @@ import tyro
 from registration.errors import InputError
 from registration.storage.files import DiskFull
 from registration.terminal import escaped_output, printable
-from workflows.cli import calibration, capture, coregister, export, farm, importing, model, register, stabilize, store
+from workflows.cli import (
+    calibration,
+    capture,
+    coregister,
+    export,
+    farm,
+    importing,
+    model,
+    register,
+    stabilize,
+    stereo,
+    store,
+)
 from workflows.cli.arguments import (
     PRINT_COMPLETION,
     SHELLS,
@@ -44,6 +56,7 @@ GROUPS: Mapping[str, Mapping[str, Command]] = {
         "capture complete": capture.complete,
         "capture synth": capture.synth,
         "capture degrade": capture.degrade,
+        "stereo": stereo.stereo,
         "dataset synth": capture.synth_dataset,
         "dataset import": importing.import_dataset,
     },
