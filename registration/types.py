@@ -82,7 +82,7 @@ class View:
     segmentation: Path | None = None
     landmarks: Mapping[str, Float[np.ndarray, "L 3"]] = field(default_factory=dict)  # scheme -> x_px y_px confidence
     # Scheme -> standard deviation of each landmark's position along each axis, px; not all schemes have it.
-    landmark_spread_px: Mapping[str, Float[np.ndarray, "L"]] = field(default_factory=dict)
+    landmark_spread_px: Mapping[str, Float[np.ndarray, "_"]] = field(default_factory=dict)
     colour: Colour = Colour()
 
     @property
@@ -212,7 +212,7 @@ class Targets:
     # Along the optical axes, metres, float32 in levels too; 0: none. Weighs as the normals. None: no view has depths.
     depth: Float[Tensor, "P"] | None = None
     landmarks: Mapping[str, Float[Tensor, "N L 3"]]  # scheme -> x_px y_px confidence
-    landmark_spread_px: Mapping[str, Float[Tensor, "N L"]] = field(default_factory=dict)  # NaN: unknown
+    landmark_spread_px: Mapping[str, Float[Tensor, "N _"]] = field(default_factory=dict)  # NaN: unknown
     px_per_head: float  # the subject's height in pixels, median over views
 
     def select(self, views: Sequence[int], device: torch.device) -> "Targets":

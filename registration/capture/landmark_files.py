@@ -21,7 +21,7 @@ class ViewLandmarks:
     """The landmarks of one view, in pixels of the distorted image."""
 
     points: Mapping[str, Float[np.ndarray, "L 3"]]  # scheme -> x_px y_px confidence
-    spread_px: Mapping[str, Float[np.ndarray, "L"]]  # scheme -> standard deviation along each axis; not of all schemes
+    spread_px: Mapping[str, Float[np.ndarray, "_"]]  # scheme -> standard deviation along each axis; not of all schemes
 
 
 def read_landmarks(path: Path) -> ViewLandmarks:
@@ -70,7 +70,7 @@ def read_landmarks(path: Path) -> ViewLandmarks:
 def write_landmarks(
     path: Path,
     points: Mapping[str, Float[np.ndarray, "L 3"]],
-    spread_px: Mapping[str, Float[np.ndarray, "L"]],
+    spread_px: Mapping[str, Float[np.ndarray, "_"]],
 ) -> None:
     """Write the landmarks of one view, and the folder that holds the file.
 

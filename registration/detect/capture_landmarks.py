@@ -11,6 +11,7 @@ from registration.detect.provider import Face
 from registration.errors import InputError
 from registration.types import Camera, Capture
 
+PLAIN = "face"  # the note of a view where nothing is remarkable
 ViewState = Literal["used", "none", "refused"]  # its face is used; it shows none; its faces contradict other views
 Outcome = Literal["found", "one view", "no face", "contradictory", "mirrored"]
 
@@ -29,6 +30,15 @@ class ViewDetection:
     spread_px: Float[np.ndarray, "L"] = field(default_factory=lambda: np.zeros(0))
     residual_px: Float[np.ndarray, "L"] = field(default_factory=lambda: np.zeros(0))  # NaN: not seen, or no point
     outliers: tuple[int, ...] = ()  # landmarks that contradict the other views; their confidence is 0
+
+    @property
+    def caption(self) -> str:
+        """What was seen, and how far it is from the other views, in words."""
+        if self.state != "used":
+            return self.note
+        known = self.residual_px[np.isfinite(self.residual_px)]
+        measured = f"{np.median(known):.1f} px off" if len(known) else "unconfirmed"
+        return measured if self.note == PLAIN else f"{measured}; {self.note}"
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

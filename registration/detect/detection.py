@@ -11,7 +11,7 @@ from jaxtyping import Float
 from registration.capture.pixels import distort_points
 from registration.detect import judgement
 from registration.detect.agreement import Agreement, agree, fitting_face, relative_residual, residuals
-from registration.detect.capture_landmarks import CaptureLandmarks, ViewDetection
+from registration.detect.capture_landmarks import PLAIN, CaptureLandmarks, ViewDetection
 from registration.detect.crops import Crop
 from registration.detect.faces import face_size
 from registration.detect.landmark_folder import LandmarkFolder
@@ -229,7 +229,8 @@ def _detection(
             note = "contradicts the other views"
         else:
             fit = min(relative_residual(view.camera, face, agreement.points) for face in view.faces)
-            note = f"contradicts the other views: {fit:.0%} of the face's size off" if np.isfinite(fit) else "elsewhere"
+            off = f"off by {fit:.0%} of the face's size" if fit < 1 else "the face is elsewhere"
+            note = f"contradicts the other views: {off}"
         return replace(_without(view, note), state="refused")
     return _used(view, chosen, _note(view, chosen), residuals(view.camera, view.faces[chosen], agreement.points))
 
@@ -239,7 +240,7 @@ def _note(view: ViewFaces, chosen: int) -> str:
     parts = [how[view.how]] if view.how in how else []
     if len(view.faces) > 1:
         parts.append(f"{len(view.faces)} faces: number {chosen + 1} agrees with the other views")
-    return "; ".join(parts) or "face"
+    return "; ".join(parts) or PLAIN
 
 
 def _without(view: ViewFaces, note: str) -> ViewDetection:

@@ -66,22 +66,23 @@ def draw_contact_sheet(
         image = _draw_tile(view, capture, tile, scheme, points, cloud)
         x, y = 8 + number % columns * cell[0], 72 + number // columns * cell[1]
         page.paste(Image.fromarray(image), (x + (tile[0] - image.shape[1]) // 2, y + tile[1] - image.shape[0]))
-        pen.text((x, y + tile[1] + 3), view.name, _INK, _font(14))
+        pen.text((x, y + tile[1] + 3), view.name, _INK, font(14))
         size = f"{view.camera.width_px} x {view.camera.height_px}"
-        pen.text((x + tile[0], y + tile[1] + 5), size, _FAINT, _font(12), anchor="ra")
-        pen.text((x, y + tile[1] + 20), captions[view.name], _FAINT, _font(12))
+        pen.text((x + tile[0], y + tile[1] + 5), size, _FAINT, font(12), anchor="ra")
+        pen.text((x, y + tile[1] + 20), captions[view.name], _FAINT, font(12))
     path.parent.mkdir(parents=True, exist_ok=True)
     with atomic_file(path) as temporary:
         page.save(temporary, "PNG")
 
 
-def _font(size: int) -> ImageFont.FreeTypeFont | ImageFont.ImageFont:
+def font(size: int) -> ImageFont.FreeTypeFont | ImageFont.ImageFont:
+    """Return the font of captions and headings."""
     return ImageFont.load_default(size)
 
 
 def _write_heading(page: Image.Image, capture: Capture, scan: bool, scheme: str | None) -> None:
     pen = ImageDraw.Draw(page)
-    pen.text((8, 8), f"{capture.subject}, {capture.expression}: {len(capture.views)} views", _INK, _font(24))
+    pen.text((8, 8), f"{capture.subject}, {capture.expression}: {len(capture.views)} views", _INK, font(24))
     entries = [(_MASK, "mask outline")] if any(view.mask for view in capture.views) else []
     entries += [(_SCAN, "scan, visible points")] if scan else []
     if scheme is not None:
@@ -94,8 +95,8 @@ def _write_heading(page: Image.Image, capture: Capture, scan: bool, scheme: str 
     x = 8.0
     for colour, text in entries:
         pen.rectangle((x, 49, x + 12, 61), fill=colour)
-        pen.text((x + 18, 46), text, _INK, _font(14))
-        x += 18 + pen.textlength(text, _font(14)) + 22
+        pen.text((x + 18, 46), text, _INK, font(14))
+        x += 18 + pen.textlength(text, font(14)) + 22
 
 
 def _draw_tile(
@@ -147,7 +148,7 @@ def _draw_scan(
     visible[inside] = depth[inside] < nearest[cells[:, 1], cells[:, 0]] + VISIBLE_M
     shown = np.flatnonzero(visible)
     for x, y in xy[shown[:: max(1, min(10, len(shown) // 500))]]:
-        cv2.circle(image, _subpixel(x, y), 10, _SCAN, -1, cv2.LINE_AA, shift=4)
+        cv2.circle(image, subpixel(x, y), 10, _SCAN, -1, cv2.LINE_AA, shift=4)
 
 
 def _draw_landmarks(
@@ -160,19 +161,19 @@ def _draw_landmarks(
     outlier = residuals(view, scheme, points) > inlier_limit_px(view.camera)
     jaw = [index for index in range(JAW if scheme == "68" else 0) if landmarks[index, 2] > MIN_CONFIDENCE]
     for first, second in zip(jaw, jaw[1:], strict=False):
-        cv2.line(image, _subpixel(*detected[first]), _subpixel(*detected[second]), _USED, 1, cv2.LINE_AA, shift=4)
+        cv2.line(image, subpixel(*detected[first]), subpixel(*detected[second]), _USED, 1, cv2.LINE_AA, shift=4)
     for index in range(len(landmarks)):
-        used, center = landmarks[index, 2] > MIN_CONFIDENCE, _subpixel(*detected[index])
+        used, center = landmarks[index, 2] > MIN_CONFIDENCE, subpixel(*detected[index])
         if np.isfinite(projected[index]).all() and used:
             x, y = projected[index]
-            for a, b in ((_subpixel(x - 4, y), _subpixel(x + 4, y)), (_subpixel(x, y - 4), _subpixel(x, y + 4))):
+            for a, b in ((subpixel(x - 4, y), subpixel(x + 4, y)), (subpixel(x, y - 4), subpixel(x, y + 4))):
                 cv2.line(image, a, b, _TRIANGULATED, 1, cv2.LINE_AA, shift=4)
         colour = (_OUTLIER if outlier[index] else _USED) if used else _UNUSED
         if outlier[index] and depth[index] > 0:
-            cv2.line(image, center, _subpixel(*projected[index]), _OUTLIER, 1, cv2.LINE_AA, shift=4)
+            cv2.line(image, center, subpixel(*projected[index]), _OUTLIER, 1, cv2.LINE_AA, shift=4)
         cv2.circle(image, center, 28, colour, -1 if used else 1, cv2.LINE_AA, shift=4)
 
 
-def _subpixel(x: float, y: float) -> tuple[int, int]:
+def subpixel(x: float, y: float) -> tuple[int, int]:
     """Convert pixel coordinates to OpenCV's with 4 fractional bits, clipped far outside the image to avoid overflow."""
     return round(float(np.clip(x - 0.5, -1e4, 1e4)) * 16), round(float(np.clip(y - 0.5, -1e4, 1e4)) * 16)

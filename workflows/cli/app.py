@@ -54,6 +54,7 @@ GROUPS: Mapping[str, Mapping[str, Command]] = {
         "capture calibrate": calibration.calibrate,
         "capture check": capture.check,
         "capture complete": capture.complete,
+        "capture detect": capture.detect,
         "capture synth": capture.synth,
         "capture degrade": capture.degrade,
         "stereo": stereo.stereo,

@@ -106,6 +106,57 @@ def complete(
     return 0
 
 
+def detect(
+    capture: CaptureFolder,
+    /,
+    provider: Annotated[str, arg(metavar="NAME")] = "face478",
+    out: OptionalFolder = None,
+    write: bool = False,
+    replace: bool = False,
+) -> int:
+    """Detect landmarks in the photographs of a capture and compare its views.
+
+    Nothing is written without --out or --write. The exit code is 2 if no landmarks can be used.
+
+    Args:
+        capture: The capture folder; it needs images and cameras.
+        provider: face478 (Google's face landmarker), files:FOLDER or files:FOLDER:SCHEME (landmark files), or
+            MODULE:FUNCTION, a provider of one's own.
+        out: Folder for landmarks/NAME.json, detections.png with every view, and detections.json.
+        write: Add the landmarks to the capture's own landmark files; other schemes stay.
+        replace: With --write, replace landmarks of the same scheme.
+    """
+    from registration.capture.native import read_capture
+    from registration.detect import written
+    from registration.detect.detection import detect_landmarks
+    from registration.detect.pictures import draw_detections
+    from registration.detect.providers import load_source
+    from registration.progress import console_progress
+    from registration.storage.files import refuse_foreign
+
+    if out is not None:
+        refuse_foreign(out, kind=written.KIND, command="capture detect", manifest=written.DETECTIONS)
+    source, read = load_source(provider), read_capture(capture)
+    if write and not replace:
+        written.check_scheme_is_new(read, source.scheme)
+    with console_progress() as progress:
+        found = detect_landmarks(read, source, progress=progress)
+    if out is not None:
+        draw_detections(read, found, out / written.SHEET)
+        written.write_detections(found, out / written.DETECTIONS)
+        print(out / written.SHEET)
+    for view in found.views:
+        print(f"{view.name:>12}  {view.caption}")
+    print(found.reason)
+    for warning in found.warnings:
+        print(f"warning: {warning}")
+    if not found.usable:
+        raise found.error(read)
+    for folder in [folder for folder in (out, capture if write else None) if folder is not None]:
+        print(f"{len(written.write_landmark_files(read, found, folder))} landmark files in {folder / 'landmarks'}")
+    return 0
+
+
 def synth(
     out: OutputFolder,
     /,

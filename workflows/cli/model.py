@@ -130,7 +130,7 @@ def landmarks(
     identities: Annotated[int, arg(metavar="N")] = 24,
     seed: Seed = 0,
 ) -> int:
-    """Make the map of a detector's landmarks on a model: points of its surface, with a spread of each.
+    """Map a detector's landmarks to points of a model, with a spread of each.
 
     People of the model are rendered with expressions from several sides, and the detector is run on the pictures. The
     map has the points of the surface that its landmarks mark, and how far they stray from them on people that were
