@@ -60,7 +60,7 @@ VARIANTS: Mapping[str, Callable[[Recipe], Recipe]] = {
     "large steps": _without_large_steps,
     "normals": _weights(normals=0.0),
     "classes": _weights(classes=0.0),
-    "landmarks": _weights(landmarks=0.0),
+    "landmarks": _weights(landmarks=0.0, landmark_likelihood=0.0),
     "RGB and UV SSIM": _without_colour,
 }
 

@@ -12,7 +12,7 @@ from registration.capture.jaw_order import has_reversed_jaw, with_corrected_jaw
 from registration.capture.native import read_capture
 from registration.capture.origin import capture_origin
 from registration.capture.scan import Scan, read_scan
-from registration.capture.triangulation import triangulate
+from registration.capture.triangulation import spreads_m, triangulate
 from registration.completion.plan import CompletionPlan, plan_completion
 from registration.detect.providers import load_provider
 from registration.doctor.ledger import Ledger
@@ -54,6 +54,7 @@ class RegistrationInputs:
     origin: Float[np.ndarray, "3"]  # world, m: the fit's own world has its origin here
     landmarks: Mapping[str, Float[np.ndarray, "L 3"]]  # triangulated, world; of the shared schemes
     plan: CompletionPlan  # of what the capture lacks
+    landmark_spread_m: Mapping[str, Float[np.ndarray, "L"]]  # of these along each axis, where detectors state theirs
     recipe: Recipe
     camera_sigma_px: float  # expected error of the given cameras, px of the stored images; 0: they are exact
     neutral: Registration | None
@@ -111,6 +112,7 @@ def read_inputs(
         origin=capture_origin([view.camera for view in capture.views]),
         landmarks=landmarks,
         plan=plan,
+        landmark_spread_m=spreads_m(selected, landmarks),
         recipe=recipe if start is None else expression_recipe(recipe),
         camera_sigma_px=options.camera_sigma_px,
         neutral=start,

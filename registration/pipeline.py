@@ -2,7 +2,7 @@
 
 import shlex
 import time
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -22,8 +22,8 @@ from registration.fit.context import FitContext
 from registration.fit.problem import FitProblem, FitTrace
 from registration.fit.recipes import Stage
 from registration.fit.start import initial_guess
+from registration.fit.status import judge_fit
 from registration.fit.variables import InitialGuess
-from registration.fit.view_weights import ViewErrors
 from registration.geometry.nearest_planes import CloudPlanes, MeshPlanes, NearestPlanes
 from registration.geometry.surface_views import SurfaceViews
 from registration.inputs import RegistrationInputs, read_inputs
@@ -48,11 +48,7 @@ from registration.storage.registration_folder import (
 )
 from registration.targets.classes import class_map
 from registration.targets.pyramid import build_pyramid
-from registration.types import Camera, HeadPose, Registration, Status
-
-CONVERGED_MM = 0.05  # 95th percentile of vertex motion over the last tenth of the last stage
-MAX_LANDMARK_PX = 3.0  # median residual at 512 px of head height
-_NAMED_VIEW_RATIO = 2  # times MAX_LANDMARK_PX: views with a larger error are named
+from registration.types import Camera, HeadPose, Registration
 
 
 def register(
@@ -196,6 +192,7 @@ def _context(inputs: RegistrationInputs, seed: int, device: torch.device, progre
         if inputs.neutral is None
         else replace(inputs.neutral, translation=inputs.neutral.translation - inputs.origin),
         triangulated={name: points - inputs.origin for name, points in inputs.landmarks.items()},
+        triangulated_spread_m=inputs.landmark_spread_m,
         scan=planes,
         camera_sigma_px=camera_refinement.level_sigma_px(inputs.camera_sigma_px, inputs.capture, pyramid[0]),
     )
@@ -236,10 +233,10 @@ def _collect(inputs: RegistrationInputs, fitted: _Fitted, comparison: Comparison
     parameters, offsets = problem.variables.parameters()
     vertices, errors = problem.vertices().cpu().numpy(), problem.view_errors()
     local = camera_refinement.located(problem.refinement, inputs.capture, inputs.landmarks, inputs.origin)
-    landmark_px = problem.landmark_residuals_px(local)
+    landmark_px, deviations = problem.landmark_residuals_px(local), problem.landmark_deviations(local)
     skin = exterior(inputs.data)
     inside = [name for name, scheme in inputs.schemes.items() if not skin[scheme.indices].any()]
-    status, reason = _status(trace, landmark_px, inside, errors)
+    status, reason = judge_fit(trace, landmark_px, inside, errors, deviations)
 
     def array(value: torch.Tensor) -> np.ndarray:
         return value.detach().cpu().numpy().astype(np.float32)
@@ -266,6 +263,7 @@ def _collect(inputs: RegistrationInputs, fitted: _Fitted, comparison: Comparison
             "expression": inputs.capture.expression,
             "motion_mm": trace.motion_mm,
             "landmark_residual_px": landmark_px,
+            **({"landmark_residual_sigmas": deviations} if deviations else {}),
             "camera_gains": problem.appearance.gains.cpu().numpy().round(4).tolist(),
             "views_not_trusted": dict(problem.view_weights.notes),
             "notes": [*inputs.notes, *fitted.initial.notes],
@@ -289,34 +287,6 @@ def _scan_in_fit(inputs: RegistrationInputs, problem: FitProblem) -> dict[str, A
         "normals": len(without) if len(inputs.scan.triangles) else 0,
         "surface": None if distance is None else distance.share,
     }
-
-
-def _status(
-    trace: FitTrace, landmark_px: Mapping[str, float], inside: Collection[str], errors: ViewErrors
-) -> tuple[Status, str]:
-    """Status and reason of a fit.
-
-    Landmarks `inside`, on teeth and tongue, are reported but cause no failure: there are no offsets, and an expression
-    cannot correct teeth that the neutral did not show.
-    """
-    if trace.failure:
-        return "failed", trace.failure
-    off = {
-        name: f"landmarks of scheme {name} are {px:.1f} px off in the median (limit {MAX_LANDMARK_PX})"
-        for name, px in sorted(landmark_px.items(), key=lambda item: -item[1])
-        if px >= MAX_LANDMARK_PX
-    }
-    status: Status
-    if off.keys() - inside:
-        status, reasons = "failed", [reason for name, reason in off.items() if name not in inside]
-    elif trace.motion_mm >= CONVERGED_MM:
-        motion = f"vertices still moved by {trace.motion_mm:.3f} mm at the end (limit {CONVERGED_MM})"
-        status, reasons = "stopped", [motion]
-    else:
-        motion = f"vertices moved by {trace.motion_mm:.3f} mm over the last tenth of the last stage"
-        return "converged", "; ".join([motion, *off.values()])
-    views = errors.disagreement(MAX_LANDMARK_PX * _NAMED_VIEW_RATIO)
-    return status, "; ".join([*reasons, views] if views else reasons)
 
 
 def _evaluate(

@@ -10,6 +10,7 @@ import torch
 
 from registration.capture.native_writer import check_new
 from registration.capture.settings_text import without_tables
+from registration.capture.triangulation import spreads_m
 from registration.completion.complete import CODE, Completer
 from registration.completion.first_fit import HeadFitter
 from registration.completion.pictures import SHEET
@@ -54,7 +55,14 @@ def complete_inputs(
     key = hashing.input_hash(inputs.digests, {"made": inputs.plan.channels, "seed": options.seed, "code": CODE})
     completion = completed(inputs.capture, key, partial(completer.complete, inputs.capture), provider.scheme, progress)
     landmarks = triangulated_landmarks(completion.capture, inputs.schemes)
-    return replace(inputs, capture=completion.capture, landmarks=landmarks, head_rows=completion.head_rows), completion
+    completed_inputs = replace(
+        inputs,
+        capture=completion.capture,
+        landmarks=landmarks,
+        landmark_spread_m=spreads_m(completion.capture, landmarks),
+        head_rows=completion.head_rows,
+    )
+    return completed_inputs, completion
 
 
 def write_completed(

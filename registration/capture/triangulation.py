@@ -1,6 +1,6 @@
 """Triangulate landmarks over the views of a capture, robust to outliers and to miscalibrated views."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations
 
@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from registration.capture.origin import capture_origin
-from registration.capture.pixels import undistort_landmarks
+from registration.capture.pixels import undistort_landmarks, undistorted_spread
 from registration.model import jaw_order
 from registration.types import Camera, Capture, View
 
@@ -89,6 +89,79 @@ def triangulate_pixels(
             points[landmark], inliers, residuals[landmark] = solution
             used[landmark] = inliers.sum()
     return points + origin, used, residuals
+
+
+def covariances(capture: Capture, scheme: str, points: Float[np.ndarray, "L 3"]) -> Float[np.ndarray, "L 3 3"]:
+    """Return the covariance of every triangulated landmark by the spread of its detections.
+
+    The inverse of the sum over the inlier views of J^T J / spread^2, where J is the projection's derivative. Detections
+    that disagree by more than their spread allows enlarge it by their reduced chi-square, since their errors have a
+    common cause.
+
+    Args:
+        capture: whose landmarks were triangulated.
+        scheme: name of the landmark scheme; its spread is known in at least one view.
+        points: as `triangulate` returns them.
+
+    Returns:
+        Square metres; NaN for points that are NaN.
+
+    Raises:
+        ValueError: no view states the spread.
+    """
+    views = [view for view in capture.views if scheme in view.landmarks]
+    spreads_px = _spreads_px(views, scheme)
+    if spreads_px is None:
+        raise ValueError(f"the spread of the landmarks {scheme} is not known")
+    information = np.zeros((len(points), 3, 3))
+    chi_square, equations = np.zeros(len(points)), np.zeros(len(points))
+    for view, spread_px in zip(views, spreads_px, strict=True):
+        distance = residuals(view, scheme, points)
+        inlier = np.flatnonzero(distance < MAX_DEVIATION * spread_px)
+        J = _projection_derivatives(view.camera, points[inlier]) / spread_px[inlier, None, None]
+        information[inlier] += J.transpose(0, 2, 1) @ J
+        chi_square[inlier] += (distance[inlier] / spread_px[inlier]) ** 2
+        equations[inlier] += 2
+    result = np.full((len(points), 3, 3), np.nan)
+    solved = np.flatnonzero(np.isfinite(points).all(-1) & (equations >= 4))
+    excess = np.maximum(1, chi_square[solved] / (equations[solved] - 3))
+    result[solved] = np.linalg.inv(information[solved]) * excess[:, None, None]
+    return result
+
+
+def spreads_m(capture: Capture, landmarks: Mapping[str, Float[np.ndarray, "L 3"]]) -> dict[str, Float[np.ndarray, "L"]]:
+    """Return the standard deviation of triangulated landmarks along each axis.
+
+    Args:
+        capture: whose landmarks were triangulated.
+        landmarks: scheme -> points, as `triangulate` returns them.
+
+    Returns:
+        Scheme -> standard deviations, metres; of schemes whose spread some view states.
+    """
+    stated = {name for view in capture.views for name in view.landmark_spread_px}
+    return {
+        name: np.sqrt(np.trace(covariances(capture, name, points), axis1=1, axis2=2) / 3)
+        for name, points in landmarks.items()
+        if name in stated
+    }
+
+
+def _projection_derivatives(camera: Camera, points: Float[np.ndarray, "P 3"]) -> Float[np.ndarray, "P 2 3"]:
+    """Derivatives of pixels by world points (m), without distortion."""
+    pixels, depth = camera.project(points)
+    M = camera.intrinsics @ camera.T_cam_world[:3, :3]
+    return (M[None, :2] - pixels[:, :, None] * M[None, 2:]) / depth[:, None, None]
+
+
+def _spreads_px(views: Sequence[View], scheme: str) -> Float[np.ndarray, "N L"] | None:
+    """Spread of the landmarks in undistorted images; a view that does not state it has the others' median."""
+    known = [undistorted_spread(view, scheme) for view in views if scheme in view.landmark_spread_px]
+    if not known:
+        return None
+    typical = np.median(known, axis=0)
+    rows = iter(known)
+    return np.stack([next(rows) if scheme in view.landmark_spread_px else typical for view in views])
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

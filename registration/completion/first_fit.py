@@ -7,7 +7,7 @@ import numpy as np
 import torch
 from jaxtyping import Float
 
-from registration.capture.triangulation import triangulate
+from registration.capture.triangulation import spreads_m, triangulate
 from registration.fit.context import FitContext
 from registration.fit.initialization import MIN_LANDMARKS
 from registration.fit.problem import FitProblem
@@ -140,6 +140,7 @@ class HeadFitter:
             seed=self._seed,
             neutral=self._neutral,
             triangulated=triangulated,
+            triangulated_spread_m=spreads_m(capture, triangulated),
         )
 
 

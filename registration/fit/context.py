@@ -45,6 +45,8 @@ class FitContext:
     neutral: Registration | None = None  # of the subject, if the capture shows an expression
     # Landmarks of the capture by scheme, triangulated over its views; world, metres; NaN where not possible.
     triangulated: Mapping[str, Float[np.ndarray, "L 3"]] = field(default_factory=dict)
+    # Standard deviation of these along each axis, metres, of schemes whose detector states its spread.
+    triangulated_spread_m: Mapping[str, Float[np.ndarray, "L"]] = field(default_factory=dict)
     scan: NearestPlanes | None = None  # whose surface is fitted; world, metres
     # Expected error of each given camera, rms shift of the head's points, px of level 0; None: cameras are exact.
     camera_sigma_px: Float[np.ndarray, "N"] | None = None
@@ -80,6 +82,17 @@ class FitContext:
     def captured_schemes(self) -> dict[str, LandmarkScheme]:
         """The landmark schemes that model and capture share."""
         return {name: scheme for name, scheme in self.schemes.items() if name in self.pyramid[0].landmarks}
+
+    def landmark_spread_m(self, name: str) -> Float[np.ndarray, "L"] | None:
+        """Return how far triangulated landmarks may be from the points of the model's scheme.
+
+        Returns:
+            The standard deviation along each axis, metres, of detections and scheme; NaN where not triangulated. None:
+            neither detector nor scheme states one.
+        """
+        triangulated, scheme = self.triangulated_spread_m.get(name), self.schemes[name].spread_m
+        known = [spread for spread in (triangulated, scheme) if spread is not None]
+        return np.sqrt(np.sum(np.square(known), axis=0)) if known else None
 
     @cached_property
     def separate_surfaces(self) -> list[int]:

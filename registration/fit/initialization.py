@@ -17,7 +17,9 @@ from registration.types import Camera, Rendered, Targets
 
 MIN_LANDMARKS = 6  # of a scheme, triangulated, for an initial guess
 MIN_OVERLAP = 0.7  # intersection over union of rendered and target masks, for an initial guess
-_LANDMARK_SIGMA_M = 1.5e-3  # of a triangulated landmark against the same point of the model
+_LANDMARK_SIGMA_M = 1.5e-3  # of a triangulated landmark against the same point of the model, if nobody states it
+_MODEL_SIGMA_M = 1e-3  # part of it that is the model's: its basis does not span the subject
+UNKNOWN_SPREAD_M = float(np.sqrt(_LANDMARK_SIGMA_M**2 - _MODEL_SIGMA_M**2))  # of a landmark beside others with a spread
 _EXPRESSION_SIGMA = 0.5  # standard deviation of expression coefficients; that of identity coefficients is 1
 _OUTLIER_M = 8e-3
 _MAX_ITERATIONS = 15
@@ -33,12 +35,13 @@ def from_landmarks(
     *,
     free_scale: bool,
     neutral: InitialGuess | None = None,
+    spread_m: Float[np.ndarray, "L"] | None = None,
 ) -> InitialGuess:
     """Return the similarity transform and coefficients that fit triangulated landmarks best.
 
     Alternates the similarity transform [Umeyama 1991] with ridge regression for the coefficients. Landmarks farther
     than 8 mm and than three times the median from the model are outliers, re-determined after some iterations: schemes
-    differ along the jaw.
+    differ along the jaw. Where spreads are given, distances are relative to them, and 8 mm stand for 5.3 of them.
 
     Args:
         data: the model.
@@ -46,6 +49,7 @@ def from_landmarks(
         points: world, metres; NaN where not triangulated. At least `MIN_LANDMARKS` must be finite.
         free_scale: estimate the size of the head too; else it is the model's.
         neutral: of the same subject: its identity, offsets and scale are kept, pose and expression are estimated.
+        spread_m: standard deviation of the points along each axis, metres; None: alike for all.
 
     Returns:
         The guess; its notes name the outliers.
@@ -61,20 +65,31 @@ def from_landmarks(
         template = neutral.scale * (template + scheme.points(neutral.offsets.astype(np.float64)))
         basis = neutral.scale * basis
     valid = np.isfinite(points).all(1)
+    sigma_m, pull = np.full(len(points), _LANDMARK_SIGMA_M), None
+    if spread_m is not None:
+        valid &= np.isfinite(spread_m)
+        sigma_m = np.where(valid, np.hypot(spread_m, _MODEL_SIGMA_M), 1)
+        pull = (_LANDMARK_SIGMA_M / sigma_m) ** 2
     used = valid.copy()
     coefficients = np.zeros(len(basis))
     for iteration in range(_MAX_ITERATIONS):
         model = template + np.tensordot(coefficients, basis, 1)
         scale, rotation, shift = similarity_transform(
-            model[used], points[used], free_scale=free_scale and neutral is None
+            model[used],
+            points[used],
+            free_scale=free_scale and neutral is None,
+            weights=None if pull is None else pull[used],
         )
         target = (points - shift) @ rotation / scale - template
-        matrix = basis[:, used].reshape(len(basis), -1).T / _LANDMARK_SIGMA_M
-        right = target[used].ravel() / _LANDMARK_SIGMA_M
+        scales = np.repeat(sigma_m[used], 3)
+        matrix = basis[:, used].reshape(len(basis), -1).T / scales[:, None]
+        right = target[used].ravel() / scales
         coefficients = matrix.T @ np.linalg.solve(matrix @ matrix.T + np.eye(len(right)), right)
         if iteration in _OUTLIER_ITERATIONS:
             fitted = scale * (template + np.tensordot(coefficients, basis, 1)) @ rotation.T + shift
             distance = np.linalg.norm(fitted - points, axis=1)
+            if spread_m is not None:
+                distance *= _LANDMARK_SIGMA_M / sigma_m
             inliers = valid & (distance < max(_OUTLIER_M, 3 * np.median(distance[valid])))
             used = inliers if inliers.sum() >= MIN_LANDMARKS else used
     identity_count = len(basis) - len(data.expression_basis)

@@ -227,17 +227,24 @@ class FitProblem:
             rendered = self.context.renderer(vertices, None, targets.pixels)
         residuals = self._landmark_residuals_by_view(vertices)
         disagreement = {name: self._disagreement_px(name, residual_px) for name, residual_px in residuals.items()}
-        return view_errors(rendered, targets, self._median_by_view(disagreement))
+        return view_errors(rendered, targets, self._median_by_view(disagreement, vertices))
 
     def landmark_px_by_view(self) -> Float[Tensor, "N"]:
-        """Return the median distance of each view's landmarks from the mesh's, px at 512 px of head height."""
-        return self._median_by_view(self._landmark_residuals_by_view(self.vertices()))
+        """Return the median distance of each view's landmarks from the mesh's, px at 512 px of head height.
 
-    def _median_by_view(self, residuals_px: Mapping[str, Float[Tensor, "N L"]]) -> Float[Tensor, "N"]:
+        Distances of landmarks whose spread exceeds 3 px count as those of landmarks of 3 px: in proportion to it.
+        """
+        vertices = self.vertices()
+        return self._median_by_view(self._landmark_residuals_by_view(vertices), vertices)
+
+    def _median_by_view(
+        self, residuals_px: Mapping[str, Float[Tensor, "N L"]], vertices: Float[Tensor, "V 3"]
+    ) -> Float[Tensor, "N"]:
         """Over all schemes; NaN without landmarks."""
         if not residuals_px:
             return torch.full((self.context.view_count,), torch.nan)
-        return torch.cat(list(residuals_px.values()), 1).nanmedian(1).values
+        relative = [residual_px * self._tolerance(name, vertices) for name, residual_px in residuals_px.items()]
+        return torch.cat(relative, 1).nanmedian(1).values
 
     def _coarsest_targets(self) -> Targets:
         return self.pyramid[-1].select(range(self.context.view_count), self.context.device)
@@ -272,6 +279,15 @@ class FitProblem:
         agree = (counted > 0) & (distance_px < MIN_ERROR_PX)  # not where it could not be triangulated: NaN
         located_px = torch.where(agree.sum(0) >= _AGREEING_VIEWS, distance_px, torch.inf)
         return torch.where(residual_px.isnan(), torch.nan, torch.minimum(residual_px, located_px))
+
+    def _tolerance(self, name: str, vertices: Float[Tensor, "V 3"]) -> Float[Tensor, "N L"] | float:
+        """Factor of the residuals of vague landmarks, so that the limits for those of 3 px hold for them too."""
+        finest, scheme = self.pyramid[0], self.context.schemes[name]
+        spread = landmark.Spread.of(name, finest, scheme.spread_m)
+        if spread is None:
+            return 1.0
+        total_px = spread.to(vertices.device).total_px(finest.pixels.cameras, scheme.points(vertices))
+        return (landmark.UNKNOWN_PX * finest.px_per_head / HEAD_PX / total_px).clamp_max(1.0)
 
     def landmark_residuals_px(self, triangulated: Mapping[str, Float[np.ndarray, "L 3"]]) -> dict[str, float]:
         """Return the median distance of the used landmarks from their points on the mesh, per scheme.
@@ -309,6 +325,25 @@ class FitProblem:
         hits, distance, _ = self.context.depth_distances(self.vertices(), rendered, targets, agree)
         view, size_mm = targets.pixels.view.index_select(0, hits.pixel), distance.abs() * MM_PER_M
         return torch.stack([size_mm[view == number].nanmedian() for number in range(len(targets.names))])
+
+    def landmark_deviations(self, triangulated: Mapping[str, Float[np.ndarray, "L 3"]]) -> dict[str, float]:
+        """Return the same median distances in standard deviations along one axis, of schemes whose spread is known.
+
+        Args:
+            triangulated: as for `landmark_residuals_px`.
+
+        Returns:
+            Scheme -> number of standard deviations; 1.5 is expected of a perfect fit.
+        """
+        mesh, deviations = self.vertices().double().cpu().numpy(), {}
+        for name, scheme in self.context.captured_schemes.items():
+            if (spread_m := self.context.landmark_spread_m(name)) is None:
+                continue
+            distance = np.linalg.norm(scheme.points(mesh) - triangulated[name], axis=1)
+            relative = (distance / spread_m)[self.landmarks_used[name]]
+            relative = relative[np.isfinite(relative)]
+            deviations[name] = float(np.median(relative)) if len(relative) else float("nan")
+        return deviations
 
     def render_views(self, views: Sequence[int]) -> tuple[Targets, Rendered]:
         """Return targets of some views at the finest level, and the mesh rendered there, exposed as their cameras."""

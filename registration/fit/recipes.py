@@ -36,7 +36,9 @@ class Weights:
     classes: float = 0.2
     eye_classes: float = 4.0  # times `classes`, of the eyes: small, but the eyelids depend on them
     landmarks: float = 0.02
-    landmark_sigma_px: float = 3.0  # at 512 px of head height
+    landmark_sigma_px: float = 3.0  # at 512 px of head height; of landmarks whose spread is not known
+    landmark_likelihood: float = 0.02  # of landmarks whose spread is known, in place of `landmarks`
+    landmarks_along_skin: bool = False  # whether the latter move free skin along itself only
     identity: float = 2e-3
     expression: float = 2e-3
     rotations: float = 0.1  # joints other than the root, per rad^2
@@ -144,6 +146,8 @@ def _offsets(
             ssim=ssim,
             classes=0.1,
             landmarks=0.01,
+            landmark_likelihood=0.001,
+            landmarks_along_skin=True,
             contacts=2e-4,
             slide=0.5,
             depth_scale_mm=max(0.5, 0.3 * smoothing_mm),
@@ -205,7 +209,8 @@ def rigid_stage(level: int) -> Stage:
     """Return a stage for pose and size alone, to compare initial guesses."""
     rates = (("root", 2e-2), ("position", 3e-3), ("scale", 1e-2))
     free = tuple((name, Rate(start=rate, end=rate * 0.2)) for name, rate in rates)
-    return Stage(name="rigid", steps=30, level=level, free=free, weights=Weights(mask=1.0, landmarks=0.0, tongue=0.0))
+    weights = Weights(mask=1.0, landmarks=0.0, landmark_likelihood=0.0, tongue=0.0)
+    return Stage(name="rigid", steps=30, level=level, free=free, weights=weights)
 
 
 def expression_recipe(recipe: Recipe) -> Recipe:

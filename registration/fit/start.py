@@ -7,9 +7,16 @@ import numpy as np
 import torch
 
 from registration.fit.context import FitContext
-from registration.fit.initialization import MIN_LANDMARKS, MIN_OVERLAP, from_landmarks, from_masks
+from registration.fit.initialization import (
+    MIN_LANDMARKS,
+    MIN_OVERLAP,
+    UNKNOWN_SPREAD_M,
+    from_landmarks,
+    from_masks,
+)
 from registration.fit.problem import assess, refine
 from registration.fit.variables import InitialGuess, initial_guess_from, pivot
+from registration.model.landmarks import LandmarkScheme
 from registration.types import HeadPose, Parameters, Registration
 
 
@@ -36,7 +43,10 @@ def initial_guess(context: FitContext, head: HeadPose | None = None) -> InitialG
     counts = {name: int(np.isfinite(points).all(1).sum()) for name, points in context.triangulated.items()}
     best = max(counts, key=lambda name: counts[name], default=None)
     if best is not None and counts[best] >= MIN_LANDMARKS:
-        scheme, points, free_scale = context.schemes[best], context.triangulated[best], context.recipe.scale
+        free_scale = context.recipe.scale
+        if any(context.landmark_spread_m(name) is not None for name in counts):
+            return _from_all_schemes(context, neutral)
+        scheme, points = context.schemes[best], context.triangulated[best]
         return from_landmarks(context.data, scheme, points, free_scale=free_scale, neutral=neutral)
     if neutral is not None and assess(context, neutral).overlap >= MIN_OVERLAP:
         return replace(neutral, notes=("no landmarks: starting from the neutral's pose",))
@@ -45,6 +55,30 @@ def initial_guess(context: FitContext, head: HeadPose | None = None) -> InitialG
         note = "no landmarks: starting from the head's pose in capture.toml"
         return InitialGuess(rotation=head.rotation, position=position, scale=head.scale, notes=(note,))
     return from_masks(context.data, context.pyramid[-1], partial(assess, context), partial(refine, context))
+
+
+def _from_all_schemes(context: FitContext, neutral: InitialGuess | None) -> InitialGuess:
+    """From the landmarks of all schemes together, each by its spread."""
+    names = sorted(context.triangulated)
+    schemes, points = [context.schemes[name] for name in names], [context.triangulated[name] for name in names]
+    spreads = [context.landmark_spread_m(name) for name in names]
+    together = LandmarkScheme(
+        name=" + ".join(names),
+        indices=np.concatenate([scheme.indices for scheme in schemes]),
+        weights=np.concatenate([scheme.weights for scheme in schemes]),
+    )
+    guess = from_landmarks(
+        context.data,
+        together,
+        np.concatenate(points),
+        free_scale=context.recipe.scale,
+        neutral=neutral,
+        spread_m=np.concatenate(
+            [np.full(len(p), UNKNOWN_SPREAD_M) if s is None else s for s, p in zip(spreads, points, strict=True)]
+        ),
+    )
+    used = np.split(guess.landmarks_used[together.name], np.cumsum([len(p) for p in points])[:-1])
+    return replace(guess, landmarks_used=dict(zip(names, used, strict=True)))
 
 
 def _parameters(registration: Registration) -> Parameters:

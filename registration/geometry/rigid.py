@@ -86,7 +86,11 @@ def fit_twists(
 
 
 def similarity_transform(
-    source: Float[np.ndarray, "P 3"], target: Float[np.ndarray, "P 3"], *, free_scale: bool
+    source: Float[np.ndarray, "P 3"],
+    target: Float[np.ndarray, "P 3"],
+    *,
+    free_scale: bool,
+    weights: Float[np.ndarray, "P"] | None = None,
 ) -> tuple[float, Float[np.ndarray, "3 3"], Float[np.ndarray, "3"]]:
     """Return the similarity transform of least squares between two point sets [Umeyama 1991].
 
@@ -94,13 +98,17 @@ def similarity_transform(
         source: points.
         target: the corresponding points, in the same unit.
         free_scale: estimate the scale; else it is 1.
+        weights: of the squared distances; None: all alike.
 
     Returns:
         Scale s, rotation R and translation t with target = s R source + t.
     """
-    a, b = source.mean(0), target.mean(0)
-    u, s, vt = np.linalg.svd((target - b).T @ (source - a))
+    if weights is None:
+        a, b, roots = source.mean(0), target.mean(0), np.ones((len(source), 1))
+    else:
+        a, b, roots = weights @ source / weights.sum(), weights @ target / weights.sum(), np.sqrt(weights)[:, None]
+    u, s, vt = np.linalg.svd(((target - b) * roots).T @ ((source - a) * roots))
     flip = np.diag([1, 1, np.sign(np.linalg.det(u @ vt))])
     rotation = u @ flip @ vt
-    scale = float((s * np.diag(flip)).sum() / ((source - a) ** 2).sum()) if free_scale else 1.0
+    scale = float((s * np.diag(flip)).sum() / (((source - a) * roots) ** 2).sum()) if free_scale else 1.0
     return scale, rotation, b - scale * rotation @ a

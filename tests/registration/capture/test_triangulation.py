@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from registration.capture import native
-from registration.capture.triangulation import residuals, reversed_jaw_points, triangulate
+from registration.capture.triangulation import covariances, residuals, reversed_jaw_points, triangulate
 from registration.doctor.report import eye_distance
 from registration.types import Camera, Capture, View
 from tests.conftest import SHARED, needs_shared
@@ -123,3 +123,39 @@ def test_shared_landmarks() -> None:
         assert distance is not None and 0.085 < distance < 0.095
         assert used.min() >= 9 and residual.max() < 0.01
         assert reversed_jaw_points(points) == []
+
+
+def test_precise_detections_outweigh_vague_ones_and_the_covariance_says_how_well_a_point_is_known() -> None:
+    rng, spread = np.random.default_rng(3), np.array([0.05, 1.0] * 4)
+    cameras = [camera(yaw_rad) for yaw_rad in np.linspace(-1.2, 1.2, 8)]
+
+    def blur(view: int, rows: np.ndarray) -> None:
+        rows[:, :2] += rng.normal(0, spread[view], (68, 2))
+
+    plain = capture_of(cameras, blur)
+    known = [
+        replace(view, landmark_spread_px={"68": np.full(68, s)}) for view, s in zip(plain.views, spread, strict=True)
+    ]
+    stated = replace(plain, views=tuple(known))
+    errors = {name: triangulate(c, "68")[0] - landmarks_68() for name, c in (("plain", plain), ("stated", stated))}
+    rms = {name: np.sqrt(np.square(error).mean()) for name, error in errors.items()}
+    assert rms["stated"] < 0.3 * rms["plain"]
+    covariance = covariances(stated, "68", triangulate(stated, "68")[0])
+    distance = np.einsum("li,lij,lj->l", errors["stated"], np.linalg.inv(covariance), errors["stated"])
+    assert 0.6 * 3 < distance.mean() < 1.4 * 3  # chi-square with three degrees of freedom
+
+
+def test_detections_that_disagree_enlarge_the_covariance() -> None:
+    def variance(noise_px: float) -> float:
+        rng = np.random.default_rng(4)
+
+        def blur(view: int, rows: np.ndarray) -> None:
+            rows[:, :2] += rng.normal(0, noise_px, (68, 2))
+
+        capture = capture_of([camera(yaw_rad) for yaw_rad in np.linspace(-1.2, 1.2, 8)], blur)
+        spread = {"68": np.full(68, 0.05)}
+        capture = replace(capture, views=tuple(replace(view, landmark_spread_px=spread) for view in capture.views))
+        result = covariances(capture, "68", triangulate(capture, "68")[0])
+        return float(np.median(np.trace(result, axis1=1, axis2=2)))
+
+    assert variance(0.09) > 1.5 * variance(0.05) and variance(0.01) == pytest.approx(variance(0.02), rel=0.01)

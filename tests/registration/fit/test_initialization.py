@@ -202,3 +202,15 @@ def test_selected_views_are_far_apart() -> None:
     assert select_spread_views(cameras, 2) in ([0, 4], [0, 5])
     assert [view // 2 for view in select_spread_views(cameras, 4)] == [0, 1, 2, 3]  # a single view of each close pair
     assert select_spread_views(cameras, 20) == list(range(7)) and select_spread_views(cameras, 1) == [0]
+
+
+def test_points_weigh_by_their_spread(scheme: LandmarkScheme) -> None:
+    """Half of the points are 4 mm off and say so: pose and shape follow the others."""
+    expected, rng = mesh(truth(1.0)), np.random.default_rng(1)
+    spread = np.where(np.arange(68) % 2, 4e-3, 1e-4)
+    exact = scheme.points(expected)
+    points = exact + spread[:, None] * rng.standard_normal((68, 3))
+    data = tiny_model()
+    guesses = [from_landmarks(data, scheme, points, free_scale=False, spread_m=s) for s in (None, spread)]
+    plain, weighted = (np.linalg.norm(scheme.points(mesh(guess)) - exact, axis=1).mean() for guess in guesses)
+    assert weighted < 0.6 * plain and guesses[1].landmarks_used["68"].all()
