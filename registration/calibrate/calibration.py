@@ -368,7 +368,7 @@ def _reason(view: int, faces: Sequence[Face | None], start: Start, evidence: Evi
     """Why a view could not be posed."""
     features = f"{int((evidence.tracks.view == view).sum())} of its features match another photograph"
     if view in start.wrong:
-        return f"the face in it does not fit those in the others, and {features}"
+        return f"the face in it does not fit those in the others (another person, or another moment), and {features}"
     if faces[view] is None:
         return f"no face was found in it, and only {features}: too few to pose it"
     return f"it could not be posed, {features}"

@@ -91,6 +91,7 @@ def test_model_info_prints_and_draws(tmp_path: Path, capsys: pytest.CaptureFixtu
     "command",
     [
         "capture check {missing} --out {out}",
+        "capture calibrate {missing} --model {missing} --out {out}",
         "model info {missing} --out {out}",
         "evaluate {missing} --capture {missing}",
     ],
