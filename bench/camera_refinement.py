@@ -114,6 +114,8 @@ def row(name: str, capture: Capture, arguments: argparse.Namespace, folder: Path
         recipe=arguments.recipe,
         views=arguments.views,
         use_scan="never",
+        detect=False,
+        stereo=False,
         camera_sigma_px=arguments.px if case.stated else 0.0,
     )
     start = time.perf_counter()

@@ -1,5 +1,6 @@
 """Rigs with known errors, and how far two rigs differ but for what no image shows."""
 
+import shutil
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -13,7 +14,7 @@ from registration.types import Camera, Capture
 def write_capture_with_cameras(
     source: Capture, target: Path, cameras: Mapping[str, Camera], *, geometry: bool = True
 ) -> Path:
-    """Write a capture of links to another's files, with other cameras.
+    """Write a copy of a capture with other cameras.
 
     Args:
         source: the capture.
@@ -24,11 +25,8 @@ def write_capture_with_cameras(
     Returns:
         `target`.
     """
-    target.mkdir(parents=True)
-    left_out = {"sparse", *(() if geometry else ("normals", "depth", "confidence", "segmentation"))}
-    for file in source.root.iterdir():
-        if file.name not in left_out:
-            (target / file.name).symlink_to(file.resolve())
+    left_out = ("sparse", *(() if geometry else ("normals", "depth", "confidence", "segmentation")))
+    shutil.copytree(source.root, target, ignore=shutil.ignore_patterns(*left_out))
     images = source.root / "images"
     names = {view.image.relative_to(images).as_posix(): cameras[view.name] for view in source.views}
     write_model(target / "sparse", names, *read_points(source.root / "sparse"))
