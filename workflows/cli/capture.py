@@ -83,7 +83,7 @@ def complete(
     neutral: OptionalRegistration = None,
     fit: RegisterOptions = _DEFAULTS,
 ) -> int:
-    """Write a copy of a capture with the landmarks, masks, labels and normals that it lacks.
+    """Copy a capture with the landmarks, masks, labels and normals that it lacks.
 
     They are made from its photographs, as `gnmreg register` makes them. Look at made.jpg, correct the files in
     landmarks, masks and segmentation, and register the copy: what it has is not made again.
