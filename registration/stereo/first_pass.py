@@ -23,6 +23,7 @@ _BLOCK = 5  # pixels
 _BEHIND = 0.7  # of the sphere's radius, behind its centre, down to which a visible surface is looked for
 _CHUNK = 16  # disparities are searched in multiples of it
 _AGREE_PX = 1.5  # widths of a pixel on the head that depths of two partners may differ by
+_ALONE = 0.3  # confidence of depths that only one pair has: nothing contradicts wrong ones
 _LEAST_CONTRAST = 1.0  # grey levels, standard deviation in the window
 _WINDOW_PX = 9  # of contrast
 
@@ -234,7 +235,8 @@ def _confirmed(
     support = votes + agree
     kept = (depth > 0) & (votes >= 1) & ((votes >= least) | (agree >= least)) & (agree > against if not alone else True)
     depth = np.where(kept, depth, 0).astype(np.float32)
-    confidence = np.where(kept, np.clip((support - against) / (3 if alone else 6), 0.05, 1), 0).astype(np.float32)
+    certain = np.full_like(support, _ALONE) if alone else np.clip((support - against) / 6, 0.05, 1)
+    confidence = np.where(kept, certain, 0).astype(np.float32)
     smooth, normals = fit_planes(depth, confidence, ray, options.smoothing_px)
     facing = (normals * ray).sum(-1) < -0.2 * np.linalg.norm(ray, axis=-1)
     kept &= (smooth > 0) & facing & (np.abs(smooth - depth) < 3 * options.agree_m)
