@@ -25,7 +25,7 @@ from jaxtyping import Bool, Float
 from rich.console import Console
 from rich.table import Table
 
-from registration.capture.class_names import NECK, covers
+from registration.capture.class_names import KNOWN, NECK, covers
 from registration.capture.native import read_capture
 from registration.capture.pixels import read_coverage, read_photograph, read_view
 from registration.detect.face478 import Face478Provider
@@ -98,7 +98,7 @@ def measures(
     rows: dict[str, list[tuple[float, ...]]] = {}
     unknown = INDEX[UNLABELLED]
     foreign = [*(INDEX[name] for name in FOREIGN), unknown]
-    covered = [index for index, name in enumerate(capture.classes) if covers(name)]
+    covered = [index for index, name in enumerate(capture.classes) if covers(name) and name not in KNOWN]
     for view, true, one in zip(views, truths, found, strict=True):
         known = (np.abs(one.mask - UNCERTAIN) > 0.02) & (one.labels != unknown)
         rows.setdefault("mask", []).append(

@@ -168,14 +168,15 @@ def _between(
     image, window = face.image[box], window_m * face.px_per_m
     given = [one for one in given if one.sum() >= _LEAST_PX] or given
     rough = given[-1]
-    error = (_POLYGON_M if len(given) > 1 else 1.5 * face.error_m) * face.px_per_m
+    error = (_POLYGON_M if len(given) > 1 else face.error_m) * face.px_per_m
     common, union = np.all(given, axis=0), np.any(given, axis=0)
     inside = cv2.erode(common.astype(np.uint8), ellipse(error)).astype(bool)
     if inside.sum() < _LEAST_PX:
         inside = cv2.erode(rough.astype(np.uint8), ellipse(1)).astype(bool)
     outside = cv2.dilate(union.astype(np.uint8), ellipse(error)) == 0
     matte = refine_between(image, rough, inside, outside, window)
-    for _ in range(_ROUNDS):
+    # The model alone is near the truth: what lies farther away is another edge.
+    for _ in range(_ROUNDS if len(given) > 1 else 0):
         matte = refine(image, matte.coverage > 0.5, max(1.0, _STEP_M * face.px_per_m), window)
     return _smooth(matte.coverage > 0.5, _GRAIN_M * face.px_per_m), ~matte.seen
 

@@ -31,6 +31,7 @@ _BODY = 0.6  # radii below the centre: from there on there may be shoulders at t
 _DEPTH_CONFIDENCE = 0.5
 _FAR = 3.0  # radii behind the head's centre: background
 _PLATE_NOISE, _PLATE_SURE = 6.0, 14.0  # grey levels of 255: below it is background, above it the subject
+_LEAST_BACKGROUND = 100  # pixels of the rough mask, below which nothing is known of the background
 _BAND = 0.08  # radii: width of the uncertain band beyond what is vague
 _HOLE = 0.01  # of the subject's area: holes below it are filled
 _FILLED, _LEAST = 0.75, 0.6  # radii around the centre that a head fills to this share at least, from any side
@@ -109,6 +110,8 @@ def _rough_mask(
     image = window.cut(view.image)
     centre, radius = sphere.in_view(window.camera(view.camera))
     subject, background = _seeds(view, evidence, sphere, window)
+    if background.sum() < _LEAST_BACKGROUND:  # a close-up
+        return subject, ~subject
     model = background_model(image, background, ~disc(background.shape, centre, radius) & ~subject)
     if model.smooth:
         opened = cv2.morphologyEx((model.strange | subject).astype(np.uint8), cv2.MORPH_OPEN, ellipse(1))

@@ -97,3 +97,15 @@ def test_a_view_without_the_head_is_uncertain():
 def test_masks_are_the_same_every_time():
     image = picture((190, 140, 115), even((120, 120, 120)))
     assert np.array_equal(mask_of(image), mask_of(image))
+
+
+def test_nothing_is_claimed_of_a_close_up_without_background():
+    near = Camera(
+        width_px=160,
+        height_px=200,
+        intrinsics=np.array([[1600.0, 0, 80], [0, 1600, 90], [0, 0, 1]]),
+        T_cam_world=np.eye(4),
+    )
+    image = np.random.default_rng(8).integers(100, 140, (200, 160, 3)).astype(np.uint8)
+    mask = first_masks([SegmentView(name="a", image=image, camera=near)], CENTRE, RADIUS)[0]
+    assert (mask < UNCERTAIN).mean() < 0.01 and (mask == UNCERTAIN).mean() > 0.3
