@@ -10,11 +10,13 @@ from registration.fit.terms.term import StageContext, StepState, Term
 from registration.geometry.topology import vertex_normals
 from registration.losses import landmark
 from registration.losses.landmark import Spread
+from registration.model.landmarks import LandmarkScheme
 
 
 def landmarks(context: StageContext) -> Term | None:
     """One loss for each landmark scheme that model and capture share: a likelihood where spreads are known."""
-    weights, schemes = context.stage.weights, context.fit.captured_schemes
+    weights = context.stage.weights
+    schemes = {name: scheme for name, scheme in context.fit.captured_schemes.items() if _weight(context, scheme) > 0}
     used = {name: torch.as_tensor(context.landmarks_used[name], device=context.fit.device) for name in schemes}
     along_skin = weights.landmarks_along_skin and context.stage.frees("offsets")
     triangles = torch.as_tensor(context.fit.data.triangles.astype("int64"), device=context.fit.device)
@@ -26,8 +28,6 @@ def landmarks(context: StageContext) -> Term | None:
             points, detected = scheme.points(state.vertices), state.batch.landmarks[name]
             cameras, px_per_head = state.batch.pixels.cameras, state.batch.px_per_head
             spread = Spread.of(name, state.batch, scheme.spread_m)
-            if not (weights.landmarks if spread is None else weights.landmark_likelihood) > 0:
-                continue
             if spread is None:
                 residual_px, counted = landmark.residuals(cameras, points, detected, px_per_head)
                 loss = landmark.geman_mcclure(residual_px, counted * used[name], weights.landmark_sigma_px)
@@ -43,7 +43,13 @@ def landmarks(context: StageContext) -> Term | None:
             losses[f"landmarks {name}"] = weights.landmark_likelihood * loss
         return losses
 
-    return term if (weights.landmarks > 0 or weights.landmark_likelihood > 0) and schemes else None
+    return term if schemes else None
+
+
+def _weight(context: StageContext, scheme: LandmarkScheme) -> float:
+    """The weight of a scheme's landmarks in the stage."""
+    weights, known = context.stage.weights, Spread.of(scheme.name, context.fit.pyramid[0], scheme.spread_m)
+    return weights.landmarks if known is None else weights.landmark_likelihood
 
 
 def _shares(context: StageContext, name: str, points: Float[Tensor, "L 3"]) -> Float[Tensor, "L"]:
