@@ -17,9 +17,11 @@ from jaxtyping import Float, UInt8
 from registration.capture.pixels import read_coverage, read_photograph, undistort_landmarks
 from registration.completion.channels import attach, write_depths, write_labels, write_landmarks, write_masks
 from registration.completion.first_fit import FittedHead, HeadFitter
-from registration.completion.plan import CompletionPlan
+from registration.completion.plan import CompletionPlan, has_landmarks
 from registration.detect.detection import detect_landmarks
+from registration.detect.pictures import draw_detections
 from registration.detect.provider import LandmarkProvider
+from registration.errors import InputError
 from registration.progress import Progress
 from registration.segment import fitted
 from registration.segment.labels import fitted_labels
@@ -29,7 +31,14 @@ from registration.stereo.depth_map import DepthMap
 from registration.stereo.first_pass import first_depths
 from registration.stereo.second_pass import refined_depths
 from registration.stereo.views import StereoView
+from registration.storage.cache import cache_folder, make_cache_folder
 from registration.types import Camera, Capture, HeadPose
+
+
+def refused_folder() -> Path:
+    """Return the folder of pictures of captures whose landmarks were refused."""
+    return cache_folder() / "refused"
+
 
 T = TypeVar("T")
 CODE = 1  # raised when the same inputs give other channels
@@ -130,10 +139,23 @@ class Completer:
         }
         if detected.usable:
             write_landmarks(self._root, detected.into(capture), detected.scheme)
-        elif not any(view.mask for view in capture.views) and capture.head is None:
-            raise detected.error(capture)
-        else:
-            self._notes.append(f"no landmarks were detected: {detected.reason}")
+        if detected.outcome == "found":
+            return
+        masked = any(view.mask or view.segmentation for view in capture.views)
+        if masked or capture.head is not None or has_landmarks(capture, self._fitter.schemes):
+            self._notes.append(f"landmarks were not detected: {detected.reason}")
+            return
+        picture = refused_folder() / f"{capture.subject} {capture.expression}.png".replace("/", " ")
+        make_cache_folder(picture.parent)
+        draw_detections(capture, detected, picture)
+        error = detected.error(capture)
+        raise InputError(
+            error.what,
+            where=error.where,
+            expected=error.expected,
+            got=f"{error.got}; look at {picture}",
+            fix=f"{error.fix}; or give masks, with which the head is located without landmarks",
+        )
 
     def _photographs(self, capture: Capture, head: FittedHead) -> list[tuple[UInt8[np.ndarray, "H W 3"], Camera]]:
         """The images without distortion, reduced so that the head has at most `_HEAD_PX`."""

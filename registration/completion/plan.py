@@ -63,7 +63,7 @@ def plan_completion(
     labelled = any(view.segmentation is not None for view in capture.views)
     masked = sum(view.mask is not None for view in capture.views) >= few or (labelled and BACKGROUND in capture.classes)
     scanned = use_scan and capture.scan is not None
-    lacks = not labelled or not _has_landmarks(capture, schemes)
+    lacks = not labelled or not has_landmarks(capture, schemes)
     return CompletionPlan(
         landmarks=lacks and detected in schemes and not _given(capture, detected),
         masks=not masked,
@@ -72,8 +72,8 @@ def plan_completion(
     )
 
 
-def _has_landmarks(capture: Capture, schemes: Mapping[str, LandmarkScheme]) -> bool:
-    """Whether enough landmarks of a scheme of the model agree over the views."""
+def has_landmarks(capture: Capture, schemes: Mapping[str, LandmarkScheme]) -> bool:
+    """Return whether enough landmarks of a scheme of the model agree over the views to locate the head."""
     shared = {name for view in capture.views for name in view.landmarks} & set(schemes)
     return any(np.isfinite(triangulate(capture, name)[0]).all(1).sum() >= MIN_LANDMARKS for name in shared)
 
