@@ -55,7 +55,7 @@ def cases(words: list[str], work: Path) -> Iterator[Case]:
     for word in words:
         if word == "synth":
             folder = work / "synth"
-            _run(["capture", "synth", str(folder), "--seed", "8", "--hair", "--shirt"])
+            run_command(["capture", "synth", str(folder), "--seed", "8", "--hair", "--shirt"])
             name = "synthetic, hair and shirt"
         else:
             path, _, preset = word.partition(":")
@@ -88,7 +88,7 @@ def measure(
     arguments = ["register", str(target), "--model", str(options.model), "--out", str(out), "--recipe", options.recipe]
     arguments += [] if neutral is None else ["--neutral", str(neutral[0])]
     start = time.perf_counter()
-    ran = _run(arguments, check=False)
+    ran = run_command(arguments, check=False)
     seconds = time.perf_counter() - start
     if not (out / "manifest.json").is_file():
         return ("refused", f"{seconds:.0f}", ran.stderr.strip().splitlines()[-1]), out
@@ -107,7 +107,8 @@ def _figure(metrics: Mapping[str, Any], name: str, key: str) -> str:
     return "-" if value is None else f"{value:.3f}"
 
 
-def _run(arguments: list[str], *, check: bool = True) -> subprocess.CompletedProcess[str]:
+def run_command(arguments: list[str], *, check: bool = True) -> subprocess.CompletedProcess[str]:
+    """Run `gnmreg` with these arguments."""
     command = [sys.executable, "-m", "workflows.cli", *arguments]
     return subprocess.run(command, capture_output=True, text=True, check=check)
 

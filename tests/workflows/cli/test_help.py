@@ -112,7 +112,9 @@ def test_every_register_option_is_offered_by_all_commands_that_register(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("COLUMNS", "300")
-    options = {f"--{item.name.replace('_', '-')}" for item in fields(RegisterOptions)} - {"--landmark-files"}
+    named = {"camera_sigma_px": "--camera-sigma", "detect": "--no-detect", "stereo": "--no-stereo"}
+    options = {named.get(item.name, f"--{item.name.replace('_', '-')}") for item in fields(RegisterOptions)}
+    options -= {"--landmark-files"}
     for command in ("register", "subject", "batch", "coregister"):
         with pytest.raises(SystemExit):
             main([command, "--help"])
