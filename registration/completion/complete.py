@@ -14,6 +14,7 @@ from typing import Any, TypeVar
 import numpy as np
 from jaxtyping import Float, UInt8
 
+from registration.capture.class_names import NECK
 from registration.capture.pixels import read_coverage, read_photograph, undistort_landmarks
 from registration.completion.channels import attach, write_depths, write_labels, write_landmarks, write_masks
 from registration.completion.first_fit import FittedHead, HeadFitter
@@ -110,6 +111,7 @@ class Completer:
         if depths is not None:
             depths = self._timed("stereo, second pass", lambda: self._refined(stereo_views, head))
             write_depths(self._root, capture, depths)
+            self._figures["coverage"] = round(_coverage(fitted.FittedHead(head.vertices, self._fitter.data), depths), 3)
         return self._fitter.head_rows(head, self._local(capture))
 
     def _attached(self, capture: Capture) -> Capture:
@@ -225,3 +227,14 @@ class Completer:
         labelled = fitted_labels(views, masks, fitted_head, depths=depths)
         write_masks(self._root, capture, [view.mask for view in labelled])
         write_labels(self._root, capture, [view.labels for view in labelled])
+
+
+def _coverage(head: fitted.FittedHead, depths: Sequence[DepthMap | None]) -> float:
+    """The share of the fitted head's pixels, without neck, that have a depth; over all views that show it."""
+    found = shown = 0
+    for made in depths:
+        if made is not None:
+            seen = head.view(made.camera)
+            on_head = seen.inside & (seen.labels != fitted.INDEX[NECK])
+            found, shown = found + int((on_head & (made.depth > 0)).sum()), shown + int(on_head.sum())
+    return found / max(shown, 1)

@@ -43,6 +43,7 @@ RESIDUAL_LIMITS = {
     "labels_percent": Limit(look=5.0),
     "landmarks_px": Limit(look=5.0, wrong=12.0),
 }
+LEAST_COVERAGE = 0.5  # of the head by depths that were made from the photographs
 INTERSECTION_LIMIT_MM = Limit(look=2.0)
 NOT_TRUSTED_LIMIT = Limit(look=0.0, wrong=0.5)  # fraction of the views
 _SCAN_PHRASES = {
@@ -83,7 +84,7 @@ def judge(status: Status, figures: Mapping[str, Any]) -> Verdict:
     if face.get("mean_mm") is not None:
         found += _scan(face)
     elif residuals:
-        found += _residuals(residuals)
+        found += [*_residuals(residuals), *_made(_mapping(figures.get("made")))]
     else:
         found.append(("look", "nothing measures the mesh: there is neither a scan of the face nor any image residual"))
     found += _views(figures) + _intersections(figures)
@@ -125,6 +126,17 @@ def _residuals(residuals: Mapping[str, Any]) -> list[tuple[Level, str]]:
     if not {"normals_deg", "colour_levels"} & known.keys():
         off.append(("look", "neither normals nor colours were compared: nothing measures the surface itself"))
     return off or [("good", f"no scan; in the images {', '.join(shown.values())} off")]
+
+
+def _made(made: Mapping[str, Any]) -> list[tuple[Level, str]]:
+    """What the residuals are worth if the channels that they compare with were made from the photographs."""
+    channels = made.get("channels")
+    if not channels:
+        return []
+    coverage = made.get("coverage")
+    if "normals" in channels and isinstance(coverage, int | float) and coverage < LEAST_COVERAGE:
+        return [("look", f"stereo found depths on {coverage:.0%} of the head only: the rest is the model's guess")]
+    return [("good", f"{', '.join(map(str, channels))} were made from the photographs")]
 
 
 def _views(figures: Mapping[str, Any]) -> list[tuple[Level, str]]:

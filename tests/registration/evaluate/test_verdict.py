@@ -61,3 +61,17 @@ def test_the_worst_reasons_come_first_and_good_ones_are_left_out() -> None:
     assert len(verdict.reasons) == 4 and "stopped" in " ".join(verdict.reasons)
     assert verdict.figure == {"level": "wrong", "reasons": list(verdict.reasons)}
     assert set(LEVEL_TITLES) == {"good", "look", "wrong"}
+
+
+@pytest.mark.parametrize(
+    ("made", "level", "reason"),
+    [
+        ({"channels": ["masks", "normals"], "coverage": 0.8}, "good", "masks, normals were made from the photographs"),
+        ({"channels": ["masks", "normals"], "coverage": 0.3}, "look", "depths on 30% of the head only"),
+        ({"channels": ["masks"]}, "good", "masks were made from the photographs"),
+    ],
+)
+def test_made_channels_are_named_and_little_stereo_asks_for_a_look(made, level, reason):
+    overall = {"silhouette_px": 0.4, "normals_deg": 0.9, "colour_levels": 1.0, "labels_percent": 0.3}
+    verdict = judge("converged", {"residuals": {"overall": overall}, "made": made})
+    assert verdict.level == level and any(reason in line for line in verdict.reasons)
