@@ -1,6 +1,6 @@
 """Register captures with fewer and fewer channels, down to photographs and cameras alone.
 
-    python -m bench.photographs --model MODEL.npz CAPTURE... [--given images masks scan everything] [--recipe draft]
+    python -m bench.photographs --model MODEL.npz CAPTURE... [--given images masks scan everything no_stereo ...] [--recipe draft]
 
 A capture is a folder; FOLDER:PRESET is a copy with the errors of a preset of `gnmreg capture degrade`; `synth` is a
 synthetic person with hair and a shirt. An expression is registered from the neutral of its subject, if that comes
@@ -29,12 +29,24 @@ from registration.degrading.degrade import degrade
 from registration.evaluate.evaluation import evaluate_registration
 from registration.storage.registration_folder import load_registration
 
-# What is given besides images and cameras: files and folders that are kept.
-GIVEN: Mapping[str, frozenset[str]] = {
-    "images": frozenset(),
-    "masks": frozenset({"masks"}),
-    "scan": frozenset({"masks", "scan"}),
-    "everything": frozenset({"masks", "scan", "normals", "segmentation", "landmarks", "depth", "confidence"}),
+
+@dataclass(frozen=True, kw_only=True)
+class Given:
+    """What a registration is given besides images and cameras."""
+
+    kept: frozenset[str]  # files and folders of the capture
+    arguments: tuple[str, ...] = ()
+
+
+GIVEN: Mapping[str, Given] = {
+    "images": Given(kept=frozenset()),
+    "masks": Given(kept=frozenset({"masks"})),
+    "scan": Given(kept=frozenset({"masks", "scan"})),
+    "everything": Given(
+        kept=frozenset({"masks", "scan", "normals", "segmentation", "landmarks", "depth", "confidence"})
+    ),
+    "no_stereo": Given(kept=frozenset(), arguments=("--no-stereo",)),
+    "no_detection": Given(kept=frozenset({"masks"}), arguments=("--no-detect",)),
 }
 _ALWAYS = frozenset({"capture.toml", "sparse", "images"})
 HEADS = ("capture", "given", "status", "s", "mean", "median", "p95", "vertex error", "drift")
@@ -70,7 +82,7 @@ def cases(words: list[str], work: Path) -> Iterator[Case]:
 
 def reduced(source: Path, target: Path, given: str) -> Path:
     """Copy a capture with only these channels."""
-    kept = _ALWAYS | GIVEN[given]
+    kept = _ALWAYS | GIVEN[given].kept
     ignored = [path.name for path in source.iterdir() if path.name not in kept and path.stem not in kept]
     shutil.copytree(source, target, ignore=lambda folder, names: ignored if Path(folder) == source else [])
     if "segmentation" not in kept:
@@ -86,6 +98,7 @@ def measure(
     name = f"{case.name} {given}".replace("/", "_").replace(" ", "_").replace(",", "")
     target, out = reduced(case.folder, work / "captures" / name, given), work / "registrations" / name
     arguments = ["register", str(target), "--model", str(options.model), "--out", str(out), "--recipe", options.recipe]
+    arguments += GIVEN[given].arguments
     arguments += [] if neutral is None else ["--neutral", str(neutral[0])]
     start = time.perf_counter()
     ran = run_command(arguments, check=False)
@@ -118,7 +131,7 @@ def main() -> None:
     parser.add_argument("captures", nargs="+", metavar="CAPTURE")
     parser.add_argument("--model", required=True, type=Path, metavar="NPZ")
     parser.add_argument("--recipe", default="draft")
-    parser.add_argument("--given", nargs="+", choices=GIVEN, default=list(GIVEN))
+    parser.add_argument("--given", nargs="+", choices=GIVEN, default=list(GIVEN)[:4])
     parser.add_argument("--keep", type=Path, metavar="DIR", help="keep captures and registrations in this folder")
     options = parser.parse_args()
     console = Console(width=150)
