@@ -1,10 +1,11 @@
 """Register captures with fewer and fewer channels, down to photographs and cameras alone.
 
-    python -m bench.photographs --model MODEL.npz CAPTURE... [--given images masks scan everything no_stereo ...] [--recipe draft]
+    python -m bench.photographs --model MODEL.npz CAPTURE... [--given images masks scan everything] [--recipe draft]
 
 A capture is a folder; FOLDER:PRESET is a copy with the errors of a preset of `gnmreg capture degrade`; `synth` is a
 synthetic person with hair and a shirt. An expression is registered from the neutral of its subject, if that comes
-before it among the captures, with the same channels given. Distances are those of `gnmreg evaluate` on the face, in mm;
+before it among the captures, with the same channels given. `no_stereo` and `no_detection` (with masks) leave steps out.
+Distances are those of `gnmreg evaluate` on the face, in mm;
 seconds are those of the whole command. A row is printed when it is measured.
 """
 
