@@ -173,7 +173,12 @@ class Completer:
         if not self._plan.normals:
             return None
         report = self._percent("stereo, first pass")
-        return first_depths(views, head.centre, head.radius_m, progress=report)
+        try:
+            return first_depths(views, head.centre, head.radius_m, progress=report)
+        except InputError as error:  # the rest of the capture is of use without depths
+            self._notes.append(f"no depths and normals could be made: {error.what.lower()}: {error.got}")
+            self._figures["coverage"] = 0.0
+            return None
 
     def _refined(self, views: Sequence[StereoView], head: FittedHead) -> tuple[DepthMap | None, ...]:
         report = self._percent("stereo, second pass")

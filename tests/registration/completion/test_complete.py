@@ -112,6 +112,13 @@ def test_the_same_inputs_are_made_once(completed, photographs, tmp_path):
     assert len(list(completions_folder().iterdir())) == 1
 
 
+def test_cameras_that_see_no_common_side_give_no_depths_and_say_so(photographs, tmp_path):
+    made = write_completed(photographs, MODEL, tmp_path / "two", replace(OPTIONS, views=2))
+    assert any(note.startswith("no depths and normals could be made") for note in made.notes)
+    assert made.figures["coverage"] == 0
+    assert not (tmp_path / "two" / "depth").exists() and (tmp_path / "two" / "masks").is_dir()
+
+
 def test_an_existing_folder_is_refused_before_any_work(completed, photographs):
     with pytest.raises(InputError, match="exists"):
         write_completed(photographs, MODEL, completed, OPTIONS)
