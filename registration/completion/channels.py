@@ -13,6 +13,7 @@ from registration.capture.landmark_files import read_landmarks
 from registration.capture.native_writer import ViewArrays, write_channels
 from registration.frames import opencv_intrinsics
 from registration.stereo.depth_map import DepthMap
+from registration.stereo.stored import stored_maps
 from registration.types import Camera, Capture, LabelCode, View
 
 _LEAST_CONFIDENCE = 0.02  # of a depth that is written
@@ -58,16 +59,13 @@ def write_depths(root: Path, capture: Capture, depths: Sequence[DepthMap | None]
     for view, made in zip(capture.views, depths, strict=True):
         if made is not None and not view.has_normals:
             trusted = made.confidence > _LEAST_CONFIDENCE
-            depth, normals, confidence = (
-                _stored(
-                    np.where(trusted.reshape(*trusted.shape, *[1] * (value.ndim - 2)), value, 0).astype(np.float32),
-                    made.camera,
-                    view.camera,
-                    cv2.INTER_NEAREST,
-                )
-                for value in (made.depth, made.normals, made.confidence)
+            kept = replace(
+                made,
+                depth=np.where(trusted, made.depth, 0),
+                normals=np.where(trusted[..., None], made.normals, 0),
+                confidence=np.where(trusted, made.confidence, 0),
             )
-            write_channels(root, _arrays(view, depth=depth, normals=normals, confidence=confidence))
+            write_channels(root, stored_maps(view.name, view.camera, kept))
 
 
 def attach(capture: Capture, root: Path, classes: Sequence[str]) -> Capture:
