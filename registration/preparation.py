@@ -12,6 +12,7 @@ from registration.capture.native_writer import check_new
 from registration.capture.settings_text import without_tables
 from registration.capture.triangulation import spreads_m
 from registration.completion.complete import CODE, Completer
+from registration.completion.costs import missing_notes
 from registration.completion.first_fit import HeadFitter
 from registration.completion.pictures import SHEET
 from registration.completion.saved import CHANNELS, Completion, completed
@@ -41,7 +42,7 @@ def complete_inputs(
         InputError: nothing says where the head is.
     """
     if inputs.plan.empty:
-        return inputs, None
+        return replace(inputs, notes=(*inputs.notes, *missing_notes(inputs.capture))), None
     neutral = inputs.neutral
     fitter = HeadFitter(
         inputs.data,

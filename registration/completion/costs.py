@@ -1,24 +1,18 @@
-"""What a missing channel costs, as measured (docs/photographs.md, "What it costs to leave steps out")."""
-
-from collections.abc import Sequence
+"""What a missing channel costs, as it was measured (docs/recipes.md, "From photographs")."""
 
 from registration.types import Capture
 
-_WITH_ALL = "0.28 mm"  # mean distance of the face's scan from the mesh, from photographs and cameras alone
-_WITHOUT_NORMALS = "0.97 mm"
+# Mean distance of the scan of a measured face from its mesh, from photographs and cameras: with what is made, without.
+_COMPLETE, _NO_NORMALS = "0.28 mm", "0.97 mm"
 
 
-def missing_notes(capture: Capture, schemes: Sequence[str]) -> tuple[str, ...]:
-    """Return a note for each channel that a completed capture still lacks, with what that is expected to cost.
+def missing_notes(capture: Capture) -> tuple[str, ...]:
+    """Return a note for what a capture lacks although it may be completed, with the error that is to be expected.
 
     Args:
         capture: with all that was made.
-        schemes: landmark schemes of the model.
     """
-    notes = []
-    if not any(view.has_normals for view in capture.views) and capture.scan is None:
-        notes.append(
-            "there are neither normals nor depths nor a scan: of a measured head the face was then "
-            f"{_WITHOUT_NORMALS} off on average, instead of {_WITH_ALL}"
-        )
-    return tuple(notes)
+    if not capture.photographs or capture.scan is not None or any(view.has_normals for view in capture.views):
+        return ()
+    expected = f"of a measured head the face was {_NO_NORMALS} off on average without them, {_COMPLETE} with them"
+    return (f"there are neither normals nor depths nor a scan: {expected}",)
