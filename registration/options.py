@@ -69,9 +69,10 @@ class RegisterOptions:
         use_scan: Whether the capture's scan takes part in the fit. auto: its normals, in views without normal maps,
             and its surface, if no view has normal maps. always: its surface beside normal maps too. never: the scan
             is only measured, so that its distances judge the fit.
-        detect: Detect landmarks in the photographs where the capture lacks them or labels, and make masks and labels
-            with them.
-        stereo: Compute depths and normals from the photographs where the capture has neither normals nor a scan.
+        detect: Landmarks are detected in the photographs where the capture lacks them or labels, and masks and labels
+            made with them, unless this is switched off.
+        stereo: Depths and normals are computed from the photographs where the capture has neither normals nor a scan,
+            unless this is switched off.
         detector: The landmark provider: face478, or the import path MODULE:FUNCTION of a function that returns one.
         camera_sigma_px: Expected error of the given cameras: rms shift of the head in the stored images, pixels. Above
             0, the fit corrects poses and focal lengths, with this prior. 0: the cameras are exact.

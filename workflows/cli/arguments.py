@@ -171,17 +171,19 @@ def _fish(options: Mapping[str, Mapping[str, Option]]) -> str:
 
 def _options(source: Any, hints: Mapping[str, Any]) -> Iterator[Option]:
     """Options of a command, or of a group of options; those of its base classes are among its hints."""
-    names = (
-        [field.name for field in fields(source)] if is_dataclass(source) else [*inspect.signature(source).parameters]
-    )
+    if is_dataclass(source):
+        defaults = {field.name: field.default for field in fields(source)}
+    else:
+        defaults = {name: parameter.default for name, parameter in inspect.signature(source).parameters.items()}
     help_ = _help(source)
-    for name in names:
+    for name, default in defaults.items():
         type_, metadata = _unwrapped(hints[name])
         if is_dataclass(type_) and isinstance(type_, type):
             yield from _options(type_, get_type_hints(type_, include_extras=True))
         elif not _marked(metadata, Positional) and not _marked(metadata, Suppress):
             shown = next((m.name for m in metadata if type(m).__name__ == _ARGUMENT_CONFIG and m.name), name)
             values, choices = _values(type_)
+            shown = f"no-{shown}" if default is True else shown  # tyro offers to switch off what is on
             yield Option(
                 name=f"--{shown.replace('_', '-')}", summary=help_.get(name, ""), values=values, choices=choices
             )

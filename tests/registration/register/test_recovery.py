@@ -213,7 +213,7 @@ def test_expression_from_its_neutral(registered: Run, smile: Run):
 
 
 def test_registration_without_landmarks(registered: Run, without_landmarks: Run):
-    assert any("estimating the head's pose from the masks" in message for message in without_landmarks.progress.notes)
+    assert any("no landmarks: best of 24 head poses" in message for message in without_landmarks.progress.notes)
     error = without_landmarks.error_mm[face(without_landmarks)]
     print(f"without landmarks: vertices {error.mean():.3f} mm, {scan_to_mesh(without_landmarks)}")
     assert without_landmarks.result.status == "converged", without_landmarks.result.reason

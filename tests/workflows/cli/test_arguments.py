@@ -51,8 +51,8 @@ def test_the_options_are_those_of_the_help(
 @pytest.mark.parametrize(
     ("typed", "words"),
     [
-        ("gnmreg st", "stabilize status store"),
-        ("gnmreg capture ", "import check synth degrade"),
+        ("gnmreg st", "stabilize status stereo store"),
+        ("gnmreg capture ", "import calibrate check complete detect synth degrade"),
         ("gnmreg stabilize r", "review"),
         ("gnmreg status --wa", "--watch"),
         ("gnmreg stabilize review --po", "--port"),
