@@ -7,15 +7,19 @@ from typing import Any
 
 import cv2
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import Bool, Float, UInt8
 
 from registration.capture.landmark_files import read_landmarks
 from registration.capture.native_writer import ViewArrays, write_channels
 from registration.frames import opencv_intrinsics
+from registration.segment.masks import UNCERTAIN
 from registration.stereo.depth_map import DepthMap
 from registration.stereo.stored import stored_maps
 from registration.types import Camera, Capture, LabelCode, View
 
+_MOST_UNKNOWN = 0.25  # pixels of unknown coverage, relative to those of the subject, in a mask of use
+_UNKNOWN = 0.49  # coverage that stands for it in files
+_TOLERANCE = 0.02  # of coverages
 _LEAST_CONFIDENCE = 0.02  # of a depth that is written
 
 
@@ -34,7 +38,7 @@ def write_landmarks(root: Path, detected: Capture, scheme: str) -> None:
 
 
 def write_masks(root: Path, capture: Capture, masks: Sequence[Float[np.ndarray, "h w"]]) -> None:
-    """Write the subject's coverage in the views without a mask.
+    """Write the subject's coverage in the views without a mask; not where most of the subject's border is unknown.
 
     Args:
         root: folder of the written channels.
@@ -42,9 +46,17 @@ def write_masks(root: Path, capture: Capture, masks: Sequence[Float[np.ndarray, 
         masks: of all views, on the pixels of their undistorted images, perhaps reduced.
     """
     for view, mask in zip(capture.views, masks, strict=True):
-        if view.mask is None:
-            stored = _stored(mask, _undistorted(view.camera, mask.shape), view.camera, cv2.INTER_LINEAR)
+        unknown = uncertain(mask)
+        if view.mask is None and unknown.sum() <= _MOST_UNKNOWN * (mask > 0.5).sum():
+            # Below a half: a reader takes the darkest of many bright values for the subject.
+            shown = np.where(unknown, np.float32(_UNKNOWN), mask)
+            stored = _stored(shown, _undistorted(view.camera, mask.shape), view.camera, cv2.INTER_LINEAR)
             write_channels(root, _arrays(view, mask=stored))
+
+
+def uncertain(mask: Float[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
+    """Return the pixels of a made mask where nothing tells subject from background."""
+    return np.abs(mask - UNCERTAIN) < _TOLERANCE
 
 
 def write_labels(root: Path, capture: Capture, labels: Sequence[UInt8[np.ndarray, "h w"]]) -> None:

@@ -16,7 +16,14 @@ from jaxtyping import Float, UInt8
 
 from registration.capture.class_names import NECK
 from registration.capture.pixels import read_coverage, read_photograph, undistort_landmarks
-from registration.completion.channels import attach, write_depths, write_labels, write_landmarks, write_masks
+from registration.completion.channels import (
+    attach,
+    uncertain,
+    write_depths,
+    write_labels,
+    write_landmarks,
+    write_masks,
+)
 from registration.completion.first_fit import FittedHead, HeadFitter
 from registration.completion.plan import CompletionPlan, has_landmarks
 from registration.detect.detection import detect_landmarks
@@ -42,7 +49,7 @@ def refused_folder() -> Path:
 
 
 T = TypeVar("T")
-CODE = 1  # raised when the same inputs give other channels
+CODE = 2  # raised when the same inputs give other channels
 _HEAD_PX = 700  # largest height of the head in the images that channels are made from
 
 
@@ -230,8 +237,15 @@ class Completer:
         self._progress.message("labels")
         fitted_head = fitted.FittedHead(head.vertices, self._fitter.data)
         labelled = fitted_labels(views, masks, fitted_head, depths=depths)
-        write_masks(self._root, capture, [view.mask for view in labelled])
-        write_labels(self._root, capture, [view.labels for view in labelled])
+        unknown = [uncertain(view.mask) for view in labelled]
+        # What is unknown is excluded by its label: in the mask it may be the subject's.
+        shown = [np.where(where, 1, view.mask) for view, where in zip(labelled, unknown, strict=True)]
+        labels = [
+            np.where(where, fitted.INDEX[fitted.UNLABELLED], view.labels).astype(np.uint8)
+            for view, where in zip(labelled, unknown, strict=True)
+        ]
+        write_masks(self._root, capture, shown)
+        write_labels(self._root, capture, labels)
 
 
 def _coverage(head: fitted.FittedHead, depths: Sequence[DepthMap | None]) -> float:
