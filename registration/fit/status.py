@@ -39,7 +39,7 @@ def judge_fit(
             continue
         text = f"landmarks of scheme {name} are {px:.1f} px off in the median (limit {MAX_LANDMARK_PX}"
         sigmas = deviations.get(name)
-        text += ")" if sigmas is None else f" or {MAX_LANDMARK_SIGMAS:g} standard deviations; it is {sigmas:.1f})"
+        text += ")" if sigmas is None else f" or {MAX_LANDMARK_SIGMAS:g} standard deviations, here {sigmas:.1f})"
         if sigmas is not None and sigmas < MAX_LANDMARK_SIGMAS:
             explained.append(text)
         else:
