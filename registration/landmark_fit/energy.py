@@ -1,0 +1,330 @@
+"""The energy of a landmark fit in maximum-a-posteriori units, and its normal equations (Wood 2022).
+
+E = sum rho(r^2 / sigma^2) / 2 + |b|^2 / 2 + sum_f |f|^2 / 2 + the priors of joints and cameras + temporal and
+anatomical terms; r are reprojection errors of landmarks.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from registration.landmark_fit.anatomy import Anatomy
+from registration.landmark_fit.landmark_model import LandmarkModel, differences
+from registration.landmark_fit.linear_system import ArrowSystem
+from registration.landmark_fit.options import FitOptions
+from registration.landmark_fit.state import Free, Layout, State
+
+_NEAR_M = 1e-3  # depth below which a point counts as behind the camera
+_BEHIND = 1e8  # squared standard deviations of a landmark behind a camera
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Problem:
+    """One subject's fit: model, observations and priors; constant during a stage."""
+
+    model: LandmarkModel
+    anatomy: Anatomy | None
+    layout: Layout
+    options: FitOptions
+    group: Int[np.ndarray, "N"]  # of the views' focal lengths
+    points_px: Float[np.ndarray, "F N L 2"]  # NaN: not seen, or not used in this stage
+    sigma_px: Float[np.ndarray, "F N L"]
+    robust: bool
+    pivot: Float[np.ndarray, "3"]
+    log_focal_mean: Float[np.ndarray, "G"]
+    centre_px: Float[np.ndarray, "N 2"]
+    principal_sigma_px: float
+    expression_change: Float[np.ndarray, "Q Q"] | None  # information of the temporal prior on coefficients
+    spread_m: Float[np.ndarray, "L"] | None = None  # of the model's landmarks; part of a stage's `sigma_px`
+
+    # ---- values
+
+    def energy(self, state: State) -> float:
+        """The energy at a state."""
+        total = self._prior_energy(state)
+        for f in range(len(state.expression)):
+            posed = self.model(state.identity, state.expression[f], state.joints[f])
+            world = self._world(state, f, posed.points)
+            for v in range(len(self.group)):
+                rows = np.flatnonzero(np.isfinite(self.points_px[f, v, :, 0]))
+                if not len(rows):
+                    continue
+                squared = self.squared(state, f, v, world, rows)
+                total += 0.5 * float(self._rho(squared).sum())
+            if self.anatomy is not None:
+                total += self.anatomy.energy(state.identity, state.expression[f], state.joints[f])
+        return total
+
+    def squared(self, state: State, f: int, v: int, world: np.ndarray, rows: np.ndarray) -> Float[np.ndarray, "M"]:
+        """Squared reprojection errors over variances."""
+        pixels, depth = self.project(state, v, world[rows])
+        squared = (((pixels - self.points_px[f, v, rows]) / self.sigma_px[f, v, rows, None]) ** 2).sum(1)
+        return np.where(depth > _NEAR_M, np.minimum(np.nan_to_num(squared, nan=_BEHIND), _BEHIND), _BEHIND)
+
+    def project(self, state: State, v: int, world: Float[np.ndarray, "M 3"]) -> tuple[np.ndarray, np.ndarray]:
+        """Pixels and depths of world points in a view."""
+        local = world @ state.view_rotations[v].T + state.view_translations[v]
+        depth = local[:, 2]
+        with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+            ray = local[:, :2] / depth[:, None]
+            stretch = 1 + state.k1[self.group[v]] * (ray**2).sum(1)
+            return np.exp(state.log_focal[self.group[v]]) * stretch[:, None] * ray + state.principal_px[v], depth
+
+    def _world(self, state: State, f: int, points: Float[np.ndarray, "L 3"]) -> Float[np.ndarray, "L 3"]:
+        return np.exp(state.log_size) * (points - self.pivot) @ state.joints[f, 0].T + state.position[f]
+
+    def world(self, state: State, f: int) -> Float[np.ndarray, "L 3"]:
+        """The landmarks of a frame in the world, metres."""
+        return self._world(state, f, self.model(state.identity, state.expression[f], state.joints[f]).points)
+
+    def weights(self, squared: Float[np.ndarray, "M"]) -> Float[np.ndarray, "M"]:
+        """Robust weights: those of Geman and McClure; all one before the robust stage."""
+        return 1 / (1 + squared / self.options.robust_sigmas**2) ** 2 if self.robust else np.ones_like(squared)
+
+    def _rho(self, squared: np.ndarray) -> np.ndarray:
+        return squared / (1 + squared / self.options.robust_sigmas**2) if self.robust else squared
+
+    # ---- priors
+
+    def _joint_sigmas(self) -> Float[np.ndarray, "C"]:
+        first = [self.options.head_rotation] * 3
+        return np.array(first + [self.options.eye_rotation] * (3 * (self.layout.joints - 2)))[
+            : 3 * (self.layout.joints - 1)
+        ]
+
+    def _prior_residuals(self, state: State) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """Weighted residuals and information (their derivatives' square): of frames (F, n), of the shared (m)."""
+        layout, options = self.layout, self.options
+        frames = len(state.expression)
+        local, local_info = np.zeros((frames, layout.local_count)), np.zeros(layout.local_count)
+        local[:, layout.local("expression")] = state.expression
+        local_info[layout.local("expression")] = 1
+        turns = differences(state.joints[:, 1:], np.broadcast_to(np.eye(3), state.joints[:, 1:].shape))
+        joint_info = 1 / self._joint_sigmas() ** 2
+        local[:, layout.local("joints")] = turns.reshape(frames, -1) * joint_info
+        local_info[layout.local("joints")] = joint_info
+        shared, info = np.zeros(layout.shared_count), np.zeros(layout.shared_count)
+        for name, value, sigma in (
+            ("identity", state.identity, 1.0),
+            ("size", state.log_size, options.log_size),
+            ("focal", state.log_focal - self.log_focal_mean, options.log_focal),
+            ("principal", (state.principal_px - self.centre_px).ravel(), self.principal_sigma_px),
+            ("k1", state.k1, options.distortion_sigma),
+        ):
+            shared[layout.shared(name)] = value / sigma**2
+            info[layout.shared(name)] = 1 / sigma**2
+        return local, local_info, shared, info
+
+    def _prior_energy(self, state: State) -> float:
+        local, local_info, shared, info = self._prior_residuals(state)
+        total = _half_squares(local, local_info) + _half_squares(shared, info)
+        if self.options.temporal is not None and len(state.expression) > 1:
+            change = self._changes(state)
+            total += 0.5 * float(np.einsum("fi,ij,fj->", change, self._change_information(), change))
+        return total
+
+    def _changes(self, state: State) -> Float[np.ndarray, "F-1 n"]:
+        layout = self.layout
+        change = np.zeros((len(state.expression) - 1, layout.local_count))
+        change[:, layout.local("expression")] = np.diff(state.expression, axis=0)
+        turns = differences(state.joints[1:], state.joints[:-1])
+        change[:, layout.local("root")] = turns[:, 0]
+        change[:, layout.local("joints")] = turns[:, 1:].reshape(len(change), -1)
+        change[:, layout.local("position")] = np.diff(state.position, axis=0)
+        return change
+
+    def _change_information(self) -> Float[np.ndarray, "n n"]:
+        layout, temporal = self.layout, self.options.temporal
+        assert temporal is not None and self.expression_change is not None
+        information = np.zeros((layout.local_count, layout.local_count))
+        own = layout.local("expression")
+        information[own, own] = self.expression_change
+        for name, sigma in (
+            ("joints", temporal.rotation),
+            ("root", temporal.rotation),
+            ("position", temporal.translation_m),
+        ):
+            index = np.arange(layout.local_count)[layout.local(name)]
+            information[index, index] = 1 / sigma**2
+        return information
+
+    # ---- normal equations
+
+    def system(self, state: State, free: Free) -> ArrowSystem:
+        """The Gauss-Newton normal equations in the free columns, with robust weights (iteratively reweighted)."""
+        frames, n, m = len(state.expression), len(free.local), len(free.shared)
+        local, mixed = np.zeros((frames, n, n)), np.zeros((frames, n, m))
+        shared, gradient, shared_gradient = np.zeros((m, m)), np.zeros((frames, n)), np.zeros(m)
+        for f in range(frames):
+            for jacobian, residual in self._frame_rows(state, f, free):
+                own, both = jacobian[:, :n], jacobian[:, n:]
+                product = jacobian.T @ jacobian
+                local[f] += product[:n, :n]
+                mixed[f] += product[:n, n:]
+                shared += product[n:, n:]
+                gradient[f] += own.T @ residual
+                shared_gradient += both.T @ residual
+        prior, prior_info, shared_prior, shared_info = self._prior_residuals(state)
+        diagonal = np.arange(n)
+        local[:, diagonal, diagonal] += prior_info[free.local]
+        gradient += prior[:, free.local]
+        shared[np.arange(m), np.arange(m)] += shared_info[free.shared]
+        shared_gradient += shared_prior[free.shared]
+        neighbours = None
+        if self.options.temporal is not None and frames > 1:
+            information = self._change_information()[np.ix_(free.local, free.local)]
+            pull = self._changes(state) @ self._change_information()
+            local[1:] += information
+            local[:-1] += information
+            gradient[1:] += pull[:, free.local]
+            gradient[:-1] -= pull[:, free.local]
+            neighbours = -information
+        return ArrowSystem(
+            local=local,
+            neighbours=neighbours,
+            mixed=mixed,
+            shared=shared,
+            local_gradient=gradient,
+            shared_gradient=shared_gradient,
+        )
+
+    def _frame_rows(self, state: State, f: int, free: Free) -> Sequence[tuple[np.ndarray, np.ndarray]]:
+        """Weighted Jacobian (rows, n + m) and residuals of each view of a frame, and of its anatomy."""
+        layout = self.layout
+        wants = _wanted(layout, free)
+        seen = np.isfinite(self.points_px[f, :, :, 0])
+        rows = np.flatnonzero(seen.any(0))
+        result = []
+        if len(rows):
+            posed = self.model(
+                state.identity,
+                state.expression[f],
+                state.joints[f],
+                rows=rows,
+                by_identity="identity" in wants,
+                by_expression="expression" in wants,
+                by_joints="joints" in wants or self.model.has_correctives,
+            )
+            world = self._world(state, f, posed.points)
+            columns = self._world_columns(state, f, posed, world, free)
+            for v in np.flatnonzero(seen.any(1)):
+                of_view = np.flatnonzero(seen[v, rows])
+                result.append(self._view_rows(state, f, v, world, columns, rows, of_view, free))
+        if self.anatomy is not None:
+            result += self.anatomy.rows(state.identity, state.expression[f], state.joints[f], layout, free)
+        return result
+
+    def _world_columns(self, state, f, posed, world, free) -> Float[np.ndarray, "3 M n+m"]:  # type: ignore[no-untyped-def]
+        """Derivatives of the world's points by the free columns; those of cameras are zero."""
+        layout = self.layout
+        size_root = np.exp(state.log_size) * state.joints[f, 0]
+        arm = world - state.position[f]
+        count = len(world)
+        local, shared = {}, {}
+        if posed.by_expression is not None:
+            local["expression"] = _rotated(size_root, posed.by_expression)
+        root = -_cross_matrices(arm)
+        if posed.by_joints is not None:
+            turns = _rotated(size_root, posed.by_joints)
+            local["joints"] = turns[:, :, 3:]
+            root = root + turns[:, :, :3]
+        local["root"] = root
+        local["position"] = np.broadcast_to(np.eye(3)[:, None], (3, count, 3))
+        if posed.by_identity is not None:
+            shared["identity"] = _rotated(size_root, posed.by_identity)
+        shared["size"] = arm.T[..., None]
+        columns = np.zeros((3, count, len(free.local) + len(free.shared)))
+        for names, blocks, chosen, start in (
+            (layout.local_names, local, free.local, 0),
+            (layout.shared_names, shared, free.shared, len(free.local)),
+        ):
+            first = 0
+            for name, width in names:
+                low, high = np.searchsorted(chosen, [first, first + width])
+                if high > low and name in blocks:
+                    block = blocks[name]
+                    whole = high - low == width
+                    columns[:, :, start + low : start + high] = (
+                        block if whole else block[:, :, chosen[low:high] - first]
+                    )
+                first += width
+        return columns
+
+    def _view_rows(self, state, f, v, world, columns, rows, of_view, free):  # type: ignore[no-untyped-def]
+        layout, group = self.layout, self.group[v]
+        R = state.view_rotations[v]
+        turned = world[of_view] @ R.T
+        local = turned + state.view_translations[v]
+        depth = np.where(np.abs(local[:, 2]) > _NEAR_M, local[:, 2], _NEAR_M)
+        ray = local[:, :2] / depth[:, None]
+        radius = (ray**2).sum(1)
+        k1, focal = state.k1[group], np.exp(state.log_focal[group])
+        stretch = 1 + k1 * radius
+        pixels = focal * stretch[:, None] * ray + state.principal_px[v]
+        chosen = rows[of_view]
+        sigma = self.sigma_px[f, v, chosen]
+        residual = (pixels - self.points_px[f, v, chosen]) / sigma[:, None]
+        squared = (residual**2).sum(1)
+        weight = np.sqrt(self.weights(squared)) * (local[:, 2] > _NEAR_M)
+        factor = weight / sigma
+        by_ray = stretch[:, None, None] * np.eye(2) + 2 * k1 * ray[:, :, None] * ray[:, None, :]
+        by_local = np.zeros((len(local), 2, 3))
+        by_local[:, 0, 0] = by_local[:, 1, 1] = 1 / depth
+        by_local[:, :, 2] = -ray / depth[:, None]
+        by_local = (focal * factor)[:, None, None] * (by_ray @ by_local)
+        by_world = by_local @ R
+        part = columns if len(of_view) == columns.shape[1] else columns[:, of_view]
+        jacobian = np.empty((len(local), 2, columns.shape[2]))
+        for axis in range(2):
+            np.multiply(part[0], by_world[:, axis, 0, None], out=jacobian[:, axis])
+            jacobian[:, axis] += part[1] * by_world[:, axis, 1, None]
+            jacobian[:, axis] += part[2] * by_world[:, axis, 2, None]
+        for name, index, value in (
+            ("focal", [group], (focal * factor * stretch)[:, None, None] * ray[..., None]),
+            ("k1", [group], (focal * factor * radius)[:, None, None] * ray[..., None]),
+            ("principal", [2 * v, 2 * v + 1], factor[:, None, None] * np.eye(2)),
+            ("poses", range(6 * v, 6 * v + 6), _by_pose(turned, by_local)),
+        ):
+            start = layout.shared(name).start
+            for k, column in enumerate(index):
+                at = np.searchsorted(free.shared, start + column)
+                if at < len(free.shared) and free.shared[at] == start + column:
+                    jacobian[:, :, len(free.local) + at] += value[:, :, k]
+        return jacobian.reshape(-1, jacobian.shape[2]), (residual * weight[:, None]).ravel()
+
+
+def _by_pose(turned: np.ndarray, by_local: np.ndarray) -> Float[np.ndarray, "M 2 6"]:
+    """Derivatives by a left rotation of R x, before the translation, and by the translation."""
+    rotation = np.cross(turned[:, None, :], by_local)  # by_local @ -[R x]x
+    return np.concatenate([rotation, by_local], 2)
+
+
+def _wanted(layout: Layout, free: Free) -> set[str]:
+    names = set()
+    for blocks, chosen in ((layout.local_names, free.local), (layout.shared_names, free.shared)):
+        first = 0
+        for name, width in blocks:
+            low, high = np.searchsorted(chosen, [first, first + width])
+            if high > low:
+                names.add(name)
+            first += width
+    return names
+
+
+def _rotated(matrix: np.ndarray, columns: np.ndarray) -> np.ndarray:
+    return (matrix @ columns.reshape(3, -1)).reshape(columns.shape)
+
+
+def _cross_matrices(vectors: Float[np.ndarray, "M 3"]) -> Float[np.ndarray, "3 M 3"]:
+    """[v]x of each vector, rows first."""
+    x, y, z = vectors.T
+    zero = np.zeros_like(x)
+    return np.stack([np.stack([zero, -z, y], 1), np.stack([z, zero, -x], 1), np.stack([-y, x, zero], 1)])
+
+
+def _half_squares(weighted: np.ndarray, information: np.ndarray) -> float:
+    """|r|^2 / 2 from information-weighted residuals."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return 0.5 * float(np.where(information > 0, weighted**2 / information, 0).sum())

@@ -1,0 +1,63 @@
+"""Expression coefficients reduced to what the landmarks of a scheme can determine."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+
+from registration.landmark_fit.observations import Observations
+from registration.landmark_fit.options import FitOptions
+from registration.model.gnm_npz import GNMData
+
+_LEAST_INFORMATION = 3e-3  # of a direction relative to its prior: less moves it by less than 0.3 % of what is true
+_MARGIN = 4.0  # so much more information may other observations hold with the same basis
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Reduction:
+    """Raw coefficients = mean + basis @ reduced ones, which have a normal prior of unit variance."""
+
+    mean: Float[np.ndarray, "E"]
+    basis: Float[np.ndarray, "E Q"]
+    root: Float[np.ndarray, "E E"]  # of the prior's covariance, root @ root^T
+    information: float  # of a displacement of one metre, for which it was made
+
+    def covers(self, information: float) -> bool:
+        """Whether the basis suffices for observations of so much information."""
+        return self.information / _MARGIN**2 <= information <= self.information
+
+
+def information_per_metre(observations: Observations, pixels_per_metre: float) -> float:
+    """Information of all observations of one landmark on a displacement, 1 / m^2."""
+    sigma = float(np.median(observations.sigma_px[observations.seen]))
+    counts = observations.seen.sum((1, 2)) / max(1, observations.seen.any((0, 1)).sum())
+    return float(counts.max()) * (pixels_per_metre / sigma) ** 2
+
+
+def reduce_expression(data: GNMData, observations: Observations, options: FitOptions, information: float) -> Reduction:
+    """Return the directions of the expression coefficients that the landmarks move visibly.
+
+    In an eigenbasis of the landmarks' information the prior stays the identity; directions without information stay at
+    the prior's mean, where the full problem would leave them.
+
+    Args:
+        data: the model.
+        observations: whose landmarks count.
+        options: the prior.
+        information: per square metre of displacement (`information_per_metre`).
+    """
+    count = len(data.expression_basis)
+    prior = options.expression_prior
+    mean = np.zeros(count) if prior is None else prior.mean.astype(np.float64)
+    if prior is None:
+        root = np.eye(count) * options.expression_sigma
+    else:
+        values, vectors = np.linalg.eigh(prior.covariance.astype(np.float64))
+        root = vectors * np.sqrt(np.maximum(values, 0))
+    seen = observations.seen.any((0, 1))
+    scheme = observations.scheme
+    vertices = data.expression_basis[:, scheme.indices[seen]].astype(np.float64)
+    moved = np.einsum("elkd,lk->lde", vertices, scheme.weights[seen], optimize=True).reshape(-1, count) @ root
+    values, vectors = np.linalg.eigh(information * _MARGIN * (moved.T @ moved))
+    kept = values > _LEAST_INFORMATION
+    return Reduction(mean=mean, basis=root @ vectors[:, kept][:, ::-1], root=root, information=information * _MARGIN)
