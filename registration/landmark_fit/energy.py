@@ -12,11 +12,12 @@ from jaxtyping import Float, Int
 
 from registration.landmark_fit.anatomy import Anatomy
 from registration.landmark_fit.landmark_model import LandmarkModel, differences
-from registration.landmark_fit.linear_system import ArrowSystem
+from registration.landmark_fit.linear_system import ArrowSystem, Coordinates
 from registration.landmark_fit.options import FitOptions
 from registration.landmark_fit.state import Free, Layout, State
 
 _NEAR_M = 1e-3  # depth below which a point counts as behind the camera
+_POSE_SCALE = 100.0  # damping of poses, which have no prior: that of a standard deviation of 0.1 rad or m
 _BEHIND = 1e8  # squared standard deviations of a landmark behind a camera
 
 
@@ -35,6 +36,7 @@ class Problem:
     pivot: Float[np.ndarray, "3"]
     log_focal_mean: Float[np.ndarray, "G"]
     centre_px: Float[np.ndarray, "N 2"]
+    first_view: int  # whose camera's frame is the world, if no pose is given
     principal_sigma_px: float
     expression_change: Float[np.ndarray, "Q Q"] | None  # information of the temporal prior on coefficients
     spread_m: Float[np.ndarray, "L"] | None = None  # of the model's landmarks; part of a stage's `sigma_px`
@@ -188,7 +190,31 @@ class Problem:
             shared=shared,
             local_gradient=gradient,
             shared_gradient=shared_gradient,
+            local_scale=np.where(prior_info > 0, prior_info, _POSE_SCALE)[free.local],
+            shared_scale=np.where(shared_info > 0, shared_info, _POSE_SCALE)[free.shared],
         )
+
+    def coordinates(self, state: State, free: Free) -> Coordinates:
+        """Unknowns in which a focal length changes the distance too, so that the head keeps its size in the image."""
+        layout = self.layout
+        n, m = len(free.local), len(free.shared)
+        along, within = np.zeros((len(state.position), n, m)), np.eye(m)
+        position = np.searchsorted(free.local, np.arange(layout.local_count)[layout.local("position")])
+        for v, group in enumerate(self.group):
+            column = layout.shared("focal").start + int(group)
+            at = int(np.searchsorted(free.shared, column))
+            if at == m or free.shared[at] != column:
+                continue
+            depth = state.position @ state.view_rotations[v, 2] + state.view_translations[v, 2]
+            if v == self.first_view:
+                along[:, position, at] = depth[:, None] * state.view_rotations[v, 2]
+            else:
+                poses = layout.shared("poses").start + 6 * v + np.arange(3, 6)
+                rows = np.searchsorted(free.shared, poses)
+                if rows[-1] < m and (free.shared[rows] == poses).all():
+                    own = along[:, position, at].mean(0)
+                    within[rows, at] = np.array([0, 0, depth.mean()]) - state.view_rotations[v] @ own
+        return Coordinates(along=along, within=within)
 
     def _frame_rows(self, state: State, f: int, free: Free) -> Sequence[tuple[np.ndarray, np.ndarray]]:
         """Weighted Jacobian (rows, n + m) and residuals of each view of a frame, and of its anatomy."""

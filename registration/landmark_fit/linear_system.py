@@ -5,7 +5,7 @@ without one they are independent.
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float
@@ -19,6 +19,39 @@ class NotPositive(Exception):
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
+class Coordinates:
+    """Unknowns in which the problem is closer to linear: a step y is the step (y_f + along_f s, within s) before."""
+
+    along: Float[np.ndarray, "F n m"]  # of shared unknowns, in those of the frames
+    within: Float[np.ndarray, "m m"]
+
+    def applied(self, system: "ArrowSystem") -> "ArrowSystem":
+        """The system of steps in these unknowns."""
+        columns = np.flatnonzero(np.abs(self.along).max((0, 1), initial=0) > 0)
+        if not len(columns):
+            return system
+        D, P = self.along[:, :, columns], self.within
+        carried = system.local @ D  # the local matrix times the change of the frames
+        if system.neighbours is not None:
+            carried[:-1] += system.neighbours @ D[1:]
+            carried[1:] += system.neighbours.T @ D[:-1]
+        mixed = system.mixed @ P
+        between = np.einsum("fnk,fnm->km", D, mixed, optimize=True)
+        shared = P.T @ system.shared @ P
+        shared[columns] += between
+        shared[:, columns] += between.T
+        shared[np.ix_(columns, columns)] += np.einsum("fnk,fnl->kl", D, carried, optimize=True)
+        gradient = P.T @ system.shared_gradient
+        gradient[columns] += np.einsum("fnk,fn->k", D, system.local_gradient, optimize=True)
+        mixed[:, :, columns] += carried
+        return replace(system, mixed=mixed, shared=shared, shared_gradient=gradient)
+
+    def undone(self, local: np.ndarray, shared: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """The step in the unknowns before."""
+        return local + self.along @ shared, self.within @ shared
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
 class ArrowSystem:
     """H x = -g for n unknowns of each of F frames and m shared ones."""
 
@@ -28,13 +61,17 @@ class ArrowSystem:
     shared: Float[np.ndarray, "m m"]
     local_gradient: Float[np.ndarray, "F n"]
     shared_gradient: Float[np.ndarray, "m"]
+    local_scale: Float[np.ndarray, "n"]  # what damping adds to the diagonal, times its strength
+    shared_scale: Float[np.ndarray, "m"]
 
     def step(self, damping: float) -> tuple[Float[np.ndarray, "F n"], Float[np.ndarray, "m"]]:
-        """Return x of the system whose diagonal is multiplied by 1 + damping. Raises NotPositive."""
+        """Return x of the system whose diagonal is increased by damping times the scales. Raises NotPositive."""
         factors = _Factors(self, damping)
         right = np.concatenate([self.mixed, self.local_gradient[..., None]], 2)
         solved = factors.solve(right)
-        reduced = _damped(self.shared, damping) - np.einsum("fnm,fnk->mk", self.mixed, solved[..., :-1], optimize=True)
+        reduced = _damped(self.shared, damping * self.shared_scale) - np.einsum(
+            "fnm,fnk->mk", self.mixed, solved[..., :-1], optimize=True
+        )
         gradient = self.shared_gradient - np.einsum("fnm,fn->m", self.mixed, solved[..., -1], optimize=True)
         shared = -_solved(reduced, gradient)
         local = -solved[..., -1] - solved[..., :-1] @ shared
@@ -92,7 +129,7 @@ class _Factors:
         self._neighbours = system.neighbours
         self.lower: list[np.ndarray] = []
         for f, block in enumerate(system.local):
-            damped = _damped(block, damping)
+            damped = _damped(block, damping * system.local_scale)
             if f and system.neighbours is not None:
                 half = solve_triangular(self.lower[-1], system.neighbours, lower=True)
                 damped = damped - half.T @ half
@@ -115,11 +152,10 @@ class _Factors:
         return np.stack(forward)
 
 
-def _damped(matrix: np.ndarray, damping: float) -> np.ndarray:
+def _damped(matrix: np.ndarray, added: np.ndarray) -> np.ndarray:
     result = matrix.copy()
-    diagonal = np.diag(matrix)
-    if len(diagonal):
-        result[np.diag_indices_from(result)] = diagonal * (1 + damping) + _FLOOR * diagonal.max()
+    if len(added):
+        result[np.diag_indices_from(result)] += added + _FLOOR * np.diag(matrix).max()
     return result
 
 

@@ -8,8 +8,9 @@ from registration.landmark_fit.energy import Problem
 from registration.landmark_fit.linear_system import NotPositive
 from registration.landmark_fit.state import Free, State, moved
 
-_DAMPING = 1e-4
+_DAMPING = 1e-2
 _LEAST, _MOST = 1e-12, 1e10
+_PRECISION = 1e-11  # of the energy
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -30,15 +31,16 @@ def minimize(problem: Problem, state: State, free: Free, max_iterations: int, to
         state: where to begin.
         free: columns of the unknowns.
         max_iterations: linearizations at most.
-        tolerance: relative decrease of the energy, below which a step is the last.
+        tolerance: decrease of the energy below which a step is the last; in units of the logarithm of the posterior.
     """
     energy, damping, growth = problem.energy(state), _DAMPING, 2.0
     for iteration in range(1, max_iterations + 1):
-        system = problem.system(state, free)
+        coordinates = problem.coordinates(state, free)
+        system = coordinates.applied(problem.system(state, free))
         while True:
             try:
                 local, shared = system.step(damping)
-                candidate = moved(state, problem.layout, free, local, shared)
+                candidate = moved(state, problem.layout, free, *coordinates.undone(local, shared))
                 value = problem.energy(candidate)
             except NotPositive:
                 value = np.inf
@@ -52,6 +54,6 @@ def minimize(problem: Problem, state: State, free: Free, max_iterations: int, to
         damping, growth = max(damping * max(1 / 3, 1 - (2 * ratio - 1) ** 3), _LEAST), 2.0
         decrease = energy - value
         state, energy = candidate, value
-        if decrease <= tolerance * max(energy, 1e-300) or energy == 0:
+        if decrease <= tolerance + _PRECISION * energy:
             return Minimum(state=state, energy=energy, iterations=iteration, converged=True)
     return Minimum(state=state, energy=energy, iterations=max_iterations, converged=False)

@@ -17,7 +17,7 @@ from registration.landmark_fit.state import Free, Layout, State, free_columns
 
 _MANY, _COARSE = 1500, 500  # landmarks above which stages before the last use so many of them
 _COARSE_ITERATIONS = 12
-_COARSE_TOLERANCE = 1e-3
+_COARSE_TOLERANCE = 0.3
 
 
 def run_stages(
@@ -64,17 +64,18 @@ def run_stages(
         pivot=start.pivot,
         log_focal_mean=start.log_focal,
         centre_px=start.centre_px,
+        first_view=start.first_view,
         principal_sigma_px=options.principal_sigma * max(view.width_px for view in observations.views),
         expression_change=None if temporal is None else reduction.basis.T @ reduction.basis / temporal.expression**2,
     )
     iterations = 0
-    names = ["root", "position", "focal", "poses"]
+    names = ["root", "position", "poses"]
     coarse = _thinned(problem, state)
-    identities = [] if options.identity is not None else [["identity"]]
+    shape = ["focal"] if options.identity is not None else ["focal", "identity"]
     rest = ["expression", "joints", *(["size"] if options.size else [])]
     rest += ["principal"] if options.principal_point else []
     rest += ["k1"] if options.distortion else []
-    for added in ([], *identities, rest):
+    for added in ([], shape, rest):
         names = names + added
         free = _free(layout, start, names)
         minimum = minimize(_weighted(coarse, state), state, free, _COARSE_ITERATIONS, _COARSE_TOLERANCE)

@@ -33,6 +33,7 @@ class Start:
     rotations: Float[np.ndarray, "F 3 3"]
     positions: Float[np.ndarray, "F 3"]
     pixels_per_metre: float
+    first_view: int  # whose pose is known or defines the world
 
     def state(self, identity: Float[np.ndarray, "I"], expression_count: int, joint_count: int) -> State:
         """The state of a head without expression."""
@@ -116,6 +117,7 @@ def start_poses(observations: Observations, data: GNMData, options: FitOptions) 
         rotations=np.stack([frame[0] for frame in frames if frame is not None]),
         positions=np.stack([frame[1] for frame in frames if frame is not None]),
         pixels_per_metre=float(np.median(scales)),
+        first_view=pose_known.index(True),
     )
 
 
