@@ -5,7 +5,7 @@ anatomical terms; r are reprojection errors of landmarks.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -15,8 +15,8 @@ from registration.landmark_fit.landmark_model import LandmarkModel, differences
 from registration.landmark_fit.linear_system import ArrowSystem, Coordinates
 from registration.landmark_fit.options import FitOptions
 from registration.landmark_fit.state import Free, Layout, State
+from registration.landmark_fit.views import NEAR_M, ViewTerms, view_terms
 
-_NEAR_M = 1e-3  # depth below which a point counts as behind the camera
 _POSE_SCALE = 100.0  # damping of poses, which have no prior: that of a standard deviation of 0.1 rad or m
 _BEHIND = 1e8  # squared standard deviations of a landmark behind a camera
 
@@ -39,6 +39,7 @@ class Problem:
     first_view: int  # whose camera's frame is the world, if no pose is given
     principal_sigma_px: float
     expression_change: Float[np.ndarray, "Q Q"] | None  # information of the temporal prior on coefficients
+    reuse: bool = False  # second derivatives in several iterations, as landmarks are many
     spread_m: Float[np.ndarray, "L"] | None = None  # of the model's landmarks; part of a stage's `sigma_px`
 
     # ---- values
@@ -63,7 +64,7 @@ class Problem:
         """Squared reprojection errors over variances."""
         pixels, depth = self.project(state, v, world[rows])
         squared = (((pixels - self.points_px[f, v, rows]) / self.sigma_px[f, v, rows, None]) ** 2).sum(1)
-        return np.where(depth > _NEAR_M, np.minimum(np.nan_to_num(squared, nan=_BEHIND), _BEHIND), _BEHIND)
+        return np.where(depth > NEAR_M, np.minimum(np.nan_to_num(squared, nan=_BEHIND), _BEHIND), _BEHIND)
 
     def project(self, state: State, v: int, world: Float[np.ndarray, "M 3"]) -> tuple[np.ndarray, np.ndarray]:
         """Pixels and depths of world points in a view."""
@@ -160,45 +161,63 @@ class Problem:
         local, mixed = np.zeros((frames, n, n)), np.zeros((frames, n, m))
         shared, gradient, shared_gradient = np.zeros((m, m)), np.zeros((frames, n)), np.zeros(m)
         for f in range(frames):
-            for jacobian, residual in self._frame_rows(state, f, free):
-                own, both = jacobian[:, :n], jacobian[:, n:]
+            for jacobian, residual in [*self._frame_rows(state, f, free), *self._anatomy_rows(state, f, free)]:
                 product = jacobian.T @ jacobian
                 local[f] += product[:n, :n]
                 mixed[f] += product[:n, n:]
                 shared += product[n:, n:]
-                gradient[f] += own.T @ residual
-                shared_gradient += both.T @ residual
-        prior, prior_info, shared_prior, shared_info = self._prior_residuals(state)
+                pull = jacobian.T @ residual
+                gradient[f] += pull[:n]
+                shared_gradient += pull[n:]
+        _, prior_info, _, shared_info = self._prior_residuals(state)
         diagonal = np.arange(n)
         local[:, diagonal, diagonal] += prior_info[free.local]
-        gradient += prior[:, free.local]
         shared[np.arange(m), np.arange(m)] += shared_info[free.shared]
-        shared_gradient += shared_prior[free.shared]
+        local_prior, shared_prior = self._prior_gradient(state, free)
         neighbours = None
         if self.options.temporal is not None and frames > 1:
             information = self._change_information()[np.ix_(free.local, free.local)]
-            pull = self._changes(state) @ self._change_information()
             local[1:] += information
             local[:-1] += information
-            gradient[1:] += pull[:, free.local]
-            gradient[:-1] -= pull[:, free.local]
             neighbours = -information
         return ArrowSystem(
             local=local,
             neighbours=neighbours,
             mixed=mixed,
             shared=shared,
-            local_gradient=gradient,
-            shared_gradient=shared_gradient,
+            local_gradient=gradient + local_prior,
+            shared_gradient=shared_gradient + shared_prior,
             local_scale=np.where(prior_info > 0, prior_info, _POSE_SCALE)[free.local],
             shared_scale=np.where(shared_info > 0, shared_info, _POSE_SCALE)[free.shared],
         )
+
+    def with_gradient(self, system: ArrowSystem, state: State, free: Free) -> ArrowSystem:
+        """The system of another state with the gradient of this one."""
+        gradient, shared_gradient = self._prior_gradient(state, free)
+        for f in range(len(state.expression)):
+            local_pull, shared_pull = self._data_gradient(state, f)
+            gradient[f] += local_pull[free.local]
+            shared_gradient += shared_pull[free.shared]
+            for jacobian, residual in self._anatomy_rows(state, f, free):
+                pull = jacobian.T @ residual
+                gradient[f] += pull[: len(free.local)]
+                shared_gradient += pull[len(free.local) :]
+        return replace(system, local_gradient=gradient, shared_gradient=shared_gradient)
+
+    def _prior_gradient(self, state: State, free: Free) -> tuple[np.ndarray, np.ndarray]:
+        local, _, shared, _ = self._prior_residuals(state)
+        gradient = local[:, free.local]
+        if self.options.temporal is not None and len(gradient) > 1:
+            pull = (self._changes(state) @ self._change_information())[:, free.local]
+            gradient[1:] += pull
+            gradient[:-1] -= pull
+        return gradient, shared[free.shared]
 
     def coordinates(self, state: State, free: Free) -> Coordinates:
         """Unknowns in which a focal length changes the distance too, so that the head keeps its size in the image."""
         layout = self.layout
         n, m = len(free.local), len(free.shared)
-        along, within = np.zeros((len(state.position), n, m)), np.eye(m)
+        along, within = np.zeros((len(state.position), n, m)), np.zeros((m, m))
         position = np.searchsorted(free.local, np.arange(layout.local_count)[layout.local("position")])
         for v, group in enumerate(self.group):
             column = layout.shared("focal").start + int(group)
@@ -217,7 +236,7 @@ class Problem:
         return Coordinates(along=along, within=within)
 
     def _frame_rows(self, state: State, f: int, free: Free) -> Sequence[tuple[np.ndarray, np.ndarray]]:
-        """Weighted Jacobian (rows, n + m) and residuals of each view of a frame, and of its anatomy."""
+        """Weighted Jacobian (rows, n + m) and residuals of each view of a frame."""
         layout = self.layout
         wants = _wanted(layout, free)
         seen = np.isfinite(self.points_px[f, :, :, 0])
@@ -236,11 +255,13 @@ class Problem:
             world = self._world(state, f, posed.points)
             columns = self._world_columns(state, f, posed, world, free)
             for v in np.flatnonzero(seen.any(1)):
-                of_view = np.flatnonzero(seen[v, rows])
-                result.append(self._view_rows(state, f, v, world, columns, rows, of_view, free))
-        if self.anatomy is not None:
-            result += self.anatomy.rows(state.identity, state.expression[f], state.joints[f], layout, free)
+                result.append(self._view_rows(state, f, int(v), world, columns, rows, free))
         return result
+
+    def _anatomy_rows(self, state: State, f: int, free: Free) -> Sequence[tuple[np.ndarray, np.ndarray]]:
+        if self.anatomy is None:
+            return []
+        return self.anatomy.rows(state.identity, state.expression[f], state.joints[f], self.layout, free)
 
     def _world_columns(self, state, f, posed, world, free) -> Float[np.ndarray, "3 M n+m"]:  # type: ignore[no-untyped-def]
         """Derivatives of the world's points by the free columns; those of cameras are zero."""
@@ -278,53 +299,67 @@ class Problem:
                 first += width
         return columns
 
-    def _view_rows(self, state, f, v, world, columns, rows, of_view, free):  # type: ignore[no-untyped-def]
-        layout, group = self.layout, self.group[v]
-        R = state.view_rotations[v]
-        turned = world[of_view] @ R.T
-        local = turned + state.view_translations[v]
-        depth = np.where(np.abs(local[:, 2]) > _NEAR_M, local[:, 2], _NEAR_M)
-        ray = local[:, :2] / depth[:, None]
-        radius = (ray**2).sum(1)
-        k1, focal = state.k1[group], np.exp(state.log_focal[group])
-        stretch = 1 + k1 * radius
-        pixels = focal * stretch[:, None] * ray + state.principal_px[v]
-        chosen = rows[of_view]
-        sigma = self.sigma_px[f, v, chosen]
-        residual = (pixels - self.points_px[f, v, chosen]) / sigma[:, None]
-        squared = (residual**2).sum(1)
-        weight = np.sqrt(self.weights(squared)) * (local[:, 2] > _NEAR_M)
-        factor = weight / sigma
-        by_ray = stretch[:, None, None] * np.eye(2) + 2 * k1 * ray[:, :, None] * ray[:, None, :]
-        by_local = np.zeros((len(local), 2, 3))
-        by_local[:, 0, 0] = by_local[:, 1, 1] = 1 / depth
-        by_local[:, :, 2] = -ray / depth[:, None]
-        by_local = (focal * factor)[:, None, None] * (by_ray @ by_local)
-        by_world = by_local @ R
+    def _view_rows(
+        self, state: State, f: int, v: int, world: np.ndarray, columns: np.ndarray, rows: np.ndarray, free: Free
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Weighted Jacobian and residuals of the landmarks that one view shows; `columns` are of all of `world`."""
+        of_view = np.flatnonzero(np.isfinite(self.points_px[f, v, rows, 0]))
+        view = self._view(state, f, v, world[of_view], rows[of_view])
         part = columns if len(of_view) == columns.shape[1] else columns[:, of_view]
-        jacobian = np.empty((len(local), 2, columns.shape[2]))
+        jacobian = np.empty((len(of_view), 2, columns.shape[2]))
         for axis in range(2):
-            np.multiply(part[0], by_world[:, axis, 0, None], out=jacobian[:, axis])
-            jacobian[:, axis] += part[1] * by_world[:, axis, 1, None]
-            jacobian[:, axis] += part[2] * by_world[:, axis, 2, None]
-        for name, index, value in (
-            ("focal", [group], (focal * factor * stretch)[:, None, None] * ray[..., None]),
-            ("k1", [group], (focal * factor * radius)[:, None, None] * ray[..., None]),
-            ("principal", [2 * v, 2 * v + 1], factor[:, None, None] * np.eye(2)),
-            ("poses", range(6 * v, 6 * v + 6), _by_pose(turned, by_local)),
-        ):
-            start = layout.shared(name).start
-            for k, column in enumerate(index):
-                at = np.searchsorted(free.shared, start + column)
-                if at < len(free.shared) and free.shared[at] == start + column:
-                    jacobian[:, :, len(free.local) + at] += value[:, :, k]
-        return jacobian.reshape(-1, jacobian.shape[2]), (residual * weight[:, None]).ravel()
+            np.multiply(part[0], view.by_world[:, axis, 0, None], out=jacobian[:, axis])
+            jacobian[:, axis] += part[1] * view.by_world[:, axis, 1, None]
+            jacobian[:, axis] += part[2] * view.by_world[:, axis, 2, None]
+        for first, value in view.by_camera(self.layout, v, int(self.group[v])):
+            at, kept = _within(free.shared, first, value.shape[2])
+            jacobian[:, :, len(free.local) + at] += value[:, :, kept]
+        return jacobian.reshape(-1, jacobian.shape[2]), view.residual.ravel()
+
+    def _view(self, state: State, f: int, v: int, world: np.ndarray, rows: np.ndarray) -> ViewTerms:
+        return view_terms(
+            world,
+            self.points_px[f, v, rows],
+            self.sigma_px[f, v, rows],
+            self.weights,
+            rotation=state.view_rotations[v],
+            translation=state.view_translations[v],
+            focal=float(np.exp(state.log_focal[self.group[v]])),
+            k1=float(state.k1[self.group[v]]),
+            principal=state.principal_px[v],
+        )
+
+    def _data_gradient(self, state: State, f: int) -> tuple[np.ndarray, np.ndarray]:
+        """Gradient of a frame's landmark term by all columns, without the matrix of derivatives."""
+        layout = self.layout
+        local, shared = np.zeros(layout.local_count), np.zeros(layout.shared_count)
+        world = self.world(state, f)
+        forces = np.zeros_like(world)
+        for v in range(len(self.group)):
+            rows = np.flatnonzero(np.isfinite(self.points_px[f, v, :, 0]))
+            if not len(rows):
+                continue
+            view = self._view(state, f, v, world[rows], rows)
+            forces[rows] += np.einsum("maw,ma->mw", view.by_world, view.residual)
+            for first, value in view.by_camera(layout, v, int(self.group[v])):
+                shared[first : first + value.shape[2]] += np.einsum("mak,ma->k", value, view.residual)
+        arm, size, root = world - state.position[f], np.exp(state.log_size), state.joints[f, 0]
+        identity, expression, joints = self.model.pulled_back(
+            state.identity, state.expression[f], state.joints[f], size * forces @ root
+        )
+        local[layout.local("expression")] = expression
+        local[layout.local("joints")] = joints[3:]
+        local[layout.local("root")] = np.cross(arm, forces).sum(0) + joints[:3]
+        local[layout.local("position")] = forces.sum(0)
+        shared[layout.shared("identity")] += identity
+        shared[layout.shared("size")] += (arm * forces).sum()
+        return local, shared
 
 
-def _by_pose(turned: np.ndarray, by_local: np.ndarray) -> Float[np.ndarray, "M 2 6"]:
-    """Derivatives by a left rotation of R x, before the translation, and by the translation."""
-    rotation = np.cross(turned[:, None, :], by_local)  # by_local @ -[R x]x
-    return np.concatenate([rotation, by_local], 2)
+def _within(chosen: np.ndarray, first: int, count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Where columns first, first + 1, ... are among the chosen ones, and which of them are."""
+    at = np.flatnonzero((chosen >= first) & (chosen < first + count))
+    return at, chosen[at] - first
 
 
 def _wanted(layout: Layout, free: Free) -> set[str]:

@@ -39,10 +39,7 @@ def finished(
     status, reason = _judged(minimum, residual, sigmas, observations)
     expression = reduction.mean + state.expression @ reduction.basis.T
     size = float(np.exp(state.log_size))
-    root_joint = problem.model.joint_positions(state.identity)[0]
-    R = state.joints[:, 0]
-    translation = state.position - size * (R @ (problem.pivot - root_joint) + root_joint)
-    rotations = Rotation.from_matrix(state.joints.reshape(-1, 3, 3)).as_rotvec().reshape(len(R), -1, 3)
+    rotations, translation = _model_poses(problem, state, size)
     covariances = _covariances(problem, state, free, reduction)
     return LandmarkFit(
         status=status,
@@ -64,6 +61,20 @@ def finished(
         energy=minimum.energy,
         options=problem.options,
     )
+
+
+def _model_poses(problem: Problem, state: State, size: float) -> tuple[np.ndarray, np.ndarray]:
+    """Rotations (axis-angle) and translations as the GNM function has them."""
+    first = problem.model.joint_positions(state.identity)[0]
+    joints, translation = state.joints.copy(), np.empty_like(state.position)
+    for f, anchor in enumerate(state.joints[:, 0]):
+        turn, shift = problem.model.root(state.identity, state.joints[f])
+        joints[f, 0] = R = anchor @ turn.T
+        # size * (anchor @ (turn.T @ (y - shift) - pivot)) + position = size * (R @ (y - first) + first) + translation
+        moved = R @ (first - shift) - anchor @ problem.pivot - first
+        translation[f] = size * moved + state.position[f]
+    rotations = Rotation.from_matrix(joints.reshape(-1, 3, 3)).as_rotvec().reshape(len(joints), -1, 3)
+    return rotations, translation
 
 
 def _residuals(

@@ -3,9 +3,15 @@
 A landmark is a weighted mean of skinned vertices: sum_k w_k sum_j W_kj (R_j v_k + t_j). With the sums exchanged it is
 sum_j (R_j m_j + W_j t_j), where m_j = sum_k w_k W_kj v_k is linear in the coefficients. A pair is a landmark and a
 joint that moves it; most landmarks have one pair.
+
+Points are returned in the frame of one joint, the anchor: that of most of the points. The head then stays where it is
+when it turns relative to the neck, which landmarks of the face do not see.
 """
 
-from dataclasses import dataclass
+from collections.abc import Iterator
+from copy import copy
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -18,7 +24,7 @@ _MIN_WEIGHT = 1e-9  # of a pair
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Posed:
-    """Points at one state, root at rest: its rotation and translation act on them afterwards."""
+    """Points at one state, the anchor at rest: its rotation and translation act on them afterwards."""
 
     points: Float[np.ndarray, "L 3"]
     by_identity: Float[np.ndarray, "3 L I"] | None
@@ -90,6 +96,7 @@ class LandmarkModel:
                     corrective=None if corrective is None else carried(corrective),
                 )
             )
+        self.anchor = int(of_joint.sum(0).argmax())
         self.joint_count = joints
         self.has_correctives = corrective is not None
 
@@ -108,12 +115,13 @@ class LandmarkModel:
         by_expression: bool = False,
         by_joints: bool = False,
     ) -> Posed:
-        """Pose the points, the root at rest.
+        """Pose the points, the anchor at rest.
 
         Args:
             identity: coefficients, as `identity_map` takes them.
             expression: coefficients, as `expression_map` takes them.
-            joints: rotations relative to the parents; that of the root acts on pose correctives alone.
+            joints: rotations relative to the parents; the first is the anchor's in the world, on which pose correctives
+                alone depend here.
             rows: points that count, sorted; None: all.
             by_identity: return these derivatives.
             by_expression: return these derivatives.
@@ -124,19 +132,7 @@ class LandmarkModel:
         if rows is not None:
             where = np.full(self.count, -1)
             where[rows] = np.arange(count)
-        rest = self.joint_positions(identity)
-        chain, position = [np.eye(3)], [rest[0]]
-        chain_by_identity = [self.joint_basis[0]]
-        for j, parent in enumerate(self.parents[1:], start=1):
-            bone = rest[j] - rest[parent]
-            position.append(position[parent] + chain[parent] @ bone)
-            chain_by_identity.append(
-                chain_by_identity[parent] + chain[parent] @ (self.joint_basis[j] - self.joint_basis[parent])
-            )
-            chain.append(chain[parent] @ joints[j])
-        feature = None
-        if self.has_correctives:
-            feature = (joints - np.eye(3)).ravel()
+        chain = self._chain(identity, joints)
         points = np.zeros((3, count))
         identities = np.zeros((3, count, self.joint_basis.shape[2])) if by_identity else None
         expressions = np.zeros((3, count, len(expression))) if by_expression else None
@@ -150,46 +146,154 @@ class LandmarkModel:
                 if not len(own):
                     continue
                 target = where[part.rows[own]]
-            j, R, weight = part.joint, chain[part.joint], part.weight[own]
-            shift = position[j] - R @ rest[j]
-            local_points = part.mean[:, own] + part.identity[:, own] @ identity + part.expression[:, own] @ expression
-            if feature is not None and part.corrective is not None:
-                local_points = local_points + part.corrective[:, own] @ feature
-            moved = R @ local_points + weight * shift[:, None]
-            points[:, target] += moved
+                own = slice(None) if len(own) == len(part.rows) else own
+            R, weight = chain.rotations[part.joint], part.weight[own]
+            moved = R @ part.local(identity, expression, chain.feature, own) + weight * chain.shift(part.joint)[:, None]
+            _add(points, target, moved)
             if identities is not None:
-                shift_by_identity = chain_by_identity[j] - R @ self.joint_basis[j]
                 basis = part.identity[:, own]
-                identities[:, target] += (R @ basis.reshape(3, -1)).reshape(basis.shape)
-                identities[:, target] += weight[:, None] * shift_by_identity[:, None]
+                turned_basis = (R @ basis.reshape(3, -1)).reshape(basis.shape)
+                turned_basis += weight[:, None] * chain.shift_by_identity(part.joint)[:, None]
+                _add(identities, target, turned_basis)
             if expressions is not None:
                 basis = part.expression[:, own]
-                expressions[:, target] += (R @ basis.reshape(3, -1)).reshape(basis.shape)
+                _add(expressions, target, (R @ basis.reshape(3, -1)).reshape(basis.shape))
             if turned is not None:
-                self._add_turns(turned, target, j, moved, weight, chain, position)
+                for joint, axes in self._turning(part.joint, chain):
+                    arm = moved - weight * chain.positions[joint][:, None]
+                    turns = np.cross(axes.T[None, :, :], arm.T[:, None, :]).transpose(2, 0, 1)
+                    turned[:, target, 3 * joint : 3 * joint + 3] += turns
                 if part.corrective is not None:
-                    self._add_corrective_turns(turned, target, part.corrective[:, own], R, joints)
+                    by_local = _corrective_turns(part.corrective[:, own], joints)
+                    turned[:, target] += (R @ by_local.reshape(3, -1)).reshape(by_local.shape)
         return Posed(points=points.T, by_identity=identities, by_expression=expressions, by_joints=turned)
 
-    def _add_turns(self, turned, target, joint, moved, weight, chain, position) -> None:  # type: ignore[no-untyped-def]
-        """Points on a joint turn with each of its ancestors but the root, about that one's position."""
-        ancestor = joint
-        while ancestor > 0:
-            arm = moved - weight * position[ancestor][:, None]
-            axes = chain[self.parents[ancestor]]  # columns: the axes of the turn
-            turned[:, target, 3 * ancestor : 3 * ancestor + 3] += np.cross(
-                axes.T[None, :, :], arm.T[:, None, :]
-            ).transpose(2, 0, 1)
-            ancestor = self.parents[ancestor]
+    def subset(self, rows: np.ndarray) -> "LandmarkModel":
+        """The model of some of the points.
 
-    def _add_corrective_turns(self, turned, target, corrective, R, joints) -> None:  # type: ignore[no-untyped-def]
-        for j in range(self.joint_count):
-            for axis in range(3):
-                unit = np.zeros(3)
-                unit[axis] = 1
-                change = np.cross(unit, joints[j].T).T  # d (exp(d) R) = [d]x R, column by column
-                bind = corrective[:, :, 9 * j : 9 * j + 9] @ change.ravel()
-                turned[:, target, 3 * j + axis] += R @ bind
+        Args:
+            rows: of the points, sorted.
+        """
+        result = copy(self)
+        result.count, result._joints = len(rows), []
+        for part in self._joints:
+            _, own, target = np.intersect1d(part.rows, rows, assume_unique=True, return_indices=True)
+            if len(own):
+                result._joints.append(
+                    replace(
+                        part,
+                        rows=target,
+                        whole=len(own) == len(rows),
+                        weight=part.weight[own],
+                        mean=part.mean[:, own],
+                        identity=part.identity[:, own],
+                        expression=part.expression[:, own],
+                        corrective=None if part.corrective is None else part.corrective[:, own],
+                    )
+                )
+        return result
+
+    def pulled_back(
+        self,
+        identity: Float[np.ndarray, "I"],
+        expression: Float[np.ndarray, "E"],
+        joints: Float[np.ndarray, "J 3 3"],
+        forces: Float[np.ndarray, "L 3"],
+    ) -> tuple[Float[np.ndarray, "I"], Float[np.ndarray, "E"], Float[np.ndarray, "C"]]:
+        """Gradients of sum(forces * points) by identity, expression and joints, without the matrices of derivatives.
+
+        Args:
+            identity: coefficients.
+            expression: coefficients.
+            joints: rotations relative to the parents.
+            forces: gradient of a function by the points.
+        """
+        chain = self._chain(identity, joints)
+        by_identity, by_expression = np.zeros(len(identity)), np.zeros(len(expression))
+        by_joints = np.zeros(3 * self.joint_count)
+        for part in self._joints:
+            R, weight, own = chain.rotations[part.joint], part.weight, forces[part.rows].T
+            local = R.T @ own
+            flat = local.ravel()
+            by_identity += flat @ part.identity.reshape(len(flat), -1)
+            by_identity += (own @ weight) @ chain.shift_by_identity(part.joint)
+            by_expression += flat @ part.expression.reshape(len(flat), -1)
+            moved = R @ part.local(identity, expression, chain.feature) + weight * chain.shift(part.joint)[:, None]
+            for joint, axes in self._turning(part.joint, chain):
+                arm = moved - weight * chain.positions[joint][:, None]
+                by_joints[3 * joint : 3 * joint + 3] += axes.T @ np.cross(arm.T, own.T).sum(0)
+            if part.corrective is not None:
+                by_joints += np.einsum("dp,dpc->c", local, _corrective_turns(part.corrective, joints))
+        return by_identity, by_expression, by_joints
+
+    def _chain(self, identity: np.ndarray, joints: np.ndarray) -> "_Chain":
+        rest = self.joint_positions(identity)
+        rotations, positions, by_identity = [np.eye(3)], [rest[0]], [self.joint_basis[0]]
+        for j, parent in enumerate(self.parents[1:], start=1):
+            above = rotations[parent]
+            positions.append(positions[parent] + above @ (rest[j] - rest[parent]))
+            by_identity.append(by_identity[parent] + above @ (self.joint_basis[j] - self.joint_basis[parent]))
+            rotations.append(above @ joints[j])
+        back, origin, origin_by_identity = rotations[self.anchor].T, positions[self.anchor], by_identity[self.anchor]
+        feature = None
+        if self.has_correctives:
+            local = joints.copy()
+            local[0] = joints[0] @ back
+            feature = (local - np.eye(3)).ravel()
+        at = self.joint_basis[self.anchor]
+        return _Chain(
+            rest=rest,
+            rest_by_identity=self.joint_basis,
+            rotations=[back @ R for R in rotations],
+            positions=[back @ (p - origin) + rest[self.anchor] for p in positions],
+            positions_by_identity=[back @ (d - origin_by_identity) + at for d in by_identity],
+            feature=feature,
+        )
+
+    def root(
+        self, identity: Float[np.ndarray, "I"], joints: Float[np.ndarray, "J 3 3"]
+    ) -> tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, "3"]]:
+        """Rotation and translation that bring the pose with the anchor at rest to that with the root at rest."""
+        rest = self.joint_positions(identity)
+        R, position = np.eye(3), rest[0]
+        for j in reversed(list(self._path(self.anchor))):
+            position = position + R @ (rest[j] - rest[self.parents[j]])
+            R = R @ joints[j]
+        return R, position - R @ rest[self.anchor]
+
+    def _path(self, joint: int) -> Iterator[int]:
+        """A joint and its ancestors, without the root."""
+        while joint > 0:
+            yield joint
+            joint = self.parents[joint]
+
+    def _turning(self, joint: int, chain: "_Chain") -> Iterator[tuple[int, np.ndarray]]:
+        """Joints whose turns move the points of `joint` relative to the anchor, and the axes, as columns."""
+        own, of_anchor = set(self._path(joint)), set(self._path(self.anchor))
+        for j in own - of_anchor:
+            yield j, chain.rotations[self.parents[j]]
+        for j in of_anchor - own:
+            yield j, -chain.rotations[self.parents[j]]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Chain:
+    """The joints at one state, the anchor at rest."""
+
+    rest: Float[np.ndarray, "J 3"]
+    rest_by_identity: Float[np.ndarray, "J 3 I"]
+    rotations: list[np.ndarray]
+    positions: list[np.ndarray]
+    positions_by_identity: list[np.ndarray]
+    feature: Float[np.ndarray, "9J"] | None  # of pose correctives
+
+    def shift(self, joint: int) -> Float[np.ndarray, "3"]:
+        """Translation of the points that turn with a joint."""
+        return self.positions[joint] - self.rotations[joint] @ self.rest[joint]
+
+    def shift_by_identity(self, joint: int) -> Float[np.ndarray, "3 I"]:
+        """Its derivatives."""
+        return self.positions_by_identity[joint] - self.rotations[joint] @ self.rest_by_identity[joint]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -204,6 +308,30 @@ class _OfJoint:
     identity: Float[np.ndarray, "3 P I"]
     expression: Float[np.ndarray, "3 P E"]
     corrective: Float[np.ndarray, "3 P 9J"] | None
+
+    def local(
+        self, identity: np.ndarray, expression: np.ndarray, feature: np.ndarray | None, own: Any = slice(None)
+    ) -> Float[np.ndarray, "3 P"]:
+        """Points in the bind pose, with pose correctives, times their weights."""
+        points = self.mean[:, own] + self.identity[:, own] @ identity + self.expression[:, own] @ expression
+        return points if feature is None or self.corrective is None else points + self.corrective[:, own] @ feature
+
+
+def _add(total: np.ndarray, target: Any, part: np.ndarray) -> None:
+    if isinstance(target, slice):
+        total += part
+    else:
+        total[:, target] += part
+
+
+def _corrective_turns(corrective: Float[np.ndarray, "3 P 9J"], joints: np.ndarray) -> Float[np.ndarray, "3 P 3J"]:
+    """Derivatives of pose correctives by left rotations: d (exp(d) R) = [d]x R."""
+    result = np.empty((*corrective.shape[:2], 3 * len(joints)))
+    for j, joint in enumerate(joints):
+        for axis, unit in enumerate(np.eye(3)):
+            change = np.cross(unit, joint.T).T
+            result[:, :, 3 * j + axis] = corrective[:, :, 9 * j : 9 * j + 9] @ change.ravel()
+    return result
 
 
 def _mapped(basis: np.ndarray, columns: np.ndarray | None) -> np.ndarray:

@@ -12,6 +12,7 @@ from jaxtyping import Float
 from scipy.linalg import cho_factor, cho_solve, cholesky, solve_triangular
 
 _FLOOR = 1e-12  # of the diagonal, relative to its largest element: what nothing determines stays where it is
+_MAX_GROWTH = 0.7  # of the logarithm of a focal length in one step
 
 
 class NotPositive(Exception):
@@ -20,7 +21,10 @@ class NotPositive(Exception):
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Coordinates:
-    """Unknowns in which the problem is closer to linear: a step y is the step (y_f + along_f s, within s) before."""
+    """Unknowns in which the problem is closer to linear: logarithms s of focal lengths change distances too.
+
+    A step (y_f, s) is the step (y_f + along_f (exp(s) - 1), s + within (exp(s) - 1)) in the unknowns before.
+    """
 
     along: Float[np.ndarray, "F n m"]  # of shared unknowns, in those of the frames
     within: Float[np.ndarray, "m m"]
@@ -30,7 +34,7 @@ class Coordinates:
         columns = np.flatnonzero(np.abs(self.along).max((0, 1), initial=0) > 0)
         if not len(columns):
             return system
-        D, P = self.along[:, :, columns], self.within
+        D, P = self.along[:, :, columns], np.eye(len(self.within)) + self.within
         carried = system.local @ D  # the local matrix times the change of the frames
         if system.neighbours is not None:
             carried[:-1] += system.neighbours @ D[1:]
@@ -48,7 +52,8 @@ class Coordinates:
 
     def undone(self, local: np.ndarray, shared: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """The step in the unknowns before."""
-        return local + self.along @ shared, self.within @ shared
+        growth = np.expm1(np.clip(shared, -_MAX_GROWTH, _MAX_GROWTH))
+        return local + self.along @ growth, shared + self.within @ growth
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -15,7 +15,7 @@ from registration.landmark_fit.solver import Minimum, minimize
 from registration.landmark_fit.start import Start
 from registration.landmark_fit.state import Free, Layout, State, free_columns
 
-_MANY, _COARSE = 1500, 500  # landmarks above which stages before the last use so many of them
+_MANY, _COARSE = 1500, 700  # landmarks above which stages before the last use so many of them
 _COARSE_ITERATIONS = 12
 _COARSE_TOLERANCE = 0.3
 
@@ -70,7 +70,7 @@ def run_stages(
     )
     iterations = 0
     names = ["root", "position", "poses"]
-    coarse = _thinned(problem, state)
+    many = problem.points_px.shape[2] > _MANY
     shape = ["focal"] if options.identity is not None else ["focal", "identity"]
     rest = ["expression", "joints", *(["size"] if options.size else [])]
     rest += ["principal"] if options.principal_point else []
@@ -78,9 +78,11 @@ def run_stages(
     for added in ([], shape, rest):
         names = names + added
         free = _free(layout, start, names)
-        minimum = minimize(_weighted(coarse, state), state, free, _COARSE_ITERATIONS, _COARSE_TOLERANCE)
+        weighted = _weighted(problem, state)
+        coarse = _thinned(weighted) if many else weighted
+        minimum = minimize(coarse, state, free, _COARSE_ITERATIONS, _COARSE_TOLERANCE)
         state, iterations = minimum.state, iterations + minimum.iterations
-    last = replace(_weighted(problem, state), anatomy=anatomy, robust=options.robust)
+    last = replace(_weighted(problem, state), anatomy=anatomy, robust=options.robust, reuse=many)
     minimum = minimize(last, state, free, options.max_iterations, options.tolerance)
     return replace(minimum, iterations=iterations + minimum.iterations), last, free
 
@@ -100,15 +102,17 @@ def _free(layout: Layout, start: Start, names: list[str]) -> Free:
     return free_columns(layout, local, shared)
 
 
-def _thinned(problem: Problem, state: State) -> Problem:
-    """With a part of the landmarks, if they are many; their information stays about the same."""
+def _thinned(problem: Problem) -> Problem:
+    """With a part of the landmarks; their information stays about the same."""
     count = problem.points_px.shape[2]
-    if count <= _MANY:
-        return problem
     rows = np.unique(np.linspace(0, count - 1, _COARSE).round().astype(int))
-    points = np.full(problem.points_px.shape, np.nan)
-    points[:, :, rows] = problem.points_px[:, :, rows]
-    return replace(problem, points_px=points, sigma_px=problem.sigma_px * np.sqrt(len(rows) / count))
+    return replace(
+        problem,
+        model=problem.model.subset(rows),
+        points_px=problem.points_px[:, :, rows],
+        sigma_px=problem.sigma_px[:, :, rows] * np.sqrt(len(rows) / count),
+        anatomy=None,
+    )
 
 
 def _weighted(problem: Problem, state: State) -> Problem:

@@ -12,7 +12,8 @@ from registration.landmark_fit.landmark_model import turned
 class State:
     """Values of all unknowns: R identity and Q expression coefficients in the reduced basis, N views, G focal groups.
 
-    A point y of the posed model, root at rest, is at size * root @ (y - pivot) + position in the world.
+    A point y of the posed model, anchor at rest, is at size * R @ (y - pivot) + position in the world, with R the first
+    rotation of the joints.
     """
 
     identity: Float[np.ndarray, "R"]
@@ -23,7 +24,7 @@ class State:
     view_rotations: Float[np.ndarray, "N 3 3"]  # camera from world
     view_translations: Float[np.ndarray, "N 3"]
     expression: Float[np.ndarray, "F Q"]
-    joints: Float[np.ndarray, "F J 3 3"]  # relative to the parents; the first is the root
+    joints: Float[np.ndarray, "F J 3 3"]  # relative to the parents; the first is the anchor's in the world
     position: Float[np.ndarray, "F 3"]  # of the pivot, world, metres
 
 
