@@ -15,7 +15,7 @@ from registration.landmark_fit.landmark_model import LandmarkModel, differences
 from registration.landmark_fit.linear_system import ArrowSystem, Coordinates
 from registration.landmark_fit.options import FitOptions
 from registration.landmark_fit.state import Free, Layout, State
-from registration.landmark_fit.views import NEAR_M, ViewTerms, view_terms
+from registration.landmark_fit.views import NEAR_M, ViewState, ViewTerms, view_terms
 
 _POSE_SCALE = 100.0  # damping of poses, which have no prior: that of a standard deviation of 0.1 rad or m
 _BEHIND = 1e8  # squared standard deviations of a landmark behind a camera
@@ -317,17 +317,14 @@ class Problem:
         return jacobian.reshape(-1, jacobian.shape[2]), view.residual.ravel()
 
     def _view(self, state: State, f: int, v: int, world: np.ndarray, rows: np.ndarray) -> ViewTerms:
-        return view_terms(
-            world,
-            self.points_px[f, v, rows],
-            self.sigma_px[f, v, rows],
-            self.weights,
+        camera = ViewState(
             rotation=state.view_rotations[v],
             translation=state.view_translations[v],
-            focal=float(np.exp(state.log_focal[self.group[v]])),
+            focal_px=float(np.exp(state.log_focal[self.group[v]])),
             k1=float(state.k1[self.group[v]]),
-            principal=state.principal_px[v],
+            principal_px=state.principal_px[v],
         )
+        return view_terms(world, self.points_px[f, v, rows], self.sigma_px[f, v, rows], camera, self.weights)
 
     def _data_gradient(self, state: State, f: int) -> tuple[np.ndarray, np.ndarray]:
         """Gradient of a frame's landmark term by all columns, without the matrix of derivatives."""

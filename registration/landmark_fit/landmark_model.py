@@ -133,9 +133,9 @@ class LandmarkModel:
             where = np.full(self.count, -1)
             where[rows] = np.arange(count)
         chain = self._chain(identity, joints)
-        points = np.zeros((3, count))
-        identities = np.zeros((3, count, self.joint_basis.shape[2])) if by_identity else None
-        expressions = np.zeros((3, count, len(expression))) if by_expression else None
+        points: np.ndarray | None = None
+        identities: np.ndarray | None = None
+        expressions: np.ndarray | None = None
         turned = np.zeros((3, count, 3 * self.joint_count)) if by_joints else None
         for part in self._joints:
             if where is None:
@@ -149,15 +149,15 @@ class LandmarkModel:
                 own = slice(None) if len(own) == len(part.rows) else own
             R, weight = chain.rotations[part.joint], part.weight[own]
             moved = R @ part.local(identity, expression, chain.feature, own) + weight * chain.shift(part.joint)[:, None]
-            _add(points, target, moved)
-            if identities is not None:
+            points = _added(points, target, count, moved)
+            if by_identity:
                 basis = part.identity[:, own]
                 turned_basis = (R @ basis.reshape(3, -1)).reshape(basis.shape)
                 turned_basis += weight[:, None] * chain.shift_by_identity(part.joint)[:, None]
-                _add(identities, target, turned_basis)
-            if expressions is not None:
+                identities = _added(identities, target, count, turned_basis)
+            if by_expression:
                 basis = part.expression[:, own]
-                _add(expressions, target, (R @ basis.reshape(3, -1)).reshape(basis.shape))
+                expressions = _added(expressions, target, count, (R @ basis.reshape(3, -1)).reshape(basis.shape))
             if turned is not None:
                 for joint, axes in self._turning(part.joint, chain):
                     arm = moved - weight * chain.positions[joint][:, None]
@@ -166,6 +166,7 @@ class LandmarkModel:
                 if part.corrective is not None:
                     by_local = _corrective_turns(part.corrective[:, own], joints)
                     turned[:, target] += (R @ by_local.reshape(3, -1)).reshape(by_local.shape)
+        assert points is not None
         return Posed(points=points.T, by_identity=identities, by_expression=expressions, by_joints=turned)
 
     def subset(self, rows: np.ndarray) -> "LandmarkModel":
@@ -317,11 +318,14 @@ class _OfJoint:
         return points if feature is None or self.corrective is None else points + self.corrective[:, own] @ feature
 
 
-def _add(total: np.ndarray, target: Any, part: np.ndarray) -> None:
+def _added(total: np.ndarray | None, target: Any, count: int, part: np.ndarray) -> np.ndarray:
+    """The sum over joints; the part itself if it is the first and of all points."""
     if isinstance(target, slice):
-        total += part
-    else:
-        total[:, target] += part
+        return part if total is None else total + part
+    if total is None:
+        total = np.zeros((3, count, *part.shape[2:]))
+    total[:, target] += part
+    return total
 
 
 def _corrective_turns(corrective: Float[np.ndarray, "3 P 9J"], joints: np.ndarray) -> Float[np.ndarray, "3 P 3J"]:

@@ -12,6 +12,17 @@ NEAR_M = 1e-3  # depth below which a point counts as behind the camera
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
+class ViewState:
+    """A camera at one state."""
+
+    rotation: Float[np.ndarray, "3 3"]  # camera from world
+    translation: Float[np.ndarray, "3"]  # camera from world, metres
+    focal_px: float
+    k1: float
+    principal_px: Float[np.ndarray, "2"]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
 class ViewTerms:
     """Residuals over standard deviations of M landmarks, times the roots of their robust weights, and derivatives."""
 
@@ -34,13 +45,8 @@ def view_terms(
     world: Float[np.ndarray, "M 3"],
     points_px: Float[np.ndarray, "M 2"],
     sigma_px: Float[np.ndarray, "M"],
+    camera: ViewState,
     weights: Callable[[np.ndarray], np.ndarray],
-    *,
-    rotation: Float[np.ndarray, "3 3"],
-    translation: Float[np.ndarray, "3"],
-    focal: float,
-    k1: float,
-    principal: Float[np.ndarray, "2"],
 ) -> ViewTerms:
     """Compare landmarks with their pixels.
 
@@ -48,20 +54,17 @@ def view_terms(
         world: metres.
         points_px: observed.
         sigma_px: standard deviations.
+        camera: of the view.
         weights: robust weights of squared distances in standard deviations.
-        rotation: camera from world.
-        translation: camera from world, metres.
-        focal: px.
-        k1: radial distortion.
-        principal: px.
     """
+    rotation, focal, k1 = camera.rotation, camera.focal_px, camera.k1
     turned = world @ rotation.T
-    local = turned + translation
+    local = turned + camera.translation
     depth = np.where(np.abs(local[:, 2]) > NEAR_M, local[:, 2], NEAR_M)
     ray = local[:, :2] / depth[:, None]
     radius = (ray**2).sum(1)
     stretch = 1 + k1 * radius
-    pixels = focal * stretch[:, None] * ray + principal
+    pixels = focal * stretch[:, None] * ray + camera.principal_px
     residual = (pixels - points_px) / sigma_px[:, None]
     weight = np.sqrt(weights((residual**2).sum(1))) * (local[:, 2] > NEAR_M)
     factor = weight / sigma_px
