@@ -1,6 +1,6 @@
 """Triangulate landmarks over the views of a capture, robust to outliers and to miscalibrated views."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations
 
@@ -14,6 +14,7 @@ from registration.types import Camera, Capture, View
 
 MIN_CONFIDENCE = 0.5  # a 2D landmark is used above it
 MAX_PAIRS = 400  # of views that propose a point; 29 views have 406
+MAX_ERRORS = 1_000_000  # of proposals in views that are computed at once, 24 bytes each in the largest array
 MAX_RESIDUAL = 0.01  # of an inlier, as a fraction of the image's geometric mean side
 MAX_DEVIATION = 3.5  # of an inlier, as a multiple of its spread, where that is stated
 MIN_ANGLE = np.radians(0.5)  # between the widest two rays; below it depth is not determined
@@ -77,18 +78,25 @@ def triangulate_pixels(
 
     count = pixels.shape[1]
     points, used, residuals = np.full((count, 3), np.nan), np.zeros(count, np.int64), np.full(count, np.nan)
-    for landmark in range(count):
-        index = np.flatnonzero(observed[:, landmark])
-        if len(index) < 2:
-            continue
-        of_views = _Observations(
-            rays=rays[index, landmark], poses=poses[index], focals=focals[index], limits=limits[index, landmark]
-        )
-        solution = _solve(of_views, max_pairs, weighted=spread_px is not None)
-        if solution is not None:
-            points[landmark], inliers, residuals[landmark] = solution
-            used[landmark] = inliers.sum()
+    for landmarks, index in _batches(observed, max_pairs):
+        at = (index, landmarks[:, None])
+        of_views = _Observations(rays=rays[at], poses=poses[index], focals=focals[index], limits=limits[at])
+        points[landmarks], inliers, residuals[landmarks] = _solve(of_views, max_pairs, weighted=spread_px is not None)
+        used[landmarks] = inliers.sum(-1)
     return points + origin, used, residuals
+
+
+def _batches(
+    observed: Bool[np.ndarray, "N L"], max_pairs: int
+) -> Iterator[tuple[Int[np.ndarray, "B"], Int[np.ndarray, "B V"]]]:
+    """Landmarks that equally many views see, and those views; as many at once as memory holds easily."""
+    views = observed.sum(0)
+    for number in map(int, np.unique(views[views >= 2])):
+        alike = np.flatnonzero(views == number)
+        size = max(1, MAX_ERRORS // (min(max_pairs, number * (number - 1) // 2) * number))
+        for start in range(0, len(alike), size):
+            landmarks = alike[start : start + size]
+            yield landmarks, np.nonzero(observed[:, landmarks].T)[1].reshape(-1, number)
 
 
 def covariances(capture: Capture, scheme: str, points: Float[np.ndarray, "L 3"]) -> Float[np.ndarray, "L 3 3"]:
@@ -166,12 +174,12 @@ def _spreads_px(views: Sequence[View], scheme: str) -> Float[np.ndarray, "N L"] 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _Observations:
-    """One landmark in the views that see it."""
+    """Landmarks, each in the views that see it."""
 
-    rays: Float[np.ndarray, "N 2"]
-    poses: Float[np.ndarray, "N 3 4"]
-    focals: Float[np.ndarray, "N 2"]
-    limits: Float[np.ndarray, "N"]  # px, of an inlier's error
+    rays: Float[np.ndarray, "L N 2"]
+    poses: Float[np.ndarray, "L N 3 4"]
+    focals: Float[np.ndarray, "L N 2"]
+    limits: Float[np.ndarray, "L N"]  # px, of an inlier's error
 
 
 def _normalized(intrinsics: Float[np.ndarray, "3 3"], xy: Float[np.ndarray, "L 2"]) -> Float[np.ndarray, "L 2"]:
@@ -182,63 +190,65 @@ def _normalized(intrinsics: Float[np.ndarray, "3 3"], xy: Float[np.ndarray, "L 2
 
 def _solve(
     of_views: _Observations, max_pairs: int, *, weighted: bool
-) -> tuple[Float[np.ndarray, "3"], Bool[np.ndarray, "N"], float] | None:
-    """Solve one landmark: best pair, then its inliers together; `weighted`: a view counts by its limit.
+) -> tuple[Float[np.ndarray, "L 3"], Bool[np.ndarray, "L N"], Float[np.ndarray, "L"]]:
+    """Solve each landmark: best pair, then its inliers together; `weighted`: a view counts by its limit.
 
-    Returns the point, its inliers and its rms error (px); None if no two views agree or their rays are parallel.
+    Returns the points, their inliers and rms errors (px); NaN and no inliers where no two views agree or their rays are
+    parallel.
     """
     rays, poses, focals, limits = of_views.rays, of_views.poses, of_views.focals, of_views.limits
-    rows = rays[:, :, None] * poses[:, 2:3] - poses[:, :2]  # N 2 4: the two DLT equations of a view
-    pairs = np.array(list(combinations(range(len(rays)), 2)))
+    rows = rays[..., None] * poses[:, :, 2:3] - poses[:, :, :2]  # L N 2 4: the two DLT equations of a view
+    pairs = np.array(list(combinations(range(rays.shape[1]), 2)))
     if len(pairs) > max_pairs:
         pairs = pairs[np.linspace(0, len(pairs) - 1, max_pairs).astype(int)]
-    proposals = _null_points(rows[pairs].reshape(len(pairs), 4, 4))
-    errors = _errors(proposals, rays, poses, focals)  # P N, px
-    best = np.minimum(errors / limits, 1.0).sum(-1).argmin()
+    proposals = _null_points(rows[:, pairs].reshape(len(rays), len(pairs), 4, 4))
+    errors = _errors(proposals, of_views)  # L P N, px
+    best = np.arange(len(rays)), np.minimum(errors / limits[:, None], 1.0).sum(-1).argmin(-1)
     inliers = errors[best] < limits
     point = proposals[best]
-    weights = limits.min() / limits if weighted else np.ones(len(limits))
+    weights = limits.min(-1, keepdims=True) / limits if weighted else np.ones_like(limits)
     for _ in range(3):
-        if inliers.sum() < 2:
-            return None
+        inliers = inliers & (inliers.sum(-1, keepdims=True) >= 2)
         # Algebraic error is depth times reprojection error: dividing by the last depth leaves the latter.
-        depth = poses[inliers, 2, :3] @ point + poses[inliers, 2, 3]
-        scaled = rows[inliers] * (weights[inliers, None] * focals[inliers] / depth[:, None])[:, :, None]
-        point = _null_points(scaled.reshape(1, -1, 4))[0]
-        error = _errors(point[None], rays, poses, focals)[0]
-        inliers = error < limits
-    if inliers.sum() < 2 or _widest_angle(point, poses[inliers]) < MIN_ANGLE:
-        return None
-    return point, inliers, float(np.sqrt(np.mean(error[inliers] ** 2)))
+        depth = (poses[:, :, 2, :3] @ point[:, :, None])[..., 0] + poses[:, :, 2, 3]
+        scale = np.where(inliers, weights, 0.0) / np.where(inliers, depth, 1.0)
+        point = _null_points((rows * (scale[..., None] * focals)[..., None]).reshape(len(rays), 1, -1, 4))[:, 0]
+        error = _errors(point[:, None], of_views)[:, 0]
+        inliers = (error < limits) & inliers.any(-1, keepdims=True)
+    solved = (inliers.sum(-1) >= 2) & (_widest_angles(point, poses, inliers) >= MIN_ANGLE)
+    inliers &= solved[:, None]
+    squares = np.where(inliers, error, 0.0) ** 2
+    rms = np.sqrt(squares.sum(-1) / np.where(solved, inliers.sum(-1), np.nan))
+    return np.where(solved[:, None], point, np.nan), inliers, rms
 
 
-def _null_points(systems: Float[np.ndarray, "P R 4"]) -> Float[np.ndarray, "P 3"]:
+def _null_points(systems: Float[np.ndarray, "L P R 4"]) -> Float[np.ndarray, "L P 3"]:
     """Return the point that each homogeneous system maps closest to zero; very far away for points at infinity."""
-    solution = np.linalg.svd(systems, full_matrices=False)[2][:, -1]
-    scale = np.where(np.abs(solution[:, 3:]) < 1e-12, 1e-12, solution[:, 3:])
-    return solution[:, :3] / scale
+    solution = np.linalg.svd(systems, full_matrices=False)[2][..., -1, :]
+    scale = np.where(np.abs(solution[..., 3:]) < 1e-12, 1e-12, solution[..., 3:])
+    return solution[..., :3] / scale
 
 
-def _errors(
-    points: Float[np.ndarray, "P 3"],
-    rays: Float[np.ndarray, "N 2"],
-    poses: Float[np.ndarray, "N 3 4"],
-    focals: Float[np.ndarray, "N 2"],
-) -> Float[np.ndarray, "P N"]:
-    """Return reprojection errors in px; infinite behind a camera."""
-    local = np.einsum("nij,pj->pni", poses[:, :, :3], points) + poses[:, :, 3]
+def _errors(points: Float[np.ndarray, "L P 3"], of_views: _Observations) -> Float[np.ndarray, "L P N"]:
+    """Return reprojection errors of each landmark's points in px; infinite behind a camera."""
+    poses = of_views.poses[:, None]
+    local = (poses[..., :3] @ points[:, :, None, :, None])[..., 0] + poses[..., 3]  # L P N 3
     depth = local[..., 2]
     front = depth > 1e-9
     image = local[..., :2] / np.where(front, depth, 1.0)[..., None]
-    return np.where(front, np.linalg.norm((image - rays) * focals, axis=-1), np.inf)
+    distance = np.linalg.norm((image - of_views.rays[:, None]) * of_views.focals[:, None], axis=-1)
+    return np.where(front, distance, np.inf)
 
 
-def _widest_angle(point: Float[np.ndarray, "3"], poses: Float[np.ndarray, "N 3 4"]) -> float:
-    """Return the largest angle (rad) between the rays of two cameras to the point."""
-    centres = -np.einsum("nji,nj->ni", poses[:, :, :3], poses[:, :, 3])
-    rays = point - centres
+def _widest_angles(
+    points: Float[np.ndarray, "L 3"], poses: Float[np.ndarray, "L N 3 4"], inliers: Bool[np.ndarray, "L N"]
+) -> Float[np.ndarray, "L"]:
+    """Return the largest angle (rad) between the rays of two inlier cameras to each point; 0 without any."""
+    centres = -np.einsum("lnji,lnj->lni", poses[..., :3], poses[..., 3])
+    rays = points[:, None] - centres
     rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
-    return float(np.arccos(np.clip((rays @ rays.T).min(), -1.0, 1.0)))
+    cosines = np.where(inliers[:, :, None] & inliers[:, None], rays @ rays.transpose(0, 2, 1), 1.0)
+    return np.arccos(np.clip(cosines.min((1, 2)), -1.0, 1.0))
 
 
 def residuals(view: View, scheme: str, points: Float[np.ndarray, "L 3"]) -> Float[np.ndarray, "L"]:
