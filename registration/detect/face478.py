@@ -47,6 +47,7 @@ _JITTER = (
     ((0.01, -0.02), 1.06, -0.06),
     ((-0.01, -0.01), 0.94, 0.06),
 )
+_FOLLOWING = 3  # passes for a face that was in the frame before
 _CODE = 2  # raised when the same nets give other results
 
 
@@ -98,14 +99,35 @@ class Face478Provider:
         faces = [face for detection in detections if (face := self._refine(image, detection)) is not None]
         return distinct(faces)
 
+    def follow(self, image: UInt8[np.ndarray, "H W 3"], before: Face) -> Face | None:
+        """Return the face near a face of the frame before, from three passes, or None if there is none.
+
+        The first pass places the crop anew, so that motions of a third of the face's size do no harm.
+        """
+        points, presence = self._predict(image, _crop_of(before.points))
+        if presence < MIN_PRESENCE:
+            return None
+        return self._averaged(image, _crop_of(points[:, :2]), _JITTER[:_FOLLOWING], [presence], hints=False)
+
     def _refine(self, image: UInt8[np.ndarray, "H W 3"], detection: Detection) -> Face | None:
         points, presence = self._predict(image, detection.crop(SCALE))
         presences = [detection.score, presence]
         if min(presences) < MIN_PRESENCE:
             return None
-        crop = _crop_of(points[:, :2])
+        return self._averaged(image, _crop_of(points[:, :2]), _JITTER, presences)
+
+    def _averaged(
+        self,
+        image: UInt8[np.ndarray, "H W 3"],
+        crop: Crop,
+        changes: Sequence[tuple[tuple[float, float], float, float]],
+        presences: list[float],
+        *,
+        hints: bool = True,
+    ) -> Face | None:
+        """The mean of several passes around a crop; None if one of them sees no face."""
         passes = []
-        for shift, scale, turn in _JITTER:
+        for shift, scale, turn in changes:
             points, presence = self._predict(image, crop.moved(shift, scale, turn))
             if presence < MIN_PRESENCE:
                 return None
@@ -126,7 +148,7 @@ class Face478Provider:
             presence=least,
             box=np.concatenate([points.min(0), points.max(0)]),
             roll=crop.roll,
-            hints=self._blendshapes(crop.from_image(points)),
+            hints=self._blendshapes(crop.from_image(points)) if hints else {},
         )
 
     def _predict(self, image: UInt8[np.ndarray, "H W 3"], crop: Crop) -> tuple[Float[np.ndarray, "478 3"], float]:

@@ -43,3 +43,12 @@ class LandmarkProvider(Protocol):
     def detect(self, image: UInt8[np.ndarray, "H W 3"]) -> Sequence[Face]:
         """Return the faces in an image, red green blue, sRGB, without distortion; the most certain first."""
         ...
+
+
+@runtime_checkable
+class FollowingProvider(LandmarkProvider, Protocol):
+    """A provider that is quicker where a face was in the frame before."""
+
+    def follow(self, image: UInt8[np.ndarray, "H W 3"], before: Face) -> Face | None:
+        """Return the face near a face of the frame before, or None if there is none."""
+        ...

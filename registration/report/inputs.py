@@ -6,7 +6,7 @@ from dataclasses import dataclass, field, replace
 import cv2
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor
 
 from registration.frames import axis_angle_to_matrix
@@ -43,6 +43,17 @@ class HeatMap:
 
 
 @dataclass(frozen=True, kw_only=True)
+class PictureSection:
+    """A section of pictures at the head of a report."""
+
+    title: str
+    text: str  # below the title
+    pictures: tuple[tuple[str, UInt8[np.ndarray, "_ _ 3"]], ...] = ()  # caption and sRGB; sizes differ
+    svg: str = ""  # a chart; not escaped
+    limit_mm: float | None = None  # end of the colour scale of distances that the pictures use
+
+
+@dataclass(frozen=True, kw_only=True)
 class ReportInputs:
     """All inputs of the report's page."""
 
@@ -52,6 +63,7 @@ class ReportInputs:
     views: tuple[ReportView, ...] = ()  # those that are shown in full
     thumbnails: tuple[ReportView, ...] = ()  # all views, small
     class_names: tuple[str, ...] = ()
+    sections: tuple[PictureSection, ...] = ()  # before all others
     heat_map: HeatMap | None = None
     made: bytes | None = None  # a JPEG of the channels that were made from the photographs
     versions: Mapping[str, str] = field(default_factory=dict)

@@ -13,7 +13,7 @@ from registration.evaluate.residuals import RESIDUALS, residual_rows
 from registration.frames import linear_to_srgb
 from registration.report.charts import loss_curves
 from registration.report.heat_map import distance_paint, plain_paint, render_painted, scale_limit_mm, texture_paint
-from registration.report.inputs import HeatMap, ReportInputs, distance_heat_map
+from registration.report.inputs import HeatMap, PictureSection, ReportInputs, distance_heat_map
 from registration.report.pictures import CLASS_COLOURS, RgbImage, ViewImages, data_uri, view_images
 from registration.report.summary import figure_parts, format_duration
 from registration.report.templates import environment
@@ -41,6 +41,7 @@ def render_report(inputs: ReportInputs) -> str:
         subject=inputs.subject,
         expression=inputs.expression,
         parts_of_figures=figure_parts(registration),
+        picture_sections=[picture_section(section) for section in inputs.sections],
         measured=any(key in registration.figures for key in METRIC_TITLES),
         **_mesh(registration, inputs.heat_map),
         residual_rows=_residual_rows(registration.figures.get("residuals", {})),
@@ -65,6 +66,17 @@ def render_report(inputs: ReportInputs) -> str:
         inputs=registration.inputs,
         versions=inputs.versions,
     )
+
+
+def picture_section(section: PictureSection) -> dict[str, Any]:
+    """Return a section's contents for the macro `picture_sections` of parts.html."""
+    return {
+        "title": section.title,
+        "text": section.text,
+        "pictures": [(caption, data_uri(image)) for caption, image in section.pictures],
+        "svg": Markup(section.svg),
+        "limit_mm": section.limit_mm,
+    }
 
 
 def _mesh(registration: Registration, heat: HeatMap | None) -> dict[str, Any]:

@@ -36,7 +36,12 @@ FILES = {  # and what each is, for people
     "history.json": "the loss terms of every step",
     REPORT: "this page",
 }
-SPARSE = "sparse"  # a COLMAP model of the corrected cameras, where the fit corrected them
+SPARSE = "sparse"  # a COLMAP model of the corrected cameras, where the fit corrected or estimated them
+FIT_FILES = {  # of a fit to landmarks alone, and what each is
+    "overlay.jpg": "the mesh drawn over the images",
+    "uncertainty.npz": "posterior covariances and standard deviations",
+    "uncertainty.png": "standard deviations of the vertices as colours",
+}
 # Axis letters of the arrays in registration.npz; one letter is one length within a file.
 AXES = {
     "identity": "I",
@@ -96,7 +101,7 @@ def check_output_folder(out: Path) -> None:
     if out.is_dir() and (names := sorted(p.name for p in out.iterdir())):
         if not is_registration(out):
             raise InputError.output_folder(out, expected=ours, got=f"a folder that holds {_listed(names)}")
-        if foreign := [name for name in names if name not in (*FILES, SPARSE)]:
+        if foreign := [name for name in names if name not in (*FILES, *FIT_FILES, SPARSE)]:
             fix = "move these files elsewhere: they would be lost"
             raise InputError.output_folder(out, expected=ours, got=f"also {_listed(foreign)}", fix=fix)
     parent = out.parent
@@ -117,6 +122,7 @@ def save_registration(
     out: Path,
     report_html: str | None = None,
     write_sparse: Callable[[Path], None] | None = None,
+    write_fit_files: Callable[[Path], None] | None = None,
 ) -> Path:
     """Write the whole folder; one that we wrote before is replaced in one rename.
 
@@ -129,6 +135,7 @@ def save_registration(
         report_html: the content of `report.html`; None: no report.
         write_sparse: writes the COLMAP model of corrected cameras into the folder that it is given; None: there are
             none.
+        write_fit_files: writes some of `FIT_FILES` into the folder that it is given; None: there are none.
 
     Returns:
         The folder, as an absolute path.
@@ -153,6 +160,8 @@ def save_registration(
             (temporary / REPORT).write_text(report_html, encoding="utf-8")
         if write_sparse is not None:
             write_sparse(temporary / SPARSE)
+        if write_fit_files is not None:
+            write_fit_files(temporary)
         _manifest(registration, content_id(arrays, texture)).write(temporary / MANIFEST)
     return out
 

@@ -27,6 +27,7 @@ from workflows.cli import (
     coregister,
     export,
     farm,
+    fit,
     importing,
     model,
     register,
@@ -62,6 +63,7 @@ GROUPS: Mapping[str, Mapping[str, Command]] = {
         "dataset import": importing.import_dataset,
     },
     "Register": {
+        "fit": fit.fit,
         "register": register.register,
         "subject": register.subject,
         "batch": farm.batch,
