@@ -1,6 +1,6 @@
 """The anatomical term of a landmark fit: an interface."""
 
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float
@@ -8,6 +8,7 @@ from jaxtyping import Float
 from registration.landmark_fit.state import Free, Layout
 
 
+@runtime_checkable
 class Anatomy(Protocol):
     """Penalizes penetrations of parts of the head in one frame."""
 
