@@ -13,7 +13,7 @@ from registration.geometry.rasterizer import RayCaster
 from registration.geometry.topology import vertex_normals
 from registration.types import Camera
 
-Pixels = UInt8[np.ndarray, "H W 3"]
+Pixels = UInt8[np.ndarray, "_ _ 3"]
 OPACITY = 0.75  # of the mesh over the image
 _SKIN = np.array([196.0, 205.0, 214.0])  # sRGB
 _OUTLINE, _OBSERVED, _FITTED = (0, 214, 190), (255, 214, 60), (235, 40, 80)

@@ -17,7 +17,7 @@ from registration.errors import InputError
 
 _CODE = 1  # raised when the same provider gives other results here
 _NEAR = 1.0  # distance from the face before, relative to its size, up to which a face is the same one
-Pixels = UInt8[np.ndarray, "H W 3"]
+Pixels = UInt8[np.ndarray, "_ _ 3"]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

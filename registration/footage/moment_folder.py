@@ -33,7 +33,7 @@ _SHOWN = 12  # views in pictures
 _SIDE_PX = 720  # of a picture of one view
 _GREY = 0.35  # linear, of the texture: images are not compared
 _AGREEMENT_MM = 1.0  # standard deviation of a vertex at which its confidence is half of a certain one's
-Pixels = UInt8[np.ndarray, "H W 3"]
+Pixels = UInt8[np.ndarray, "_ _ 3"]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

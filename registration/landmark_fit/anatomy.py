@@ -25,6 +25,6 @@ class Anatomy(Protocol):
         joints: Float[np.ndarray, "J 3 3"],
         layout: Layout,
         free: Free,
-    ) -> list[tuple[Float[np.ndarray, "M n+m"], Float[np.ndarray, "M"]]]:
+    ) -> list[tuple[Float[np.ndarray, "M _"], Float[np.ndarray, "M"]]]:
         """Weighted Jacobians by the free columns, and residuals."""
         ...

@@ -263,7 +263,7 @@ class Problem:
             return []
         return self.anatomy.rows(state.identity, state.expression[f], state.joints[f], self.layout, free)
 
-    def _world_columns(self, state, f, posed, world, free) -> Float[np.ndarray, "3 M n+m"]:  # type: ignore[no-untyped-def]
+    def _world_columns(self, state, f, posed, world, free) -> Float[np.ndarray, "3 M _"]:  # type: ignore[no-untyped-def]
         """Derivatives of the world's points by the free columns; those of cameras are zero."""
         layout = self.layout
         size_root = np.exp(state.log_size) * state.joints[f, 0]

@@ -30,7 +30,7 @@ class LandmarkFit:
     identity_covariance: Float[np.ndarray, "I I"]  # posterior
     expression_sigma: Float[np.ndarray, "F E"]  # posterior standard deviation of each coefficient
     focal_sigma_px: Float[np.ndarray, "N"]  # posterior standard deviation; 0: given
-    shape_covariance: Float[np.ndarray, "I+E I+E"] | None  # posterior, of identity and the first frame's expression
+    shape_covariance: Float[np.ndarray, "S S"] | None  # posterior, of identity and first expression: S = I + E
     seconds: float
     iterations: int
     energy: float

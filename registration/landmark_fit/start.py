@@ -8,6 +8,7 @@ from jaxtyping import Float, Int
 from scipy.spatial.transform import Rotation
 
 from registration.errors import InputError
+from registration.landmark_fit.facing import check_facing
 from registration.landmark_fit.initial_pose import Orthographic, combined, orthographic, placed
 from registration.landmark_fit.observations import Observations
 from registration.landmark_fit.options import FitOptions
@@ -82,6 +83,7 @@ def start_poses(observations: Observations, data: GNMData, options: FitOptions) 
     centre = np.array([v.principal_px or (v.width_px / 2, v.height_px / 2) for v in views], np.float64)
     poses = [[orthographic(points, pixels, pivot) for pixels in frame] for frame in observations.points_px]
     _check_mirrored(observations, points, pivot, poses)
+    check_facing(observations, data, poses)
     focal = np.exp(log_focal)[group]
     heads = [
         [None if pose is None else placed(pose, focal[v], centre[v]) for v, pose in enumerate(frame)] for frame in poses

@@ -11,7 +11,11 @@ import registration.footage.moment as moment
 from registration.errors import InputError
 from registration.export.options import ExportOptions
 from registration.footage.fit import fit_footage
+from registration.footage.moment import read_moment
+from registration.footage.observed import Footage
 from registration.footage.options import FootageOptions
+from registration.footage.solve import read_identity, solver_options
+from registration.landmark_fit.fit import fit_landmarks
 from registration.progress import NullProgress
 from registration.storage.registration_folder import load_registration, read_manifest
 from tests.registration.footage import known
@@ -84,15 +88,23 @@ def test_the_same_inputs_are_not_fitted_again(image: Path, fitted: Path) -> None
     assert any("already holds" in text for text in messages.texts)
 
 
-def test_its_identity_is_taken_as_known(image: Path, fitted: Path, tmp_path: Path) -> None:
+def test_its_identity_is_taken_as_known(fitted: Path, tmp_path: Path) -> None:
+    identity = read_identity(fitted, known.DATA)
+    assert identity is not None and identity.offsets is None
     points = known.landmarks(known.camera(), known.parameters(turn=0.3, shift=0.02))
-    other = known.write_image(tmp_path / "other.png", known.picture(points))
-    given = known.write_json(tmp_path / "other.json", points)
-    options = FootageOptions(landmarks=given, focal=known.FOCAL, identity_from=fitted)
-    fit_footage(other, known.MODEL, tmp_path / "out", options)
-    assert np.array_equal(load_registration(tmp_path / "out").identity, load_registration(fitted).identity)
+    file = known.write_image(tmp_path / "other.png", known.picture(points))
+    options = FootageOptions(landmarks=known.write_json(tmp_path / "other.json", points), focal=known.FOCAL)
+    footage = read(file, options)
+    fit = fit_landmarks(footage.observations, known.DATA, solver_options(footage, options, identity))
+    assert np.array_equal(fit.identity, load_registration(fitted).identity.astype(np.float64))
     with pytest.raises(InputError, match="There is no identity"):
-        fit_footage(other, known.MODEL, tmp_path / "b", FootageOptions(landmarks=given, identity_from=tmp_path))
+        read_identity(tmp_path, known.DATA)
+
+
+def read(source: Path, options: FootageOptions) -> Footage:
+    schemes = {"68": known.SCHEME}
+    out = source.with_name("out")
+    return read_moment("views" if source.is_dir() else "image", source, schemes, options, out, NullProgress())
 
 
 def test_views_without_cameras_get_cameras(tmp_path: Path) -> None:
@@ -101,10 +113,16 @@ def test_views_without_cameras_get_cameras(tmp_path: Path) -> None:
         points = known.landmarks(known.camera(yaw), head)
         known.write_image(tmp_path / "views" / f"{name}.png", known.picture(points))
         known.write_json(tmp_path / "marks" / f"{name}.json", points)
-    fit_footage(tmp_path / "views", known.MODEL, tmp_path / "out", FootageOptions(landmarks=tmp_path / "marks"))
-    figures = read_manifest(tmp_path / "out").figures
-    assert len(figures["landmark_fit"]["focal_px"]) == 3 and len(set(figures["landmark_fit"]["focal_px"].values())) == 1
-    assert figures["landmark_fit"]["rms_px"] < 0.3
+    known.write_image(tmp_path / "views" / "unseen.png", known.picture(points))
+    options = FootageOptions(landmarks=tmp_path / "marks")
+    footage = read(tmp_path / "views", options)
+    assert [sight.name for sight in footage.sights] == ["front", "left", "right"]
+    assert footage.notes == ("unseen: no landmarks; left out",)
+    fit = fit_landmarks(footage.observations, known.DATA, solver_options(footage, options, None))
+    focal = {float(camera.intrinsics[0, 0]) for camera in fit.cameras}
+    assert len(focal) == 1 and fit.rms_px[0] < 0.3
+    looks = [camera.T_cam_world[2, :3] for camera in fit.cameras]
+    assert np.degrees(np.arccos(looks[1] @ looks[2])) == pytest.approx(np.degrees(0.8), abs=3)
 
 
 def detector(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, faces: dict[bytes, list[np.ndarray]]) -> known.KnownFaces:
@@ -114,21 +132,20 @@ def detector(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, faces: dict[bytes,
     return provider
 
 
-def test_the_largest_of_several_faces_is_fitted_and_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_largest_of_several_faces_is_chosen_and_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     near, far = (known.landmarks(known.camera(), known.parameters(2)) * scale for scale in (0.9, 0.3))
     pixels = known.picture(near)
     file = known.write_image(tmp_path / "two.png", pixels)
     provider = detector(monkeypatch, tmp_path, {pixels.tobytes(): [far, near]})
-    messages = Messages()
-    fit_footage(file, known.MODEL, tmp_path / "out", progress=messages)
-    assert any("2 faces; the largest is fitted" in text for text in messages.texts)
-    first = load_registration(tmp_path / "out")
-    calls = provider.calls
-    fit_footage(file, known.MODEL, tmp_path / "small", FootageOptions(face=2))
-    assert provider.calls == calls  # cached by the content of the pixels
-    assert load_registration(tmp_path / "small").translation[2] > 2 * first.translation[2]
+    footage = read(file, FootageOptions())
+    assert "2 faces; the largest is fitted" in footage.notes[0] and footage.detected
+    assert np.allclose(footage.observations.points_px[0, 0], near)
+    assert provider.calls == 1
+    footage = read(file, FootageOptions(face=2))
+    assert np.allclose(footage.observations.points_px[0, 0], far) and "number 2 by size" in footage.notes[0]
+    assert provider.calls == 1  # cached by the content of the pixels
     with pytest.raises(InputError, match="There is no such face"):
-        fit_footage(file, known.MODEL, tmp_path / "none", FootageOptions(face=3))
+        read(file, FootageOptions(face=3))
 
 
 def test_no_face_is_shown_in_a_picture(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -147,10 +164,11 @@ def test_too_few_points_and_mirrored_ones_are_refused(image: Path, tmp_path: Pat
     (tmp_path / "few.json").write_text(json.dumps({"68": rows}))
     with pytest.raises(InputError, match="Too few landmarks"):
         fit_footage(image, known.MODEL, tmp_path / "out", FootageOptions(landmarks=tmp_path / "few.json"))
-    mirrored = known.landmarks(known.camera(0.5), known.parameters()) * [-1, 1] + [known.SIZE[0], 0]
-    given = known.write_json(tmp_path / "mirrored.json", mirrored)
-    with pytest.raises(InputError, match="mirrored"):
-        fit_footage(image, known.MODEL, tmp_path / "out", FootageOptions(landmarks=given))
+    for yaw in (0.0, 0.5):
+        mirrored = known.landmarks(known.camera(yaw), known.parameters()) * [-1, 1] + [known.SIZE[0], 0]
+        given = known.write_json(tmp_path / "mirrored.json", mirrored)
+        with pytest.raises(InputError, match="mirrored"):
+            fit_footage(image, known.MODEL, tmp_path / "out", FootageOptions(landmarks=given))
     assert not (tmp_path / "out").exists()
 
 
