@@ -20,7 +20,7 @@ def fit(
     force: bool = False,
     footage: FootageOptions = _DEFAULTS,
 ) -> int:
-    """Fit the head model to the landmarks of an image, of images of one moment, of a capture or of a video.
+    """Fit the head model to landmarks in an image, several images, or a capture.
 
     Needs no cameras: those of images and videos are estimated. The mesh is the model's, without offsets. One moment
     gives a registration's folder.
