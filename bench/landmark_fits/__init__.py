@@ -1,0 +1,1 @@
+"""The experiments of `bench.landmark_fit`, one module each, and the synthetic pictures they share."""
