@@ -6,6 +6,7 @@ from collections.abc import Iterable, Iterator
 import numpy as np
 
 from registration.errors import InputError
+from registration.landmark_fit.anatomy import Anatomy
 from registration.landmark_fit.finish import finished
 from registration.landmark_fit.landmark_model import LandmarkModel
 from registration.landmark_fit.observations import MIN_POINTS, Observations
@@ -78,9 +79,11 @@ class _Prepared:
 
     def __init__(self, scheme: LandmarkScheme, data: GNMData, options: FitOptions):
         self.scheme, self._data, self._options = scheme, data, options
-        self._restricted: tuple[Reduction, LandmarkModel] | None = None
+        self._restricted: tuple[Reduction, LandmarkModel, Anatomy | None] | None = None
 
-    def _model(self, observations: Observations, pixels_per_metre: float) -> tuple[Reduction, LandmarkModel]:
+    def _model(
+        self, observations: Observations, pixels_per_metre: float
+    ) -> tuple[Reduction, LandmarkModel, Anatomy | None]:
         information = information_per_metre(observations, pixels_per_metre)
         if self._restricted is None or not self._restricted[0].covers(information):
             reduction = reduce_expression(self._data, observations, self._options, information)
@@ -92,15 +95,18 @@ class _Prepared:
                 expression_mean=reduction.mean,
                 offsets=self._options.offsets,
             )
-            self._restricted = (reduction, model)
+            anatomy = None
+            if self._options.anatomy > 0:
+                anatomy = Anatomy(self._data, reduction, self._options.anatomy, self._options.offsets)
+            self._restricted = (reduction, model, anatomy)
         return self._restricted
 
     def fit(self, observations: Observations) -> LandmarkFit:
         began = time.perf_counter()
         options = self._options
         start = start_poses(observations, self._data, options)
-        reduction, model = self._model(observations, start.pixels_per_metre)
+        reduction, model, anatomy = self._model(observations, start.pixels_per_metre)
         identity = np.zeros(len(self._data.vertex_identity_basis)) if options.identity is None else options.identity
         state = start.state(identity.astype(np.float64), reduction.basis.shape[1], model.joint_count)
-        minimum, problem, free = run_stages(observations, options, start, state, model, reduction, None)
+        minimum, problem, free = run_stages(observations, options, start, state, model, reduction, anatomy)
         return finished(minimum, problem, free, observations, reduction, time.perf_counter() - began)

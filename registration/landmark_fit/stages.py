@@ -17,6 +17,7 @@ from registration.landmark_fit.state import Free, Layout, State, free_columns
 
 _MANY, _COARSE = 1500, 700  # landmarks above which stages before the last use so many of them
 _COARSE_ITERATIONS = 12
+_SOFT = 2.0  # factor of the anatomical term's standard deviations before the last stage
 _COARSE_TOLERANCE = 0.3
 
 
@@ -80,7 +81,9 @@ def run_stages(
         free = _free(layout, start, names)
         weighted = _weighted(problem, state)
         coarse = _thinned(weighted) if many else weighted
-        minimum = minimize(coarse, state, free, _COARSE_ITERATIONS, _COARSE_TOLERANCE)
+        # The robust stage must not begin with parts in one another: it would give up landmarks for them.
+        soft = anatomy.softened(_SOFT) if anatomy is not None and added is rest else None
+        minimum = minimize(replace(coarse, anatomy=soft), state, free, _COARSE_ITERATIONS, _COARSE_TOLERANCE)
         state, iterations = minimum.state, iterations + minimum.iterations
     last = replace(_weighted(problem, state), anatomy=anatomy, robust=options.robust, reuse=many)
     minimum = minimize(last, state, free, options.max_iterations, options.tolerance)
