@@ -19,6 +19,7 @@ from registration.evaluate.verdict import judge
 from registration.evaluate.viewpoint import intersection_figures
 from registration.fit import camera_refinement
 from registration.fit.context import FitContext
+from registration.fit.landmark_start import seen_landmarks
 from registration.fit.problem import FitProblem, FitTrace
 from registration.fit.recipes import Stage
 from registration.fit.start import initial_guess
@@ -193,6 +194,7 @@ def _context(inputs: RegistrationInputs, seed: int, device: torch.device, progre
         else replace(inputs.neutral, translation=inputs.neutral.translation - inputs.origin),
         triangulated={name: points - inputs.origin for name, points in inputs.landmarks.items()},
         triangulated_spread_m=inputs.landmark_spread_m,
+        seen_landmarks=seen_landmarks(capture, inputs.schemes),
         scan=planes,
         camera_sigma_px=camera_refinement.level_sigma_px(inputs.camera_sigma_px, inputs.capture, pyramid[0]),
     )

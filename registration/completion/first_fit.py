@@ -10,6 +10,7 @@ from jaxtyping import Float
 from registration.capture.triangulation import spreads_m, triangulate
 from registration.fit.context import FitContext
 from registration.fit.initialization import MIN_LANDMARKS
+from registration.fit.landmark_start import seen_landmarks
 from registration.fit.problem import FitProblem
 from registration.fit.recipes import Recipe, expression_recipe, in_model
 from registration.fit.start import initial_guess
@@ -141,6 +142,7 @@ class HeadFitter:
             neutral=self._neutral,
             triangulated=triangulated,
             triangulated_spread_m=spreads_m(capture, triangulated),
+            seen_landmarks=seen_landmarks(capture, self.schemes),
         )
 
 

@@ -13,6 +13,7 @@ from registration.fit.recipes import Recipe
 from registration.fit.variables import skin_triangles, skin_vertices
 from registration.geometry.large_steps import normalised_laplacian, spacing
 from registration.geometry.nearest_planes import NearestPlanes
+from registration.landmark_fit.observations import Observations
 from registration.losses import depth
 from registration.losses.scan import ScanDistance
 from registration.losses.self_intersection import SelfIntersectionPenalty
@@ -47,6 +48,7 @@ class FitContext:
     triangulated: Mapping[str, Float[np.ndarray, "L 3"]] = field(default_factory=dict)
     # Standard deviation of these along each axis, metres, of schemes whose detector states its spread.
     triangulated_spread_m: Mapping[str, Float[np.ndarray, "L"]] = field(default_factory=dict)
+    seen_landmarks: Observations | None = None  # the same landmarks in the views
     scan: NearestPlanes | None = None  # whose surface is fitted; world, metres
     # Expected error of each given camera, rms shift of the head's points, px of level 0; None: cameras are exact.
     camera_sigma_px: Float[np.ndarray, "N"] | None = None

@@ -14,6 +14,7 @@ from registration.fit.initialization import (
     from_landmarks,
     from_masks,
 )
+from registration.fit.landmark_start import refined
 from registration.fit.problem import assess, refine
 from registration.fit.variables import InitialGuess, initial_guess_from, pivot
 from registration.model.landmarks import LandmarkScheme
@@ -23,8 +24,9 @@ from registration.types import HeadPose, Parameters, Registration
 def initial_guess(context: FitContext, head: HeadPose | None = None) -> InitialGuess:
     """Return the initial guess of a fit.
 
-    From landmarks, if model and capture share a scheme; else from the neutral's pose, if it covers the masks; else the
-    given pose; else the best of many head poses at the masks' common centre.
+    From landmarks, if model and capture share a scheme: in closed form from triangulated ones, then refined in the
+    views, from linear equations where none are triangulated; else from the neutral's pose, if it covers the masks; else
+    the given pose; else the best of many head poses at the masks' common centre.
 
     Args:
         context: its triangulated landmarks, neutral and masks are used.
@@ -43,11 +45,15 @@ def initial_guess(context: FitContext, head: HeadPose | None = None) -> InitialG
     counts = {name: int(np.isfinite(points).all(1).sum()) for name, points in context.triangulated.items()}
     best = max(counts, key=lambda name: counts[name], default=None)
     if best is not None and counts[best] >= MIN_LANDMARKS:
-        free_scale = context.recipe.scale
         if any(context.landmark_spread_m(name) is not None for name in counts):
-            return _from_all_schemes(context, neutral)
-        scheme, points = context.schemes[best], context.triangulated[best]
-        return from_landmarks(context.data, scheme, points, free_scale=free_scale, neutral=neutral)
+            closed = _from_all_schemes(context, neutral)
+        else:
+            scheme, points = context.schemes[best], context.triangulated[best]
+            closed = from_landmarks(context.data, scheme, points, free_scale=context.recipe.scale, neutral=neutral)
+        return _refined(context, closed, neutral) or closed
+    alone = _refined(context, None, neutral)
+    if alone is not None:
+        return alone
     if neutral is not None and assess(context, neutral).overlap >= MIN_OVERLAP:
         return replace(neutral, notes=("no landmarks: starting from the neutral's pose",))
     if head is not None:
@@ -55,6 +61,12 @@ def initial_guess(context: FitContext, head: HeadPose | None = None) -> InitialG
         note = "no landmarks: starting from the head's pose in capture.toml"
         return InitialGuess(rotation=head.rotation, position=position, scale=head.scale, notes=(note,))
     return from_masks(context.data, context.pyramid[-1], partial(assess, context), partial(refine, context))
+
+
+def _refined(context: FitContext, guess: InitialGuess | None, neutral: InitialGuess | None) -> InitialGuess | None:
+    if context.seen_landmarks is None:
+        return None
+    return refined(context.data, context.seen_landmarks, guess, neutral=neutral, size=context.recipe.scale)
 
 
 def _from_all_schemes(context: FitContext, neutral: InitialGuess | None) -> InitialGuess:

@@ -111,7 +111,7 @@ class Problem:
         shared, info = np.zeros(layout.shared_count), np.zeros(layout.shared_count)
         for name, value, sigma in (
             ("identity", state.identity, 1.0),
-            ("size", state.log_size, options.log_size),
+            ("size", state.log_size - np.log(options.scale), options.log_size),
             ("focal", state.log_focal - self.log_focal_mean, options.log_focal),
             ("principal", (state.principal_px - self.centre_px).ravel(), self.principal_sigma_px),
             ("k1", state.k1, options.distortion_sigma),
@@ -128,7 +128,7 @@ class Problem:
             total += 0.5 * float(np.einsum("fi,ij,fj->", change, self._change_information(), change))
         return total
 
-    def _changes(self, state: State) -> Float[np.ndarray, "F-1 n"]:
+    def _changes(self, state: State) -> Float[np.ndarray, "_ n"]:
         layout = self.layout
         change = np.zeros((len(state.expression) - 1, layout.local_count))
         change[:, layout.local("expression")] = np.diff(state.expression, axis=0)

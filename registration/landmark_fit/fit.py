@@ -1,7 +1,7 @@
 """The model fitted to landmarks: `fit_landmarks`, and `fit_many` for independent subjects."""
 
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 
 import numpy as np
 
@@ -17,9 +17,15 @@ from registration.landmark_fit.stages import run_stages
 from registration.landmark_fit.start import start_poses
 from registration.model.gnm_npz import GNMData
 from registration.model.landmarks import LandmarkScheme
+from registration.types import HeadPose
 
 
-def fit_landmarks(observations: Observations, data: GNMData, options: FitOptions | None = None) -> LandmarkFit:
+def fit_landmarks(
+    observations: Observations,
+    data: GNMData,
+    options: FitOptions | None = None,
+    poses: Sequence[HeadPose] | None = None,
+) -> LandmarkFit:
     """Fit identity, expressions, poses and unknown cameras to landmarks in images by Levenberg-Marquardt.
 
     Stages (Wood 2022): pose and focal length; identity; everything; everything with robust weights.
@@ -28,6 +34,8 @@ def fit_landmarks(observations: Observations, data: GNMData, options: FitOptions
         observations: of one subject, in one frame or several, one view or several.
         data: the model.
         options: what is estimated, and the priors.
+        poses: of the head in each frame, where the fit begins, if the cameras' poses are known; None: estimated by
+            linear equations.
 
     Returns:
         The fit; its status says whether it converged.
@@ -36,7 +44,8 @@ def fit_landmarks(observations: Observations, data: GNMData, options: FitOptions
         InputError: fewer than `MIN_POINTS` landmarks are seen in a frame, landmarks are mirrored, or no view can be
             posed.
     """
-    return next(fit_many([observations], data, options))
+    _check(observations)
+    return _Prepared(observations.scheme, data, options or FitOptions()).fit(observations, poses)
 
 
 def fit_many(batch: Iterable[Observations], data: GNMData, options: FitOptions | None = None) -> Iterator[LandmarkFit]:
@@ -101,12 +110,14 @@ class _Prepared:
             self._restricted = (reduction, model, anatomy)
         return self._restricted
 
-    def fit(self, observations: Observations) -> LandmarkFit:
+    def fit(self, observations: Observations, poses: Sequence[HeadPose] | None = None) -> LandmarkFit:
         began = time.perf_counter()
         options = self._options
         start = start_poses(observations, self._data, options)
+        if poses is not None:
+            start = start.at(poses)
         reduction, model, anatomy = self._model(observations, start.pixels_per_metre)
         identity = np.zeros(len(self._data.vertex_identity_basis)) if options.identity is None else options.identity
-        state = start.state(identity.astype(np.float64), reduction.basis.shape[1], model.joint_count)
+        state = start.state(identity.astype(np.float64), reduction.basis.shape[1], model.joint_count, options.scale)
         minimum, problem, free = run_stages(observations, options, start, state, model, reduction, anatomy)
         return finished(minimum, problem, free, observations, reduction, time.perf_counter() - began)

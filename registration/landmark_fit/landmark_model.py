@@ -286,7 +286,7 @@ class _Chain:
     rotations: list[np.ndarray]
     positions: list[np.ndarray]
     positions_by_identity: list[np.ndarray]
-    feature: Float[np.ndarray, "9J"] | None  # of pose correctives
+    feature: Float[np.ndarray, "_"] | None  # of pose correctives
 
     def shift(self, joint: int) -> Float[np.ndarray, "3"]:
         """Translation of the points that turn with a joint."""
@@ -308,7 +308,7 @@ class _OfJoint:
     mean: Float[np.ndarray, "3 P"]
     identity: Float[np.ndarray, "3 P I"]
     expression: Float[np.ndarray, "3 P E"]
-    corrective: Float[np.ndarray, "3 P 9J"] | None
+    corrective: Float[np.ndarray, "3 P _"] | None
 
     def local(
         self, identity: np.ndarray, expression: np.ndarray, feature: np.ndarray | None, own: Any = slice(None)
@@ -328,7 +328,7 @@ def _added(total: np.ndarray | None, target: Any, count: int, part: np.ndarray) 
     return total
 
 
-def _corrective_turns(corrective: Float[np.ndarray, "3 P 9J"], joints: np.ndarray) -> Float[np.ndarray, "3 P 3J"]:
+def _corrective_turns(corrective: Float[np.ndarray, "3 P _"], joints: np.ndarray) -> Float[np.ndarray, "3 P _"]:
     """Derivatives of pose correctives by left rotations: d (exp(d) R) = [d]x R."""
     result = np.empty((*corrective.shape[:2], 3 * len(joints)))
     for j, joint in enumerate(joints):

@@ -52,6 +52,8 @@ class Observations:
     sigma_px: Float[np.ndarray, "F N L"]  # standard deviation along each axis
 
     def __post_init__(self) -> None:
+        for name in ("points_px", "sigma_px"):
+            object.__setattr__(self, name, np.asarray(getattr(self, name), np.float64))
         shape = (len(self.points_px), len(self.views), len(self.scheme.indices))
         if self.points_px.shape != (*shape, 2) or self.sigma_px.shape != shape:
             raise InputError(

@@ -16,11 +16,11 @@ class ExpressionPrior:
 
 @dataclass(frozen=True, kw_only=True)
 class TemporalPrior:
-    """Standard deviations of what changes from one frame to the next."""
+    """Standard deviations of what changes from one frame to the next, of a talking head at 30 frames a second."""
 
     expression: float = 0.3  # coefficients
-    rotation: float = 0.02  # of root and joints, radians
-    translation_m: float = 2e-3
+    rotation: float = 0.01  # of root and joints, radians
+    translation_m: float = 7e-4
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -37,7 +37,8 @@ class FitOptions:
     principal_sigma: float = 0.02  # relative to the image's width
     distortion: bool = False  # estimate one radial coefficient of each group of views
     distortion_sigma: float = 0.1
-    size: bool = False  # estimate the head's size relative to the model's
+    scale: float = 1.0  # the head's size relative to the model's
+    size: bool = False  # estimate it, about `scale`
     log_size: float = 0.1
     temporal: TemporalPrior | None = None  # None: frames are independent but for the identity
     robust: bool = True  # Geman-McClure weights in the last stage

@@ -119,14 +119,18 @@ def _thinned(problem: Problem) -> Problem:
 
 
 def _weighted(problem: Problem, state: State) -> Problem:
-    """With standard deviations that contain the spread of the model's landmarks, in pixels at their depth."""
+    """With standard deviations that contain the spread of the model's landmarks, in pixels at their depth.
+
+    A landmark that is elsewhere on the model is so in all views: together they count as one.
+    """
     sigma = problem.sigma_px**2
     spread = problem.spread_m
     if spread is not None:
+        spread = spread * np.sqrt(np.maximum(np.isfinite(problem.points_px[..., 0]).sum(1), 1))  # F L
         for f in range(len(sigma)):
             world = problem.world(state, f)
             for v in range(sigma.shape[1]):
                 depth = world @ state.view_rotations[v, 2] + state.view_translations[v, 2]
                 scale: Float[np.ndarray, L] = np.exp(state.log_focal[problem.group[v]]) / np.maximum(depth, 0.05)
-                sigma[f, v] += (spread * scale * np.exp(state.log_size)) ** 2
+                sigma[f, v] += (spread[f] * scale * np.exp(state.log_size)) ** 2
     return replace(problem, sigma_px=np.sqrt(sigma * problem.options.correlated))

@@ -1,7 +1,7 @@
 """Where a landmark fit begins: the mean head, posed from each frame's and view's landmarks by linear equations."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -9,14 +9,14 @@ from scipy.spatial.transform import Rotation
 
 from registration.errors import InputError
 from registration.landmark_fit.facing import check_facing
-from registration.landmark_fit.initial_pose import Orthographic, combined, orthographic, placed
+from registration.landmark_fit.initial_pose import combined, orthographic, placed
 from registration.landmark_fit.observations import Observations
 from registration.landmark_fit.options import FitOptions
 from registration.landmark_fit.state import State
 from registration.model.gnm_npz import GNMData
+from registration.types import HeadPose
 
 _MIN_ANGLE = np.radians(3.0)  # between the rays of two views, for a position by intersection
-_MIRRORED = 0.6  # of the residual of the landmarks as given: then they are mirrored
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -36,14 +36,22 @@ class Start:
     pixels_per_metre: float
     first_view: int  # whose pose is known or defines the world
 
-    def state(self, identity: Float[np.ndarray, "I"], expression_count: int, joint_count: int) -> State:
+    def at(self, poses: Sequence[HeadPose]) -> "Start":
+        """The same with these poses of the head in the frames."""
+        return replace(
+            self,
+            rotations=np.stack([pose.rotation for pose in poses]),
+            positions=np.stack([pose.scale * pose.rotation @ self.pivot + pose.translation for pose in poses]),
+        )
+
+    def state(self, identity: Float[np.ndarray, "I"], expression_count: int, joint_count: int, scale: float) -> State:
         """The state of a head without expression."""
         frames = len(self.rotations)
         joints = np.tile(np.eye(3), (frames, joint_count, 1, 1))
         joints[:, 0] = self.rotations
         return State(
             identity=identity,
-            log_size=0.0,
+            log_size=float(np.log(scale)),
             log_focal=self.log_focal,
             principal_px=self.centre_px,
             k1=np.zeros(len(self.log_focal)),
@@ -82,7 +90,6 @@ def start_poses(observations: Observations, data: GNMData, options: FitOptions) 
     group, known, log_focal = _focals(observations, options)
     centre = np.array([v.principal_px or (v.width_px / 2, v.height_px / 2) for v in views], np.float64)
     poses = [[orthographic(points, pixels, pivot) for pixels in frame] for frame in observations.points_px]
-    _check_mirrored(observations, points, pivot, poses)
     check_facing(observations, data, poses)
     focal = np.exp(log_focal)[group]
     heads = [
@@ -190,32 +197,3 @@ def _filled(frames: list) -> list:
     """Frames without a pose get that of the nearest one."""
     having = [f for f, frame in enumerate(frames) if frame is not None]
     return [frames[min(having, key=lambda g: abs(g - f))] for f in range(len(frames))]
-
-
-def _check_mirrored(
-    observations: Observations,
-    points: np.ndarray,
-    pivot: np.ndarray,
-    poses: Sequence[Sequence[Orthographic | None]],
-) -> None:
-    """Raise InputError if mirrored landmarks fit much better than those given."""
-    mirror = np.array([-1.0, 1.0])
-    given, mirrored = [], []
-    for frame, pixels in zip(poses, observations.points_px, strict=True):
-        for v, pose in enumerate(frame):
-            if pose is None:
-                continue
-            other = orthographic(points, pixels[v] * mirror, pivot)
-            assert other is not None
-            given.append(pose.residual_px / pose.scale_px)
-            mirrored.append(other.residual_px / other.scale_px)
-        if len(given) >= 20:
-            break
-    if given and np.median(mirrored) < _MIRRORED * np.median(given):
-        raise InputError(
-            "The landmarks are mirrored",
-            where=f"landmarks of scheme {observations.scheme.name}",
-            expected="the subject's right side on the left of an image that faces it",
-            got=f"{1e3 * np.median(given):.1f} mm off, mirrored {1e3 * np.median(mirrored):.1f} mm",
-            fix="mirror the images back, or exchange the landmarks of left and right",
-        )
