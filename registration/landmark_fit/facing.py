@@ -12,7 +12,7 @@ from registration.landmark_fit.initial_pose import Orthographic
 from registration.landmark_fit.observations import Observations
 from registration.model.gnm_npz import GNMData
 
-_MIN_SHARE = 0.4  # of the seen landmarks, on surfaces that face the camera
+_MIN_SHARE = 0.3  # of the seen landmarks, on surfaces that face the camera
 _FRAMES = 20  # that are tested
 
 
