@@ -34,13 +34,14 @@ _ACCURACY_M = 5e-6  # of the parts' restricted bases, at unit coefficients
 class Anatomy:
     """Penalizes penetrations of parts of the head in one frame.
 
-    Independent of the head's pose and size: depths are those of a head of the model's size, root at rest.
+    Independent of the head's pose and size: depths are those of a head of the model's size, the anchor at rest.
 
     Args:
         data: the model.
         reduction: of the expression coefficients.
         weight: of the term.
         offsets: of the bind pose, metres; None: zero.
+        anchor: the joint that is at rest, as in the model of the landmarks.
 
     Raises:
         InputError: the model lacks a vertex group that names a part.
@@ -52,6 +53,7 @@ class Anatomy:
         reduction: Reduction,
         weight: float = 1.0,
         offsets: Float[np.ndarray, "V 3"] | None = None,
+        anchor: int = 0,
     ):
         contacts = _contacts(data)
         used = np.zeros(len(data.template_vertex_positions), bool)
@@ -65,8 +67,9 @@ class Anatomy:
             index = np.flatnonzero(used & members & (place < 0))
             if len(index):
                 place[index] = np.arange(first, first + len(index))
-                self._parts.append(_Part(data, index, first, reduction, offsets))
+                self._parts.append(_Part(data, index, first, reduction, offsets, anchor))
                 first += len(index)
+        self.index = np.argsort(np.where(used, place, len(used)))[:first]
         placed = [replace(c, points=place[c.points], triangles=place[c.triangles]) for c in contacts]
         rest = np.zeros((first, 3))
         rest[place[used]] = data.template_vertex_positions[used].astype(np.float64) * MM_PER_M
@@ -148,6 +151,18 @@ class Anatomy:
         """
         return self._residual(self._deep(identity, expression, joints)) / self._factor
 
+    def vertices_mm(
+        self, identity: Float[np.ndarray, "R"], expression: Float[np.ndarray, "Q"], joints: Float[np.ndarray, "J 3 3"]
+    ) -> Float[np.ndarray, "S 3"]:
+        """Return the vertices `index`, mm, the anchor at rest.
+
+        Args:
+            identity: coefficients.
+            expression: reduced coefficients.
+            joints: rotations relative to the parents.
+        """
+        return np.concatenate([part.points(identity, expression, joints) for part in self._parts]) * MM_PER_M
+
     def _residual(self, deep: Depths) -> Float[np.ndarray, "M"]:
         return self._factor * (deep.depth - self._tolerance[deep.query])
 
@@ -158,15 +173,23 @@ class Anatomy:
             self._latest = (subject, {})
         found = self._latest[1].get(frame)
         if found is None:
-            vertices = np.concatenate([part.points(identity, expression, joints) for part in self._parts])
-            found = self._latest[1][frame] = self._depths(vertices * MM_PER_M, self._tolerance)
+            vertices = self.vertices_mm(identity, expression, joints)
+            found = self._latest[1][frame] = self._depths(vertices, self._tolerance)
         return found
 
 
 class _Part:
     """Vertices of one part, in bases restricted to the directions that move them."""
 
-    def __init__(self, data: GNMData, index: np.ndarray, first: int, reduction: Reduction, offsets: np.ndarray | None):
+    def __init__(
+        self,
+        data: GNMData,
+        index: np.ndarray,
+        first: int,
+        reduction: Reduction,
+        offsets: np.ndarray | None,
+        anchor: int,
+    ):
         self.first, self.count = first, len(index)
         by_identity, of_joints, by_expression = (
             basis.astype(np.float64).reshape(len(basis), -1)
@@ -186,6 +209,7 @@ class _Part:
             expression_map=reduction.basis @ self._expression,
             expression_mean=reduction.mean,
             offsets=offsets,
+            anchor=anchor,
         )
 
     def points(self, identity: np.ndarray, expression: np.ndarray, joints: np.ndarray) -> Float[np.ndarray, "P 3"]:

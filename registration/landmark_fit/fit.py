@@ -106,7 +106,7 @@ class _Prepared:
             )
             anatomy = None
             if self._options.anatomy > 0:
-                anatomy = Anatomy(self._data, reduction, self._options.anatomy, self._options.offsets)
+                anatomy = Anatomy(self._data, reduction, self._options.anatomy, self._options.offsets, model.anchor)
             self._restricted = (reduction, model, anatomy)
         return self._restricted
 

@@ -43,6 +43,7 @@ class LandmarkModel:
         expression_map: the same of the expression coefficients.
         expression_mean: raw coefficients where those to be used are zero.
         offsets: of the bind pose, metres; None: zero.
+        anchor: the joint that is at rest; None: that which moves most of the points.
     """
 
     def __init__(
@@ -55,6 +56,7 @@ class LandmarkModel:
         expression_map: Float[np.ndarray, "E Q"] | None = None,
         expression_mean: Float[np.ndarray, "E"] | None = None,
         offsets: Float[np.ndarray, "V 3"] | None = None,
+        anchor: int | None = None,
     ):
         skinning = data.skinning_weights.astype(np.float64)
         skinning = skinning / skinning.sum(0)
@@ -96,7 +98,7 @@ class LandmarkModel:
                     corrective=None if corrective is None else carried(corrective),
                 )
             )
-        self.anchor = int(of_joint.sum(0).argmax())
+        self.anchor = int(of_joint.sum(0).argmax()) if anchor is None else anchor
         self.joint_count = joints
         self.has_correctives = corrective is not None
 

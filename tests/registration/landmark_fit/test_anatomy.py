@@ -46,6 +46,21 @@ def test_the_template_costs_nothing(full, anatomy):
 
 
 @needs_shared
+def test_all_parts_are_where_the_model_has_them(full, anatomy):
+    identity, expression, rotations = crossed(full, 4)
+    parameters = Parameters(
+        identity=torch.tensor(identity),
+        expression=torch.tensor(SIGMA * expression),
+        rotations=torch.tensor(rotations),
+        translation=torch.zeros(3, dtype=torch.float64),
+        scale=torch.tensor(1.0, dtype=torch.float64),
+    )
+    expected = 1e3 * GNM(full, dtype=torch.float64)(parameters).numpy()[anatomy.index]
+    joints = Rotation.from_rotvec(rotations).as_matrix()
+    np.testing.assert_allclose(anatomy.vertices_mm(identity, expression, joints), expected, atol=0.05)
+
+
+@needs_shared
 def test_rows_are_the_derivatives_of_the_energy(full, anatomy):
     identity, expression, rotations = crossed(full, 3)
     joints = Rotation.from_rotvec(rotations).as_matrix()
