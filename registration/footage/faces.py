@@ -85,8 +85,14 @@ class CachedFaces:
         return faces
 
 
-def nearest(faces: Sequence[Face], before: Face) -> Face | None:
-    """Return the face whose place and size are most like those before; None if all are elsewhere."""
+def nearest(faces: Sequence[Face], before: Face, *, anywhere: bool = False) -> Face | None:
+    """Return the face whose place and size are most like those before; None if all are elsewhere.
+
+    Args:
+        faces: of an image.
+        before: the face in the last image that shows it.
+        anywhere: a face counts however far away it is.
+    """
     size, centre = face_size(before), before.points.mean(0)
 
     def distance(face: Face) -> float:
@@ -94,7 +100,7 @@ def nearest(faces: Sequence[Face], before: Face) -> Face | None:
         return moved + abs(float(np.log(face_size(face) / size)))
 
     best = min(faces, key=distance, default=None)
-    return best if best is not None and distance(best) < _NEAR else None
+    return best if best is not None and (anywhere or distance(best) < _NEAR) else None
 
 
 def choose(faces: Sequence[Face], number: int | None, where: object) -> tuple[Face, str]:

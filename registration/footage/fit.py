@@ -6,12 +6,23 @@ from dataclasses import MISSING, dataclass, fields
 from pathlib import Path
 from typing import Any
 
+from registration.errors import InputError
 from registration.footage.media import Kind, recognize
 from registration.footage.moment import read_moment
 from registration.footage.moment_folder import FittedMoment, write_moment
 from registration.footage.observed import Footage
 from registration.footage.options import FootageOptions
+from registration.footage.sequence import read_sequence_footage
+from registration.footage.sequence_folder import (
+    FittedSequence,
+    check_mesh_frames,
+    check_sequence_folder,
+    find_sequence,
+    write_sequence,
+)
 from registration.footage.solve import KnownIdentity, read_identity, solver_options
+from registration.footage.video import Video, open_video
+from registration.footage.windows import fit_long
 from registration.inputs import read_schemes
 from registration.landmark_fit.fit import fit_landmarks
 from registration.model import gnm_npz
@@ -21,7 +32,7 @@ from registration.storage import hashing
 from registration.storage.registration_folder import check_output_folder, find_existing
 from registration.types import Status
 
-_NOT_HASHED = ("landmarks", "detector", "identity_from", "video", "meshes", "frames")  # their contents are, or nothing
+_NOT_HASHED = ("landmarks", "detector", "identity_from")  # their contents are
 _DEFAULTS = FootageOptions()
 
 
@@ -46,9 +57,10 @@ def fit_footage(
     """Fit the model to the landmarks of an input, and write a folder.
 
     Args:
-        source: an image, a folder of images of one moment, or a capture.
+        source: an image, a folder of images of one moment, a capture, or a video.
         model: a GNM NPZ file; landmark schemes lie next to it.
-        out: a registration folder; one that we wrote is replaced, one of the same inputs stays.
+        out: for one moment a registration folder, for a video a folder with `fit.npz`, a page and a video. One that we
+            wrote is replaced, one of the same inputs stays.
         options: of the fit.
         force: fit although `out` holds the result of the same inputs.
         progress: receives steps and messages.
@@ -60,33 +72,121 @@ def fit_footage(
     progress = progress or NullProgress()
     source, out = Path(source), Path(out)
     kind = recognize(source)
-    check_output_folder(out)
+    if kind == "video":
+        check_sequence_folder(out)
+    else:
+        check_output_folder(out)
+        _check_moment(options)
     data = gnm_npz.read(Path(model))
     schemes = read_schemes(Path(model), data, {})
     known = read_identity(options.identity_from, data)
-    footage = read_moment(kind, source, schemes, options, out, progress)
+    video = open_video(source, options) if kind == "video" else None
+    if video is None:
+        footage = read_moment(kind, source, schemes, options, out, progress)
+    else:
+        footage = read_sequence_footage(source, video, schemes, options, out, progress)
+        check_mesh_frames(footage, options)
     for note in footage.notes:
         progress.message(note)
-    digests = _digests(footage, data, known)
-    config = _config(kind, options)
-    if not force and (same := find_existing(out, hashing.input_hash(digests, config))) is not None:
-        progress.message(f"{out} already holds the fit of these inputs")
-        return FitOutcome(status=same.status, reason=same.reason, notes=tuple(same.figures.get("notes", ())))
-    progress.message(f"fitting {int(footage.observations.seen.sum())} landmarks")
-    fit = fit_landmarks(footage.observations, data, solver_options(footage, options, known))
-    progress.message("writing the page")
-    registration = write_moment(
-        FittedMoment(
-            footage=footage,
-            fit=fit,
-            data=data,
-            config=config,
-            digests=digests,
-            provenance=_provenance(source, Path(model), out, options),
-        ),
-        out,
+    task = _Task(
+        footage=footage,
+        data=data,
+        known=known,
+        options=options,
+        config=_config(kind, options),
+        digests=_digests(footage, data, known),
+        provenance=_provenance(source, Path(model), out, options),
+        out=out,
+        progress=progress,
     )
-    return FitOutcome(status=fit.status, reason=fit.reason, notes=tuple(registration.figures["notes"]))
+    if not force and (same := task.existing()) is not None:
+        progress.message(f"{out} already holds the fit of these inputs")
+        return same
+    count = len(footage.numbers)
+    what = f"{int(footage.observations.seen.sum())} landmarks" + (f" in {count} frames" if count > 1 else "")
+    progress.message(f"fitting {what}")
+    return task.moment() if video is None else task.sequence(video)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Task:
+    """A fit whose inputs have been read."""
+
+    footage: Footage
+    data: gnm_npz.GNMData
+    known: KnownIdentity | None
+    options: FootageOptions
+    config: Mapping[str, Any]
+    digests: Mapping[str, str]
+    provenance: Mapping[str, str]
+    out: Path
+    progress: Progress
+
+    def existing(self) -> FitOutcome | None:
+        """What `out` holds, if it was made from the same inputs."""
+        digest = hashing.input_hash(self.digests, self.config)
+        if self.footage.kind == "video":
+            manifest = find_sequence(self.out, digest)
+            return None if manifest is None else _outcome(manifest)
+        same = find_existing(self.out, digest)
+        if same is None:
+            return None
+        return FitOutcome(status=same.status, reason=same.reason, notes=tuple(same.figures.get("notes", ())))
+
+    def moment(self) -> FitOutcome:
+        """Fit and write one moment."""
+        fit = fit_landmarks(
+            self.footage.observations, self.data, solver_options(self.footage, self.options, self.known)
+        )
+        self.progress.message("writing the page")
+        fitted = FittedMoment(
+            footage=self.footage,
+            fit=fit,
+            data=self.data,
+            config=self.config,
+            digests=self.digests,
+            provenance=self.provenance,
+        )
+        registration = write_moment(fitted, self.out)
+        return FitOutcome(status=fit.status, reason=fit.reason, notes=tuple(registration.figures["notes"]))
+
+    def sequence(self, video: Video) -> FitOutcome:
+        """Fit and write a sequence."""
+        fit = fit_long(
+            self.footage.observations,
+            self.data,
+            solver_options(self.footage, self.options, self.known),
+            report=lambda done, total: self.progress.update(done, total, "solving windows"),
+        )
+        fitted = FittedSequence(
+            footage=self.footage,
+            video=video,
+            fit=fit,
+            data=self.data,
+            options=self.options,
+            config=self.config,
+            digests=self.digests,
+            provenance=self.provenance,
+        )
+        return _outcome(write_sequence(fitted, self.out, self.progress))
+
+
+def _outcome(manifest: Mapping[str, Any]) -> FitOutcome:
+    return FitOutcome(status=manifest["status"], reason=manifest["reason"], notes=tuple(manifest["figures"]["notes"]))
+
+
+def _check_moment(options: FootageOptions) -> None:
+    """Refuse options of videos for one moment. Raises InputError."""
+    plain = FootageOptions()
+    for name in ("every", "start", "end", "meshes", "frames", "temporal", "video"):
+        if getattr(options, name) != getattr(plain, name):
+            raise InputError(
+                "The option is for videos only",
+                where=f"--{'no-' if name in ('temporal', 'video') else ''}{name}",
+                expected="a video as input",
+                got="one moment",
+                fix="leave it out; gnmreg export writes the mesh in other formats",
+            )
 
 
 def _digests(footage: Footage, data: gnm_npz.GNMData, known: KnownIdentity | None) -> dict[str, str]:

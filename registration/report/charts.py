@@ -26,6 +26,7 @@ LINE_COLOURS = (
     "#9a031e",
 )
 _COLUMNS = 3  # panels in a row
+_DOTTED = 60  # values of a line, above which they get no dots
 
 
 def loss_curves(history: Mapping[str, Mapping[str, Sequence[float]]]) -> str:
@@ -70,14 +71,15 @@ class ChartLine:
     high: Sequence[float | None] = ()
 
 
-def line_charts(panels: Mapping[str, Sequence[ChartLine]], x_label: str) -> str:
-    """Plot lines with their confidence bands, one panel per title. The vertical axes start at zero.
+def line_charts(panels: Mapping[str, Sequence[ChartLine]], x_label: str, *, from_zero: bool = True) -> str:
+    """Plot lines with their confidence bands, one panel per title.
 
     Lines of one name have the same colour in all panels.
 
     Args:
         panels: title -> lines; panels without lines are omitted.
         x_label: of the horizontal axis of all panels.
+        from_zero: the vertical axes start at zero.
 
     Returns:
         An SVG element; empty without any line.
@@ -93,12 +95,14 @@ def line_charts(panels: Mapping[str, Sequence[ChartLine]], x_label: str) -> str:
         axes = figure.subplots(rows, columns, squeeze=False).ravel()
         for panel, (title, lines) in zip(axes, panels.items(), strict=False):
             for line in lines:
-                panel.plot(line.x, line.y, color=colours[line.name], lw=1.6, marker="o", ms=3.5)
+                dots = {"marker": "o", "ms": 3.5} if len(line.x) <= _DOTTED else {}
+                panel.plot(line.x, line.y, color=colours[line.name], lw=1.6, **dots)
                 with_band = [k for k, low in enumerate(line.low) if low is not None]
                 low, high = ([float(side[k] or 0) for k in with_band] for side in (line.low, line.high))
                 band_x = [line.x[k] for k in with_band]
                 panel.fill_between(band_x, low, high, color=colours[line.name], alpha=0.15, lw=0)
-            panel.set_ylim(bottom=0)
+            if from_zero:
+                panel.set_ylim(bottom=0)
             _style_axes(panel, title, x_label)
         for panel in axes[len(panels) :]:
             panel.set_visible(False)

@@ -25,7 +25,9 @@ MAX_PIXELS = 2**28  # 16384 x 16384: beyond any camera, and a hostile header mus
 FORMATS = ("PNG", "JPEG", "TIFF", "WEBP", "BMP", "PPM", "GIF", "JPEG2000")  # Pillow's others start programs or are rare
 _DAMAGE = re.compile(r"premature end|corrupt jpeg data|libpng error|\[ERROR:", re.IGNORECASE)
 _HARMLESS = re.compile(r"extraneous bytes before marker", re.IGNORECASE)  # some cameras write them
-_OF_DECODERS = re.compile(r"^(\[ ?(WARN|ERROR|INFO)|libpng|libjpeg|TIFF|Corrupt JPEG|Premature end|Invalid SOS|\s*$)")
+_OF_DECODERS = re.compile(
+    r"^(\[ ?(WARN|ERROR|INFO)|OpenCV: FFMPEG|libpng|libjpeg|TIFF|Corrupt JPEG|Premature end|Invalid SOS|\s*$)"
+)
 _lock = threading.Lock()
 
 
@@ -99,6 +101,13 @@ def _decoded(read: "Callable[[], np.ndarray | None]", refuse: Refuse) -> "np.nda
         got = _brief(complaints[0]) if complaints else "a decoding error"
         raise refuse(expected="a whole, undamaged image", got=got)
     return pixels
+
+
+@contextmanager
+def quiet_decoders() -> Iterator[None]:
+    """Drop what OpenCV's libraries write to the standard error in the block; what others write passes."""
+    with _decoder_messages():
+        yield
 
 
 def _brief(message: str) -> str:

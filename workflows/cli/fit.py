@@ -20,10 +20,10 @@ def fit(
     force: bool = False,
     footage: FootageOptions = _DEFAULTS,
 ) -> int:
-    """Fit the head model to landmarks in an image, several images, or a capture.
+    """Fit the head model to landmarks in an image, images, a capture or a video.
 
     Needs no cameras: those of images and videos are estimated. The mesh is the model's, without offsets. One moment
-    gives a registration's folder.
+    gives a registration's folder, a video a folder with fit.npz, index.html and a video of the mesh.
 
     Args:
         source: An image; a folder of images of one moment by unknown cameras; a capture folder; or a video.
