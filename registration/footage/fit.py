@@ -91,6 +91,7 @@ def fit_footage(
     task = _Task(
         footage=footage,
         data=data,
+        schemes=schemes,
         known=known,
         options=options,
         config=_config(kind, options),
@@ -114,6 +115,7 @@ class _Task:
 
     footage: Footage
     data: gnm_npz.GNMData
+    schemes: Mapping[str, LandmarkScheme]  # of the model
     known: KnownIdentity | None
     options: FootageOptions
     config: Mapping[str, Any]
@@ -139,10 +141,12 @@ class _Task:
             self.footage.observations, self.data, solver_options(self.footage, self.options, self.known)
         )
         self.progress.message("writing the page")
+        fitted_scheme = self.footage.observations.scheme
         fitted = FittedMoment(
             footage=self.footage,
             fit=fit,
             data=self.data,
+            schemes={name: one for name, one in self.schemes.items() if one is fitted_scheme or not one.shipped},
             config=self.config,
             digests=self.digests,
             provenance=self.provenance,

@@ -20,6 +20,7 @@ from registration.geometry.rasterizer import visible
 from registration.landmark_fit.result import LandmarkFit
 from registration.model.atlas import texture_atlas
 from registration.model.gnm_npz import GNMData
+from registration.model.landmarks import LandmarkScheme
 from registration.report.heat_map import render_heat_map, scale_limit_mm
 from registration.report.inputs import PictureSection, ReportInputs, distance_heat_map
 from registration.report.page import render_report
@@ -43,6 +44,7 @@ class FittedMoment:
     footage: Footage
     fit: LandmarkFit
     data: GNMData
+    schemes: Mapping[str, LandmarkScheme]  # whose landmarks on the mesh are stored
     config: Mapping[str, Any]
     digests: Mapping[str, str]
     provenance: Mapping[str, str]
@@ -131,10 +133,9 @@ def _write_cameras(moment: FittedMoment, folder: Path) -> None:
 
 
 def _registration(moment: FittedMoment, uncertainty: Uncertainty) -> Registration:
-    fit, data, footage = moment.fit, moment.data, moment.footage
+    fit, data = moment.fit, moment.data
     vertices = fit.vertices(data)
     offsets = np.zeros_like(vertices) if fit.options.offsets is None else fit.options.offsets
-    scheme = footage.observations.scheme
     figures = _figures(moment, vertices, uncertainty)
     return Registration(
         status=fit.status,
@@ -150,7 +151,7 @@ def _registration(moment: FittedMoment, uncertainty: Uncertainty) -> Registratio
         confidence=_confidence(moment, vertices, uncertainty),
         texture=np.full((64, 64, 3), _GREY, np.float32),
         corner_uvs=texture_atlas(data),
-        landmarks={scheme.name: scheme.points(vertices)},
+        landmarks={name: scheme.points(vertices) for name, scheme in moment.schemes.items()},
         seconds={"landmark fit": fit.seconds},
         history={},
         figures=figures,
