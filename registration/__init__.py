@@ -18,6 +18,10 @@ if TYPE_CHECKING:
     from registration.errors import InputError
     from registration.evaluate.evaluation import RegistrationEvaluation, evaluate_registration
     from registration.fit.recipes import Lengths, OffsetRegion, Rate, Recipe, Stage, Weights, load_recipe
+    from registration.landmark_fit.fit import fit_landmarks
+    from registration.landmark_fit.observations import Observations
+    from registration.landmark_fit.options import FitOptions
+    from registration.landmark_fit.result import LandmarkFit
     from registration.model.gnm import GNM
     from registration.model.gnm_npz import GNMData
     from registration.model.gnm_npz import read as load_model
@@ -31,10 +35,13 @@ __all__ = [
     "Camera",
     "Capture",
     "CaptureReport",
+    "FitOptions",
     "GNM",
     "GNMData",
     "InputError",
+    "LandmarkFit",
     "Lengths",
+    "Observations",
     "OffsetRegion",
     "Parameters",
     "Rate",
@@ -48,6 +55,7 @@ __all__ = [
     "check_capture",
     "console_progress",
     "evaluate_registration",
+    "fit_landmarks",
     "load_model",
     "load_recipe",
     "load_registration",

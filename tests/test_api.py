@@ -17,9 +17,9 @@ from tests.registration.register import synthetic
 
 DOCUMENT = Path(__file__).parents[1] / "docs" / "python.md"
 REGISTRATION = """
-Camera Capture CaptureReport GNM GNMData InputError Lengths OffsetRegion Parameters Rate Recipe RegisterOptions
-Registration RegistrationEvaluation Stage View Weights check_capture console_progress evaluate_registration
-load_model load_recipe
+Camera Capture CaptureReport FitOptions GNM GNMData InputError LandmarkFit Lengths Observations OffsetRegion Parameters
+Rate Recipe RegisterOptions Registration RegistrationEvaluation Stage View Weights check_capture console_progress
+evaluate_registration fit_landmarks load_model load_recipe
 load_registration read_capture register save_registration
 """.split()
 COREGISTER = """
@@ -97,10 +97,11 @@ def test_the_examples_of_the_document_run(
     monkeypatch.chdir(tmp_path)
     names: dict[str, object] = {}
     blocks = re.findall(r"```python\n(.*?)```", DOCUMENT.read_text(), re.DOTALL)
-    assert len(blocks) == 2
+    assert len(blocks) == 3
     for block in blocks:
         exec(compile(block, str(DOCUMENT), "exec"), names)
-    status, shape, _, distance = capsys.readouterr().out.splitlines()
+    status, shape, _, distance, fitted = capsys.readouterr().out.splitlines()
     assert status.startswith("converged") and shape.startswith("(") and (tmp_path / "registered/report.html").is_file()
     assert float(distance.split()[0]) < 1.0
     assert names["longer"].stages[0].steps == 200
+    assert fitted.startswith("converged") and names["sigma_mm"].shape == names["vertices"].shape
