@@ -47,6 +47,8 @@ class FitOptions:
     anatomy: float = 1.0  # weight of penetrations of eyeballs and lids, teeth and lips, tongue and mouth; 0: none
     covariance: bool = True  # estimate posterior standard deviations
     max_iterations: int = 30  # of each stage
-    tolerance: float = 1e-3  # decrease of the energy, minus the logarithm of the posterior, at which a fit ends
+    tolerance: float = (
+        1e-3  # decrease of the energy per frame, minus the logarithm of the posterior, at which a fit ends
+    )
     identity: Float[np.ndarray, "I"] | None = None  # known: it is not estimated
     offsets: Float[np.ndarray, "V 3"] | None = None  # of the bind pose, metres, known

@@ -9,8 +9,8 @@ from registration.landmark_fit.observations import Observations
 from registration.landmark_fit.options import FitOptions
 from registration.model.gnm_npz import GNMData
 
-_LEAST_INFORMATION = 3e-3  # of a direction relative to its prior: less moves it by less than 0.3 % of what is true
-_MARGIN = 4.0  # so much more information may other observations hold with the same basis
+_LEAST_INFORMATION = 0.1  # of a direction relative to its prior: less recovers less than a tenth of what is true
+_MARGIN = 2.0  # so much more information may other observations hold with the same basis
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

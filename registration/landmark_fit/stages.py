@@ -69,7 +69,7 @@ def run_stages(
         principal_sigma_px=options.principal_sigma * max(view.width_px for view in observations.views),
         expression_change=None if temporal is None else reduction.basis.T @ reduction.basis / temporal.expression**2,
     )
-    iterations = 0
+    iterations, frames = 0, len(observations.points_px)
     names = ["root", "position", "poses"]
     many = problem.points_px.shape[2] > _MANY
     shape = ["focal"] if options.identity is not None else ["focal", "identity"]
@@ -83,10 +83,10 @@ def run_stages(
         coarse = _thinned(weighted) if many else weighted
         # The robust stage must not begin with parts in one another: it would give up landmarks for them.
         soft = anatomy.softened(_SOFT) if anatomy is not None and added is rest else None
-        minimum = minimize(replace(coarse, anatomy=soft), state, free, _COARSE_ITERATIONS, _COARSE_TOLERANCE)
+        minimum = minimize(replace(coarse, anatomy=soft), state, free, _COARSE_ITERATIONS, _COARSE_TOLERANCE * frames)
         state, iterations = minimum.state, iterations + minimum.iterations
     last = replace(_weighted(problem, state), anatomy=anatomy, robust=options.robust, reuse=many)
-    minimum = minimize(last, state, free, options.max_iterations, options.tolerance)
+    minimum = minimize(last, state, free, options.max_iterations, options.tolerance * frames)
     return replace(minimum, iterations=iterations + minimum.iterations), last, free
 
 
