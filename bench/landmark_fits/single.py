@@ -18,12 +18,14 @@ from bench.landmark_fits.heads import HeadModel
 from bench.landmark_fits.people import People, turned
 from bench.landmark_fits.pictures import SIZE_PX, Pinhole, look_at
 from bench.landmark_fits.rows import Row
+from registration.errors import InputError
 from registration.geometry.closest_point import ClosestPointQuery
 from registration.geometry.rigid import similarity_transform
 from registration.geometry.surface_samples import sample_surface
 from registration.landmark_fit.fit import fit_many
 from registration.landmark_fit.observations import Observations
 from registration.landmark_fit.options import FitOptions
+from registration.landmark_fit.result import LandmarkFit
 from registration.model.landmarks import LandmarkScheme
 
 POINTS = 7000
@@ -92,16 +94,35 @@ def _pictures(prepared: _Prepared, seed: int, count: int) -> Iterator[tuple[np.n
         yield points, camera.project(points), camera
 
 
+def _fits(prepared: _Prepared, batch: list[Observations]) -> Iterator[tuple[LandmarkFit | None, float]]:
+    """Fits, None where the landmarks were refused, and the processor time they took, seconds."""
+    while batch:
+        done, began = 0, time.process_time()
+        try:
+            for fit in fit_many(batch, prepared.case.model.data, prepared.options):
+                done += 1
+                yield fit, time.process_time() - began
+                began = time.process_time()
+        except InputError:
+            done += 1
+            yield None, time.process_time() - began
+        batch = batch[done:]
+
+
 def _measured(prepared: _Prepared, seed: int, count: int) -> np.ndarray:
-    """Mean distances (mm) by alignment, focal error (relative), seconds of the fit, 1 if it converged; per picture."""
+    """Mean distances (mm) by alignment, focal error (relative), seconds of the fit, of these on the processor, 1 if it
+    converged; per picture. NaN where the landmarks were refused."""
     pictures = list(_pictures(prepared, seed, count))
-    batch = (
+    batch = [
         Observations.of_image(prepared.scheme, pixels, (SIZE_PX, SIZE_PX), sigma_px=SIGMA_PX)
         for _, pixels, _ in pictures
-    )
+    ]
     model = prepared.case.model
     result = []
-    for (points, _, camera), fit in zip(pictures, fit_many(batch, model.data, prepared.options), strict=True):
+    for (points, _, camera), (fit, cpu) in zip(pictures, _fits(prepared, batch), strict=True):
+        if fit is None:
+            result.append([np.nan] * (len(ALIGNMENTS) + 4))
+            continue
         mesh = model.posed(fit.parameters(0))
         fitted = prepared.scheme.points(mesh)
         T = camera.T_cam_world
@@ -116,7 +137,7 @@ def _measured(prepared: _Prepared, seed: int, count: int) -> np.ndarray:
             distance = ClosestPointQuery(s * mesh @ R.T + t, model.outer_triangles).closest(points)[0]
             row.append(1e3 * distance.mean())
         focal = abs(fit.cameras[0].intrinsics[0, 0] / camera.focal_px - 1)
-        result.append([*row, focal, fit.seconds, float(fit.status == "converged")])
+        result.append([*row, focal, fit.seconds, cpu, float(fit.status == "converged")])
     return np.array(result)
 
 
@@ -151,6 +172,8 @@ def single(cases: list[Case], count: int, processes: int) -> tuple[list[Row], li
     for case in cases:
         prepared, off = prepare(case)
         found, seconds = measure(prepared, count, processes)
+        refused = int(np.isnan(found[:, 0]).sum())
+        found = found[np.isfinite(found[:, 0])]
         for k, name in enumerate(ALIGNMENTS):
             values = found[:, k]
             limited = case.in_model and name == "rigid"
@@ -163,7 +186,8 @@ def single(cases: list[Case], count: int, processes: int) -> tuple[list[Row], li
                 )
             )
         note = f"{case.people.name}, {case.model.name}: {count} pictures in {seconds / 60:.1f} min on {processes} cores"
-        note += f", {found[:, 4].mean():.2f} s a fit, {100 * found[:, 5].mean():.0f} % converged"
+        note += f", {found[:, 4].mean():.2f} s a fit, {found[:, 5].mean():.2f} s of processor time"
+        note += f", {100 * found[:, 6].mean():.0f} % converged, {refused} refused"
         note += f", focal length off by {100 * np.median(found[:, 3]):.1f} % in the median"
         notes.append(note + (f", landmarks {off:.2f} mm from the deformed template" if off else ""))
     for name, figures in PAPER.items():
