@@ -5,12 +5,11 @@ import sys
 from pathlib import Path
 
 import pytest
-from jaxtyping import install_import_hook
+
+from tests import annotation_checks
 
 # Before any test module imports the library: every jaxtyping annotation there is checked at run time.
-# An int is accepted for a float, as in PEP 484.
-_CHECKER = "beartype.beartype(conf=beartype.BeartypeConf(is_pep484_tower=True))"
-install_import_hook(["registration", "coregister"], _CHECKER)
+annotation_checks.install(["registration", "coregister"])
 
 ROOT = Path(__file__).resolve().parents[1]
 FIXTURES = ROOT / "tests" / "fixtures"
