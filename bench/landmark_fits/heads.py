@@ -16,7 +16,9 @@ from registration.model.gnm_npz import GNMData
 from registration.model.landmarks import LandmarkScheme, schemes_beside, shipped_schemes
 from registration.types import Parameters
 
-EXPRESSION_SIGMA = 0.3  # of sampled coefficients: of 383 independent ones, larger values make grimaces
+# Standard deviations of expression coefficients, sampled and expected. The first model's basis has that of the samples
+# of which it is made; four real expressions of the GNM basis have coefficients of 0.20 to 0.27 (rms).
+FIRST_SIGMA, GNM_SIGMA = 1.0, 0.3
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -36,12 +38,14 @@ class HeadModel:
     name: str
     data: GNMData
     path: Path
+    expression_sigma: float
 
     @classmethod
     def read(cls, name: str, path: Path | None) -> "HeadModel":
         """Read a model's file; None: the first model."""
+        sigma = FIRST_SIGMA if path is None else GNM_SIGMA
         path = path or bootstrap()
-        return cls(name=name, data=gnm_npz.read(path), path=path)
+        return cls(name=name, data=gnm_npz.read(path), path=path, expression_sigma=sigma)
 
     @cached_property
     def _torch(self) -> GNM:
@@ -96,14 +100,11 @@ class HeadModel:
             expression, self.data.expression_basis, 1
         )
 
-    def sample(
-        self, rng: np.random.Generator, *, expression_sigma: float = EXPRESSION_SIGMA, turn: float = 0.15
-    ) -> Head:
+    def sample(self, rng: np.random.Generator, *, turn: float = 0.15) -> Head:
         """Sample a head of the model's prior.
 
         Args:
             rng: source of randomness.
-            expression_sigma: standard deviation of the expression coefficients.
             turn: standard deviation of the head's rotation in the world about each axis, radians; twice about y.
         """
         rotations = np.zeros((len(self.data.joint_names), 3))
@@ -112,7 +113,7 @@ class HeadModel:
         rotations[2:] = rng.normal(size=(len(rotations) - 2, 3)) * 0.1
         return Head(
             identity=rng.normal(size=len(self.data.vertex_identity_basis)),
-            expression=rng.normal(size=len(self.data.expression_basis)) * expression_sigma,
+            expression=rng.normal(size=len(self.data.expression_basis)) * self.expression_sigma,
             rotations=rotations,
             translation=rng.normal(size=3) * 0.02,
         )

@@ -13,7 +13,6 @@ from registration.landmark_fit.options import FitOptions
 
 VIEWS = (1, 3, 8)
 POINTS = 600
-_SIGMA = 0.3  # of expression coefficients, in the samples and in the prior
 _FOCALS = (0.85, 1.0, 1.18)  # of the cameras, relative to `FOCAL_PX`
 FOCAL_LIMIT = 3.0  # per cent, in three views
 
@@ -49,13 +48,13 @@ def noise(model: HeadModel, count: int) -> list[Row]:
     rows = []
     scheme = model.face_scheme(POINTS)
     target = model.template[model.face].mean(0)
-    options = FitOptions(expression_sigma=_SIGMA, anatomy=0, covariance=False)
+    options = FitOptions(expression_sigma=model.expression_sigma, anatomy=0, covariance=False)
     for known in (True, False):
         for views in VIEWS:
             rng = np.random.default_rng([5, views])
             truths, focals, batch = [], [], []
             for k in range(count):
-                truths.append(model.vertices(model.sample(rng, expression_sigma=_SIGMA)))
+                truths.append(model.vertices(model.sample(rng)))
                 focals.append(FOCAL_PX * _FOCALS[k % len(_FOCALS)])
                 # The nearer the camera, the shorter its lens: the face has the same size in all images.
                 cameras = cameras_around(target, views, focals[-1], 0.7 * focals[-1] / FOCAL_PX)

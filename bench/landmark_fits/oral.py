@@ -27,7 +27,6 @@ VIEWS = (1, 3)
 POSES = {"jaw open": 0.15, "tongue out": 1.0}  # protrusion of the tongue at most
 TEETH = 12  # the first landmarks of `oral`; six of the tongue follow
 LEAST_SEEN = 2
-EXPRESSION_SIGMA = 1.0  # that of the samples of which the first model's expression basis is made
 TEETH_LIMIT_MM, TONGUE_LIMIT_MM, PENETRATION_LIMIT = 2.0, 3.0, 2.0  # the last: per cent of the fits
 _SEEN_M = 1e-3  # a surface nearer to the camera by less does not hide a landmark
 
@@ -108,7 +107,7 @@ def _measured(model: HeadModel, heads: list[np.ndarray], views: int, name: str) 
     limits = {"teeth": TEETH_LIMIT_MM, "tongue": TONGUE_LIMIT_MM}
     rows = []
     for weight in (1.0, 0.0):
-        options = FitOptions(expression_sigma=EXPRESSION_SIGMA, anatomy=weight, covariance=False)
+        options = FitOptions(expression_sigma=model.expression_sigma, anatomy=weight, covariance=False)
         fits = list(fit_many(batch, model.data, options))
         errors, crossing, excess = _errors(model, fits, heads)
         case = f"{name}, anatomical term {'on' if weight else 'off'}"

@@ -31,7 +31,7 @@ class People(Protocol):
 
 @dataclass(eq=False)
 class OfModel:
-    """People of a model's prior: identity coefficients N(0, 1), expression coefficients N(0, 0.3^2), gaze."""
+    """People of a model's prior: identity coefficients N(0, 1), expression coefficients of its own spread, gaze."""
 
     model: HeadModel
 

@@ -75,7 +75,7 @@ def prepare(case: Case, options: FitOptions | None = None) -> tuple[_Prepared, f
         points = np.einsum("pk,pkc->pc", barycentric, people.template[corners])
         landmarks = {name: p for name, p in people.landmarks.items() if name in model.schemes}
         scheme, distance = matched_scheme(model, people.template, people.skin, landmarks, points)
-    options = options or FitOptions(expression_sigma=0.3, correlated=CORRELATED, covariance=False)
+    options = options or FitOptions(expression_sigma=model.expression_sigma, correlated=CORRELATED, covariance=False)
     prepared = _Prepared(case=case, faces=faces, barycentric=barycentric, scheme=scheme, options=options)
     return prepared, 1e3 * float(distance.mean())
 
