@@ -44,8 +44,8 @@ class Problem:
 
     # ---- values
 
-    def energy(self, state: State) -> float:
-        """The energy at a state."""
+    def energy(self, state: State, limit: float = np.inf) -> float:
+        """The energy at a state; infinity if landmarks and priors alone exceed the limit."""
         total = self._prior_energy(state)
         for f in range(len(state.expression)):
             posed = self.model(state.identity, state.expression[f], state.joints[f])
@@ -56,8 +56,13 @@ class Problem:
                     continue
                 squared = self.squared(state, f, v, world, rows)
                 total += 0.5 * float(self._rho(squared).sum())
-            if self.anatomy is not None:
-                total += self.anatomy.energy(state.identity, state.expression[f], state.joints[f])
+            if total > limit:
+                return np.inf
+        for f in range(len(state.expression) if self.anatomy is not None else 0):
+            assert self.anatomy is not None
+            total += self.anatomy.energy(state.identity, state.expression[f], state.joints[f])
+            if total > limit:
+                return np.inf
         return total
 
     def squared(self, state: State, f: int, v: int, world: np.ndarray, rows: np.ndarray) -> Float[np.ndarray, "M"]:

@@ -11,12 +11,21 @@ from registration.geometry.topology import vertex_normals
 from registration.landmark_fit.initial_pose import Orthographic
 from registration.landmark_fit.observations import Observations
 from registration.model.gnm_npz import GNMData
+from registration.model.landmarks import LandmarkScheme
 
 _MIN_SHARE = 0.3  # of the seen landmarks, on surfaces that face the camera
 _FRAMES = 20  # that are tested
 
 
-def check_facing(observations: Observations, data: GNMData, poses: Sequence[Sequence[Orthographic | None]]) -> None:
+def landmark_normals(scheme: LandmarkScheme, data: GNMData) -> Float[np.ndarray, "L 3"]:
+    """Normals of the mean head at a scheme's landmarks, model frame."""
+    template = torch.as_tensor(data.template_vertex_positions, dtype=torch.float64)
+    return scheme.points(vertex_normals(template, torch.as_tensor(data.triangles.astype(np.int64))).numpy())
+
+
+def check_facing(
+    observations: Observations, normals: Float[np.ndarray, "L 3"], poses: Sequence[Sequence[Orthographic | None]]
+) -> None:
     """Raise InputError if landmarks are mostly on surfaces that face away from the cameras that see them.
 
     Under orthographic projection mirrored landmarks are those of a head seen from behind: the pose fits as well, but
@@ -24,17 +33,14 @@ def check_facing(observations: Observations, data: GNMData, poses: Sequence[Sequ
 
     Args:
         observations: of one subject.
-        data: the model; its template decides.
+        normals: of the landmarks (`landmark_normals`).
         poses: of the frames and views.
     """
-    template = torch.as_tensor(data.template_vertex_positions, dtype=torch.float64)
-    normals = vertex_normals(template, torch.as_tensor(data.triangles.astype(np.int64))).numpy()
-    directions: Float[np.ndarray, "L 3"] = observations.scheme.points(normals)
     shares = []
     for frame, seen in list(zip(poses, observations.seen, strict=True))[:_FRAMES]:
         for pose, visible in zip(frame, seen, strict=True):
             if pose is not None:
-                shares.append(float((directions[visible] @ pose.rotation[2] < 0).mean()))
+                shares.append(float((normals[visible] @ pose.rotation[2] < 0).mean()))
     if shares and np.median(shares) < _MIN_SHARE:
         raise InputError(
             "The landmarks are mirrored",

@@ -14,7 +14,7 @@ from registration.landmark_fit.options import FitOptions
 from registration.landmark_fit.reduction import Reduction, information_per_metre, reduce_expression
 from registration.landmark_fit.result import LandmarkFit
 from registration.landmark_fit.stages import run_stages
-from registration.landmark_fit.start import start_poses
+from registration.landmark_fit.start import mean_head, start_poses
 from registration.model.gnm_npz import GNMData
 from registration.model.landmarks import LandmarkScheme
 from registration.types import HeadPose
@@ -88,6 +88,7 @@ class _Prepared:
 
     def __init__(self, scheme: LandmarkScheme, data: GNMData, options: FitOptions):
         self.scheme, self._data, self._options = scheme, data, options
+        self._mean = mean_head(scheme, data, options)
         self._restricted: tuple[Reduction, LandmarkModel, Anatomy | None] | None = None
 
     def _model(
@@ -113,7 +114,7 @@ class _Prepared:
     def fit(self, observations: Observations, poses: Sequence[HeadPose] | None = None) -> LandmarkFit:
         began = time.perf_counter()
         options = self._options
-        start = start_poses(observations, self._data, options)
+        start = start_poses(observations, self._mean, options)
         if poses is not None:
             start = start.at(poses)
         reduction, model, anatomy = self._model(observations, start.pixels_per_metre)

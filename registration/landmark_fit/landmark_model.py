@@ -20,6 +20,7 @@ from scipy.spatial.transform import Rotation
 from registration.model.gnm_npz import GNMData
 
 _MIN_WEIGHT = 1e-9  # of a pair
+_MOST = 0.7  # of the points
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -76,6 +77,8 @@ class LandmarkModel:
             rows = np.flatnonzero(np.einsum("lk,lk->l", np.abs(weights), skinning[j][indices]) > _MIN_WEIGHT)
             if not len(rows):
                 continue
+            if len(rows) > _MOST * self.count:  # sums over all points are faster than over chosen ones
+                rows = np.arange(self.count)
             vertices, share = indices[rows], weights[rows] * skinning[j][indices[rows]]
 
             def carried(basis: np.ndarray, vertices: np.ndarray = vertices, share: np.ndarray = share) -> np.ndarray:
@@ -99,6 +102,7 @@ class LandmarkModel:
                 )
             )
         self.anchor = int(of_joint.sum(0).argmax()) if anchor is None else anchor
+        self._joints.sort(key=lambda part: not part.whole)
         self.joint_count = joints
         self.has_correctives = corrective is not None
 

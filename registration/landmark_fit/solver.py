@@ -49,7 +49,7 @@ def minimize(problem: Problem, state: State, free: Free, max_iterations: int, to
             try:
                 local, shared = system.step(damping)
                 candidate = moved(state, problem.layout, free, *coordinates.undone(local, shared))
-                value = problem.energy(candidate)
+                value = problem.energy(candidate, energy)
             except NotPositive:
                 value = np.inf
             if value <= energy:

@@ -15,7 +15,7 @@ from registration.landmark_fit.solver import Minimum, minimize
 from registration.landmark_fit.start import Start
 from registration.landmark_fit.state import Free, Layout, State, free_columns
 
-_MANY, _COARSE = 1500, 700  # landmarks above which stages before the last use so many of them
+_MANY, _COARSE = 1500, 400  # landmarks above which stages before the last use so many of them
 _COARSE_ITERATIONS = 12
 _SOFT = 2.0  # factor of the anatomical term's standard deviations before the last stage
 _COARSE_TOLERANCE = 0.3

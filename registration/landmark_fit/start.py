@@ -8,12 +8,13 @@ from jaxtyping import Float, Int
 from scipy.spatial.transform import Rotation
 
 from registration.errors import InputError
-from registration.landmark_fit.facing import check_facing
+from registration.landmark_fit.facing import check_facing, landmark_normals
 from registration.landmark_fit.initial_pose import combined, orthographic, placed
 from registration.landmark_fit.observations import Observations
 from registration.landmark_fit.options import FitOptions
 from registration.landmark_fit.state import State
 from registration.model.gnm_npz import GNMData
+from registration.model.landmarks import LandmarkScheme
 from registration.types import HeadPose
 
 _MIN_ANGLE = np.radians(3.0)  # between the rays of two views, for a position by intersection
@@ -63,34 +64,42 @@ class Start:
         )
 
 
-def mean_points(observations: Observations, data: GNMData, options: FitOptions) -> Float[np.ndarray, "L 3"]:
-    """The landmarks of the mean head, metres, model frame."""
+@dataclass(frozen=True, kw_only=True, eq=False)
+class MeanHead:
+    """The landmarks of the mean head, model frame."""
+
+    points: Float[np.ndarray, "L 3"]  # metres
+    normals: Float[np.ndarray, "L 3"]
+
+
+def mean_head(scheme: LandmarkScheme, data: GNMData, options: FitOptions) -> MeanHead:
+    """The head that a fit begins with: of a known identity, if there is one."""
     template = data.template_vertex_positions.astype(np.float64)
     if options.offsets is not None:
         template = template + options.offsets
     if options.identity is not None:
         template = template + np.tensordot(options.identity, data.vertex_identity_basis.astype(np.float64), 1)
-    return observations.scheme.points(template)
+    return MeanHead(points=scheme.points(template), normals=landmark_normals(scheme, data))
 
 
-def start_poses(observations: Observations, data: GNMData, options: FitOptions) -> Start:
+def start_poses(observations: Observations, mean: MeanHead, options: FitOptions) -> Start:
     """Pose the mean head in every frame.
 
     Args:
         observations: of one subject.
-        data: the model.
+        mean: the mean head.
         options: the prior of focal lengths.
 
     Raises:
         InputError: a frame or a view cannot be posed, or landmarks are mirrored.
     """
-    points = mean_points(observations, data, options)
+    points = mean.points
     pivot = points[observations.seen.any((0, 1))].mean(0)
     views = observations.views
     group, known, log_focal = _focals(observations, options)
     centre = np.array([v.principal_px or (v.width_px / 2, v.height_px / 2) for v in views], np.float64)
     poses = [[orthographic(points, pixels, pivot) for pixels in frame] for frame in observations.points_px]
-    check_facing(observations, data, poses)
+    check_facing(observations, mean.normals, poses)
     focal = np.exp(log_focal)[group]
     heads = [
         [None if pose is None else placed(pose, focal[v], centre[v]) for v, pose in enumerate(frame)] for frame in poses
