@@ -25,6 +25,8 @@ from registration.footage.video import Video, open_video
 from registration.footage.windows import fit_long
 from registration.inputs import read_schemes
 from registration.landmark_fit.fit import fit_landmarks
+from registration.landmark_fit.options import ExpressionPrior
+from registration.landmark_fit.prior import read_expression_prior
 from registration.model import gnm_npz
 from registration.model.landmarks import LandmarkScheme
 from registration.progress import NullProgress, Progress
@@ -77,9 +79,12 @@ def fit_footage(
     else:
         check_output_folder(out)
         _check_moment(options)
+    if kind == "capture":
+        _check_capture(options)
     data = gnm_npz.read(Path(model))
     schemes = read_schemes(Path(model), data, {})
     known = read_identity(options.identity_from, data)
+    prior = read_expression_prior(Path(model), data, options.expression_sigma)
     video = open_video(source, options) if kind == "video" else None
     if video is None:
         footage = read_moment(kind, source, schemes, options, out, progress)
@@ -93,9 +98,10 @@ def fit_footage(
         data=data,
         schemes=schemes,
         known=known,
+        prior=prior,
         options=options,
         config=_config(kind, options),
-        digests=_digests(footage, data, known),
+        digests=_digests(footage, data, known, prior),
         provenance=_provenance(source, Path(model), out, options),
         out=out,
         progress=progress,
@@ -117,6 +123,7 @@ class _Task:
     data: gnm_npz.GNMData
     schemes: Mapping[str, LandmarkScheme]  # of the model
     known: KnownIdentity | None
+    prior: ExpressionPrior | None  # of the model's expressions
     options: FootageOptions
     config: Mapping[str, Any]
     digests: Mapping[str, str]
@@ -138,7 +145,7 @@ class _Task:
     def moment(self) -> FitOutcome:
         """Fit and write one moment."""
         fit = fit_landmarks(
-            self.footage.observations, self.data, solver_options(self.footage, self.options, self.known)
+            self.footage.observations, self.data, solver_options(self.footage, self.options, self.known, self.prior)
         )
         self.progress.message("writing the page")
         fitted_scheme = self.footage.observations.scheme
@@ -159,7 +166,7 @@ class _Task:
         fit = fit_long(
             self.footage.observations,
             self.data,
-            solver_options(self.footage, self.options, self.known),
+            solver_options(self.footage, self.options, self.known, self.prior),
             report=lambda done, total: self.progress.update(done, total, "solving windows"),
         )
         fitted = FittedSequence(
@@ -193,13 +200,29 @@ def _check_moment(options: FootageOptions) -> None:
             )
 
 
-def _digests(footage: Footage, data: gnm_npz.GNMData, known: KnownIdentity | None) -> dict[str, str]:
+def _check_capture(options: FootageOptions) -> None:
+    """Refuse options of unknown cameras for a capture. Raises InputError."""
+    for name in ("focal", "principal_point", "distortion"):
+        if getattr(options, name) != getattr(_DEFAULTS, name):
+            raise InputError(
+                "The option is for unknown cameras only",
+                where=f"--{name.replace('_', '-')}",
+                expected="images or a video as input",
+                got="a capture with calibrated cameras",
+                fix="leave it out, or fit the folder of the capture's images",
+            )
+
+
+def _digests(
+    footage: Footage, data: gnm_npz.GNMData, known: KnownIdentity | None, prior: ExpressionPrior | None
+) -> dict[str, str]:
     scheme: LandmarkScheme = footage.observations.scheme
     return {
         **footage.digests,
         "model": gnm_npz.content_hash(data),
         f"landmarks {scheme.name}": hashing.hash_fields(scheme),
         **({} if known is None else {"identity": known.digest}),
+        **({} if prior is None else {"expression prior": hashing.hash_fields(prior)}),
     }
 
 

@@ -11,7 +11,7 @@ from registration.errors import InputError
 from registration.footage.observed import Footage
 from registration.footage.options import FootageOptions
 from registration.footage.sequence_file import FILE, read_sequence
-from registration.landmark_fit.options import FitOptions, TemporalPrior
+from registration.landmark_fit.options import ExpressionPrior, FitOptions, TemporalPrior
 from registration.model.gnm_npz import GNMData, topology_hash
 from registration.storage.hashing import hash_arrays
 from registration.storage.registration_folder import is_registration, load_registration
@@ -69,12 +69,15 @@ def read_identity(path: Path | None, data: GNMData) -> KnownIdentity | None:
     return KnownIdentity(identity=identity, offsets=offsets)
 
 
-def solver_options(footage: Footage, options: FootageOptions, known: KnownIdentity | None) -> FitOptions:
+def solver_options(
+    footage: Footage, options: FootageOptions, known: KnownIdentity | None, prior: ExpressionPrior | None = None
+) -> FitOptions:
     """Return the solver's options for an input."""
     plain = FitOptions()
     sequence = footage.kind == "video" and options.temporal
     return FitOptions(
         expression_sigma=options.expression_sigma,
+        expression_prior=prior,
         focal_guess=plain.focal_guess if footage.focal_guess is None else footage.focal_guess,
         log_focal=plain.log_focal if footage.focal_guess is None else EXIF_SIGMA,
         principal_point=options.principal_point,

@@ -22,7 +22,7 @@ class ViewCamera:
     width_px: int
     height_px: int
     focal_px: float | None = None  # None: unknown
-    principal_px: tuple[float, float] | None = None  # None: the image's centre
+    principal_px: tuple[float, float] | None = None  # None: near the image's centre, of a lens that may distort
     T_cam_world: Float[np.ndarray, "4 4"] | None = None  # None: unknown; a single view's camera frame is the world
     group: int = 0  # views of one group share an unknown focal length
 

@@ -31,11 +31,11 @@ class FitOptions:
     expression_prior: ExpressionPrior | None = None  # in place of `expression_sigma`
     head_rotation: float = 0.3  # of the head about the neck, radians
     eye_rotation: float = 0.35  # radians
-    log_focal: float = 0.15  # of an unknown focal length about `focal_guess`
+    log_focal: float = 0.3  # of an unknown focal length about `focal_guess`
     focal_guess: float = 1.2  # relative to the longer side of the image
-    principal_point: bool = False  # estimate it, about the image's centre
+    principal_point: bool = False  # estimate it, about the image's centre, of views that state none
     principal_sigma: float = 0.02  # relative to the image's width
-    distortion: bool = False  # estimate one radial coefficient of each group of views
+    distortion: bool = False  # estimate one radial coefficient of each group of views that state no principal point
     distortion_sigma: float = 0.1
     scale: float = 1.0  # the head's size relative to the model's
     size: bool = False  # estimate it, about `scale`
@@ -47,8 +47,6 @@ class FitOptions:
     anatomy: float = 1.0  # weight of penetrations of eyeballs and lids, teeth and lips, tongue and mouth; 0: none
     covariance: bool = True  # estimate posterior standard deviations
     max_iterations: int = 30  # of each stage
-    tolerance: float = (
-        1e-3  # decrease of the energy per frame, minus the logarithm of the posterior, at which a fit ends
-    )
+    tolerance: float = 1e-3  # decrease of the energy (minus the logarithm of the posterior) per frame that ends a fit
     identity: Float[np.ndarray, "I"] | None = None  # known: it is not estimated
     offsets: Float[np.ndarray, "V 3"] | None = None  # of the bind pose, metres, known

@@ -98,9 +98,9 @@ def _free(layout: Layout, start: Start, names: list[str]) -> Free:
         shared[layout.shared(name)] = name in names
     known = np.array(start.group_known)
     shared[layout.shared("focal")] &= ~known
-    shared[layout.shared("k1")] &= ~known
-    of_known = known[start.group]
-    shared[layout.shared("principal")] &= ~np.repeat(of_known, 2)
+    uncalibrated = ~np.array(start.centre_known)
+    shared[layout.shared("k1")] &= np.isin(np.arange(layout.groups), start.group[uncalibrated])
+    shared[layout.shared("principal")] &= np.repeat(uncalibrated, 2)
     shared[layout.shared("poses")] &= ~np.repeat(np.array(start.pose_known), 6)
     return free_columns(layout, local, shared)
 

@@ -29,6 +29,7 @@ class Start:
     group_known: tuple[bool, ...]
     log_focal: Float[np.ndarray, "G"]
     centre_px: Float[np.ndarray, "N 2"]
+    centre_known: tuple[bool, ...]  # of a calibrated view, whose lens does not distort
     pose_known: tuple[bool, ...]
     view_rotations: Float[np.ndarray, "N 3 3"]
     view_translations: Float[np.ndarray, "N 3"]
@@ -129,6 +130,7 @@ def start_poses(observations: Observations, mean: MeanHead, options: FitOptions)
         group_known=known,
         log_focal=log_focal,
         centre_px=centre,
+        centre_known=tuple(view.principal_px is not None for view in views),
         pose_known=tuple(pose_known),
         view_rotations=R,
         view_translations=t,

@@ -203,3 +203,12 @@ def test_a_focal_length_that_is_no_number(image: Path, capsys: pytest.CaptureFix
     with pytest.raises(SystemExit) as stop:
         main(["fit", str(image), "--model", str(known.MODEL), "--out", "out", "--focal", "long"])
     assert stop.value.code == 2 and "long" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("changed", [{"focal": 900.0}, {"principal_point": True}, {"distortion": True}])
+def test_options_of_unknown_cameras_are_refused_for_captures(tmp_path, changed):
+    capture = tmp_path / "capture"
+    capture.mkdir()
+    (capture / "capture.toml").write_text("", "utf-8")
+    with pytest.raises(InputError, match="unknown cameras only"):
+        fit_footage(capture, tmp_path / "model.npz", tmp_path / "out", FootageOptions(**changed))

@@ -101,7 +101,7 @@ def test_a_video_becomes_a_folder(video: Path, tmp_path: Path, use) -> None:
     assert arrays["frames"].tolist() == list(range(FRAMES))
     assert arrays["times_s"] == pytest.approx(np.arange(FRAMES) / 20, abs=1e-3)
     assert arrays["expression"].shape == (FRAMES, len(known.DATA.expression_basis))
-    assert np.nanmax(np.abs(arrays["residual_px"])) < 1.0
+    assert np.nanmax(np.abs(arrays["residual_px"])) < 1.5
     assert arrays["camera_intrinsics"][0, 0, 0] == pytest.approx(known.FOCAL)
     assert json.loads(str(arrays["config"]))["input"] == "video"
     assert {path.name for path in (out / "meshes").glob("*.obj")} == {"000000.obj", "000005.obj"}
@@ -228,7 +228,7 @@ def test_a_long_sequence_is_as_a_short_one(video: Path, use) -> None:
     distance = np.linalg.norm(
         parts.vertices(known.DATA, slice(None)) - whole.vertices(known.DATA, slice(None)), axis=-1
     )
-    assert 1e3 * np.median(distance) < 1.0
+    assert 1e3 * np.median(distance) < 2.0
     assert parts.residual_px.shape == whole.residual_px.shape
 
 
