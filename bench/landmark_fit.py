@@ -11,7 +11,7 @@ schur      steps of the eliminated and of the dense system: 6 frames
 frames     identity of one frame and of ten: 10 heads
 noise      600 landmarks with one pixel of noise, in one, three and eight views: 20 heads
 sequence   a talking head in one view: 300 frames
-single     the paper's single-view experiment: 2,000 pictures of each kind
+single     the paper's single-view experiment: 2,000 pictures of people of each model, 300 of other people
 oral       teeth and tongue of open mouths: 40 heads
 mediapipe  MediaPipe's own points of rendered faces beside ours: 12 faces
 
@@ -61,7 +61,7 @@ def _cases(models: list[HeadModel]) -> list[single.Case]:
     """In-model people of each model, MakeHuman's people, and the other topology's people."""
     first = models[0]
     makehuman = OfMakeHuman(first)
-    cases = [single.Case(people=OfModel(model), model=model, in_model=True) for model in models]
+    cases = [single.Case(people=OfModel(model), model=model, in_model=True) for model in reversed(models)]
     cases += [single.Case(people=makehuman, model=model) for model in models]
     return cases + [single.Case(people=OfModel(model), model=first) for model in models[1:]]
 
