@@ -30,6 +30,7 @@ class Weights:
 
     normals: float = 1.0
     normal_truncation: float = 2.0  # length of the difference of unit normals beyond which it is an outlier
+    lid_normal_truncation: float = 2.0  # the same on the eyelids, which may fold over one another
     rgb: float = 0.0
     ssim: float = 0.0
     mask: float = 0.5
@@ -115,6 +116,7 @@ _POSE = (("root", 5e-3), ("joints", 5e-3), ("position", 1e-3), ("eyes", 1e-3))
 
 
 _SCAN = 3e4  # per m^2
+_LID_NORMAL_TRUNCATION = 0.45  # 26 degrees: a rim, where the image shows the lid that covers it
 _COARSE_MM = 10.0  # smoothing beyond which the head's shape is still unknown, and closest points are wrong ones
 
 
@@ -142,6 +144,7 @@ def _offsets(
         lengths=Lengths(smoothing_mm=smoothing_mm, half_gain_mm=half_gain_mm),
         free=(("offsets", Rate(start=start, end=end)), ("eyes", Rate(start=start / 10, end=end / 10))),
         weights=Weights(
+            lid_normal_truncation=_LID_NORMAL_TRUNCATION,
             rgb=0.3,
             ssim=ssim,
             classes=0.1,

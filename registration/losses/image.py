@@ -74,7 +74,9 @@ def rgb_ssim(rendered: Rendered, targets: Targets, agree: Bool[Tensor, "P"]) -> 
     return (dissimilarity * weight).sum() / subject_pixels(targets)
 
 
-def normals(rendered: Rendered, targets: Targets, agree: Bool[Tensor, "P"], truncation: float) -> Float[Tensor, ""]:
+def normals(
+    rendered: Rendered, targets: Targets, agree: Bool[Tensor, "P"], truncation: float | Float[Tensor, "P"]
+) -> Float[Tensor, ""]:
     """Return the truncated difference of unit normals.
 
     Sum over pixels of w d, d = sqrt(|n_r - n_t|^2 + 1e-6) where d < truncation, over the subject's pixels. The weights
@@ -84,7 +86,7 @@ def normals(rendered: Rendered, targets: Targets, agree: Bool[Tensor, "P"], trun
         rendered: the mesh; normals in the world.
         targets: normals in the world, weights w.
         agree: the pixels that are compared.
-        truncation: larger differences are outliers and do not count; 2 is the largest one.
+        truncation: larger differences are outliers and do not count; 2 is the largest one. For all pixels or for each.
     """
     difference = ((rendered.normals - targets.normals).square().sum(-1) + 1e-6).sqrt()
     weight = targets.normal_weight * agree * (difference.detach() < truncation)

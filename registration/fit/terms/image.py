@@ -7,14 +7,21 @@ from torch import Tensor
 
 from registration.fit.terms.term import StageContext, StepState, Term
 from registration.losses import image
+from registration.model.regions import offset_regions
 
 
 def normals(context: StageContext) -> Term | None:
     """Rendered against predicted normals."""
-    weights = context.stage.weights
+    weights, fit = context.stage.weights, context.fit
+    other, on_lids = weights.normal_truncation, weights.lid_normal_truncation
+    lids = torch.as_tensor(offset_regions(fit.data)["lids"][fit.data.triangles].any(1), device=fit.device)
 
     def term(state: StepState) -> Mapping[str, Tensor]:
-        loss = image.normals(state.rendered, state.batch, state.agree, weights.normal_truncation)
+        truncation = state.batch.normal_weight.new_full(state.batch.normal_weight.shape, other)
+        if on_lids != other:
+            hits = fit.renderer.surface(state.vertices.detach(), state.batch.pixels)
+            truncation[hits.pixel[lids[hits.face]]] = on_lids
+        loss = image.normals(state.rendered, state.batch, state.agree, truncation)
         return {"normals": weights.normals * loss}
 
     return term if weights.normals > 0 else None
