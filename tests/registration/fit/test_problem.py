@@ -13,14 +13,16 @@ from registration.fit import terms
 from registration.fit.context import FitContext, ViewOrder
 from registration.fit.initialization import from_landmarks
 from registration.fit.problem import FitProblem, assess, refine
-from registration.fit.recipes import Rate, Recipe, Stage, Weights, preview
+from registration.fit.recipes import Rate, Recipe, Stage, Weights, draft, preview, studio
 from registration.fit.terms import StageContext, StepState, Term
+from registration.fit.terms import image as image_terms
 from registration.fit.variables import InitialGuess
 from registration.geometry.nearest_planes import MeshPlanes
 from registration.geometry.surface_views import SurfaceViews
 from registration.inputs import RegistrationInputs, read_inputs
 from registration.model.atlas import texture_atlas
 from registration.model.gnm import GNM
+from registration.model.regions import offset_regions
 from registration.options import RegisterOptions
 from registration.render import backend
 from registration.targets.classes import class_map
@@ -101,6 +103,53 @@ def test_depths_are_fitted_where_there_are_any(context: FitContext, initial: Ini
     trace = problem.run([stage])
     after = (problem.vertices() - vertices).norm(dim=-1).mean()
     assert set(trace.history["pose"]) == {"depth"} and after < 0.2 * before
+
+
+@pytest.mark.parametrize("difference, counts", [(0.3, True), (0.6, False)])
+def test_large_differences_of_normals_do_not_count_on_the_lids(
+    context: FitContext, initial: InitialGuess, difference: float, counts: bool
+) -> None:
+    """Normals that all differ by one length: beyond the lids' limit, pixels on lids alone are without cost."""
+    problem = FitProblem(context, initial)
+    plain = context.recipe.stages[1]
+    state = problem._step_state(plain, 0)
+    rendered = replace(state.rendered, normals=state.rendered.normals.detach().requires_grad_())
+    shown = rendered.normals.detach()
+    across = torch.linalg.cross(shown, torch.tensor([0.6, 0.0, 0.8]).expand_as(shown))
+    tilt = 2 * np.arcsin(difference / 2)  # of unit vectors whose tips are so far apart
+    tilted = np.cos(tilt) * shown + np.sin(tilt) * torch.nn.functional.normalize(across, dim=1)
+    batch = replace(state.batch, normals=tilted, normal_weight=rendered.mask.detach())
+    state = replace(state, rendered=rendered, batch=batch, agree=torch.ones_like(state.agree))
+
+    def used(truncation: float) -> torch.Tensor:
+        """The pixels whose normals have a gradient."""
+        stage = replace(plain, weights=Weights(lid_normal_truncation=truncation))
+        shared = StageContext(
+            fit=context,
+            stage=stage,
+            variables=problem.variables,
+            appearance=problem.appearance,
+            landmarks_used=problem.landmarks_used,
+            regularizer=None,
+        )
+        term = image_terms.normals(shared)
+        assert term is not None
+        (gradient,) = torch.autograd.grad(term(state)["normals"], rendered.normals)
+        return gradient.abs().amax(1) > 0
+
+    hits = context.renderer.surface(state.vertices.detach(), batch.pixels)
+    members = offset_regions(context.data)["lids"][context.data.triangles[hits.face.numpy()]].any(1)
+    on_lids = torch.zeros(len(batch.mask), dtype=torch.bool)
+    on_lids[hits.pixel[torch.as_tensor(members)]] = True
+    everywhere, limited = used(2.0), used(0.45)
+    assert (everywhere & on_lids).sum() > 5 and (everywhere & ~on_lids).sum() > 500
+    assert torch.equal(limited, everywhere if counts else everywhere & ~on_lids)
+
+
+def test_recipes_limit_normals_on_the_lids_while_offsets_are_free() -> None:
+    for recipe in (draft(), preview(), studio()):
+        for stage in recipe.stages:
+            assert (stage.weights.lid_normal_truncation < stage.weights.normal_truncation) == stage.frees("offsets")
 
 
 def test_a_scan_is_fitted_in_the_finer_stages_only(

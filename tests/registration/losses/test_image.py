@@ -149,6 +149,10 @@ def test_normals_by_hand():
     assert value == pytest.approx((lengths * [1, 0.25]).sum() / len(target.mask))
     two = image.normals(rendered, target, everywhere(target), 2.5).item()
     assert two == pytest.approx(((lengths * [1, 0.25]).sum() + np.sqrt(4 + 1e-6)) / len(target.mask))
+    limits = torch.full_like(target.mask, 2.5)
+    limits[1:3] = torch.tensor([1.0, 2.5])  # of each pixel: the second is beyond, the third is not
+    each = image.normals(rendered, target, everywhere(target), limits).item()
+    assert each == pytest.approx((lengths[0] + np.sqrt(4 + 1e-6)) / len(target.mask))
 
 
 def test_mask_by_hand():
