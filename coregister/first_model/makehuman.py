@@ -7,6 +7,7 @@ The mesh, its targets and its mask images are CC0 1.0 (MakeHuman community); so 
 import difflib
 import gzip
 import io
+import os
 import zipfile
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -70,8 +71,15 @@ class MakeHuman:
         return self.vertices[self.group(name)].mean(0)
 
     @cached_property
+    def _archives(self) -> dict[int, zipfile.ZipFile]:
+        return {}  # by process: one that is forked shares the position in an open file with its parent
+
+    @property
     def _archive(self) -> zipfile.ZipFile:
-        return zipfile.ZipFile(self.wheel)  # reading its long table of contents is slow: kept open
+        process = os.getpid()
+        if process not in self._archives:  # reading its long table of contents is slow: kept open
+            self._archives[process] = zipfile.ZipFile(self.wheel)
+        return self._archives[process]
 
     @cached_property
     def targets(self) -> Mapping[str, str]:

@@ -1,6 +1,7 @@
 """MakeHuman's data for the first model: the contents of the wheel, and the errors when it is missing."""
 
 import zipfile
+from multiprocessing import get_context
 
 import numpy as np
 import pytest
@@ -102,3 +103,19 @@ def test_masks_are_symmetric_and_at_their_regions(source, name, low, high):
     np.testing.assert_array_equal(inside, inside[source.mirror])
     height = source.vertices[inside, 1]
     assert len(height) > 50 and low < height.min() and height.max() < high
+
+
+def test_a_process_that_was_forked_opens_the_archive_again(source):
+    name = sorted(source.targets)[0]
+    expected, opened = source.target(name), source._archive
+
+    def read(results):
+        results.put((source._archive is opened, np.array_equal(source.target(name), expected)))
+
+    context = get_context("fork")
+    results = context.SimpleQueue()
+    process = context.Process(target=read, args=(results,))
+    process.start()
+    assert results.get() == (False, True)
+    process.join()
+    assert source._archive is opened
