@@ -1,0 +1,134 @@
+"""The mouth around a tongue: how a model opens it, and how deep a tongue lies in its teeth, palate and skin.
+
+The tongue and the lower teeth are carried by the jaw, as the model's lower-face components move them; a pose of the
+tongue is relative to that.
+"""
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from registration.frames import MM_PER_M
+from registration.geometry.closest_point import ClosestPointQuery
+from registration.geometry.topology import connected_parts
+from registration.geometry.winding import Winding, closed
+from registration.model import regions
+from registration.model.gnm_npz import GNMData
+
+_INCISORS = 6e-3, 8e-3  # metres behind the foremost lower tooth, and to each side of the median plane
+_INSIDE = 0.5  # winding number
+OBSTACLES = ("teeth and gums", "skin")
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class JawOpening:
+    """The lower-face components of a model, and the most probable expression that lowers the lower incisors."""
+
+    basis: Float[np.ndarray, "K V 3"]
+    direction: Float[np.ndarray, "K"]  # coefficients for 1 m between the incisors, beyond the template's
+
+    @classmethod
+    def of(cls, data: GNMData) -> "JawOpening":
+        """Find it: of the expressions that lower the incisors so far, the one with the smallest coefficients."""
+        basis = data.expression_basis[regions.expression_modes(data)["lower_face"]].astype(np.float64)
+        teeth = np.flatnonzero(regions.teeth(data) & regions.lower_teeth(data))
+        points = data.template_vertex_positions[teeth]
+        depth, side = _INCISORS
+        front = teeth[(points[:, 2] > points[:, 2].max() - depth) & (np.abs(points[:, 0]) < side)]
+        lowering = -basis[:, front, 1].mean(1)
+        return cls(basis=basis, direction=lowering / (lowering @ lowering))
+
+    def coefficients(self, gap: float, rng: np.random.Generator | None = None, spread: float = 0.0) -> np.ndarray:
+        """Return coefficients with a gap between the incisors (m, beyond the template's) and any other expression.
+
+        Args:
+            gap: metres.
+            rng: of the other coefficients; None: only the jaw opens.
+            spread: standard deviation of the other coefficients.
+        """
+        if rng is None:
+            return gap * self.direction
+        other = rng.normal(0, spread, len(self.direction))
+        unit = self.direction / np.linalg.norm(self.direction)
+        return gap * self.direction + other - (other @ unit) * unit
+
+    def displacement(self, coefficients: Float[np.ndarray, "K"]) -> Float[np.ndarray, "V 3"]:
+        """Return the displacements of all vertices, the tongue carried by the jaw."""
+        return np.tensordot(coefficients, self.basis, 1)
+
+
+class Mouth:
+    """What surrounds the tongue in one expression, prepared for many tongues. Metres, the model's frame."""
+
+    def __init__(self, data: GNMData, vertices: Float[np.ndarray, "V 3"]):
+        """Prepare the surfaces.
+
+        Args:
+            data: the model.
+            vertices: the model's vertices with an expression; those of the tongue are where the jaw carries them.
+        """
+        self.vertices = np.asarray(vertices, np.float64)
+        self.carried = self.vertices[regions.tongue(data)]
+        solids = regions.solids(data)
+        teeth = solids["teeth"]
+        part = connected_parts(teeth)
+        self._shells = [_Surface(self.vertices, teeth[part == number]) for number in np.unique(part)]
+        near = self._near(solids["skin"])
+        self._skin = _Surface(self.vertices, solids["skin"], near)
+
+    def _near(self, triangles: Int[np.ndarray, "F 3"]) -> Int[np.ndarray, "G 3"]:
+        """The skin within reach of the tongue, where distances are measured."""
+        reach = 0.05
+        low, high = self.carried.min(0) - reach, self.carried.max(0) + reach
+        centres = self.vertices[triangles].mean(1)
+        return triangles[((centres > low) & (centres < high)).all(1)]
+
+    def depths_mm(self, tongue: Float[np.ndarray, "N 3"], *, skin: bool = True) -> dict[str, Float[np.ndarray, "N"]]:
+        """Return how deep each vertex of a tongue lies in the teeth with their gums and palate, and in the skin.
+
+        Args:
+            tongue: the tongue's vertices in this mouth.
+            skin: ask for the skin too: lips, cheeks and the lining.
+
+        Returns:
+            By obstacle, in millimetres; 0 outside.
+        """
+        depths = {OBSTACLES[0]: np.max([shell.depth_mm(tongue) for shell in self._shells], axis=0)}
+        if skin:
+            depths[OBSTACLES[1]] = self._skin.depth_mm(tongue)
+        return depths
+
+    @cached_property
+    def resting(self) -> dict[str, Float[np.ndarray, "N"]]:
+        """The depths of the tongue as carried by the jaw, which no pose can avoid."""
+        return self.depths_mm(self.carried)
+
+    def excess_mm(self, tongue: Float[np.ndarray, "N 3"], *, skin: bool = True) -> dict[str, float]:
+        """Return by obstacle how much deeper than as carried by the jaw the deepest vertex lies, millimetres."""
+        depths = self.depths_mm(tongue, skin=skin)
+        return {name: float((depth - self.resting[name]).max(initial=0)) for name, depth in depths.items()}
+
+
+class _Surface:
+    """A closed surface, and the triangles to which depths are measured."""
+
+    def __init__(
+        self,
+        vertices: Float[np.ndarray, "V 3"],
+        triangles: Int[np.ndarray, "F 3"],
+        measured: Int[np.ndarray, "G 3"] | None = None,
+    ):
+        corners = vertices[triangles].reshape(-1, 3)
+        self._low, self._high = corners.min(0), corners.max(0)
+        self._winding = Winding(*closed(vertices, triangles))
+        self._query = ClosestPointQuery(vertices, triangles if measured is None else measured)
+
+    def depth_mm(self, points: Float[np.ndarray, "N 3"]) -> Float[np.ndarray, "N"]:
+        depth = np.zeros(len(points))
+        boxed = np.flatnonzero(((points > self._low) & (points < self._high)).all(1))
+        inside = boxed[self._winding.numbers(points[boxed]) > _INSIDE]
+        if len(inside):
+            depth[inside] = self._query.closest(points[inside])[0] * MM_PER_M
+        return depth
