@@ -14,6 +14,8 @@ from registration.capture.origin import capture_origin
 from registration.capture.scan import Scan, read_scan
 from registration.capture.triangulation import spreads_m, triangulate
 from registration.completion.plan import CompletionPlan, plan_completion
+from registration.cranium import auxiliary_model
+from registration.cranium.auxiliary_model import CraniumModel
 from registration.detect.providers import load_provider
 from registration.doctor.ledger import Ledger
 from registration.doctor.validation import validate_capture
@@ -39,6 +41,7 @@ NOT_HASHED = {  # fields of the options that decide nothing by themselves, and w
     "detect": "what is made is hashed",
     "stereo": "what is made is hashed",
     "detector": "its version is hashed where it is used",
+    "cranium": "the auxiliary model is hashed where it is used",
 }
 
 
@@ -58,6 +61,7 @@ class RegistrationInputs:
     recipe: Recipe
     camera_sigma_px: float  # expected error of the given cameras, px of the stored images; 0: they are exact
     neutral: Registration | None
+    cranium: CraniumModel | None  # that completes a hidden cranium; None: the fit's own, or the neutral's
     scan: Scan | None  # whose normals stand in for normal maps, or whose surface is fitted; None: neither
     fits_scan: bool  # whether its surface is fitted
     digests: Mapping[str, str]  # input -> sha256
@@ -102,7 +106,8 @@ def read_inputs(
     if not plan.landmarks:
         _check_head_can_be_found(selected, landmarks)
     scan = _scan_of_the_fit(selected, options)
-    digests, config = _deciding(capture, data, every, start, options)
+    cranium = None if start is not None else used_cranium(model_path, data, options)
+    digests, config = _deciding(capture, data, every, start, options, cranium)
     return RegistrationInputs(
         capture=selected,
         ledger=ledger,
@@ -116,6 +121,7 @@ def read_inputs(
         recipe=recipe if start is None else expression_recipe(recipe),
         camera_sigma_px=options.camera_sigma_px,
         neutral=start,
+        cranium=cranium,
         scan=scan,
         fits_scan=scan is not None
         and (options.use_scan == "always" or not any(view.has_normals for view in selected.views)),
@@ -123,6 +129,15 @@ def read_inputs(
         config=config,
         notes=(*_of_the_scan(capture), *data.remarks, *_reversed_files(capture, schemes)),
     )
+
+
+def used_cranium(model_path: Path, data: gnm_npz.GNMData, options: RegisterOptions) -> CraniumModel | None:
+    """Return the auxiliary model beside a head model, if there is one and the options want it.
+
+    Raises:
+        InputError: it cannot be read, or has another topology.
+    """
+    return auxiliary_model.find(model_path, data) if options.cranium == "model" else None
 
 
 def read_schemes(model_path: Path, data: gnm_npz.GNMData, files: Mapping[str, Path]) -> dict[str, LandmarkScheme]:
@@ -174,6 +189,7 @@ def input_hash(
     schemes: Mapping[str, LandmarkScheme],
     neutral: Registration | None,
     options: RegisterOptions,
+    cranium: CraniumModel | None = None,
 ) -> str:
     """Return the sha256 of all that decides a registration: equal for two that must have equal results.
 
@@ -186,11 +202,12 @@ def input_hash(
         schemes: of the model, as `read_schemes` returns them.
         neutral: the subject's neutral registration that the fit starts from, if any.
         options: of the registration; the recipe is hashed by its values, not by its name.
+        cranium: what `used_cranium` returns for a registration without a neutral, if any.
 
     Raises:
         InputError: there is no such recipe, or `options.views` is below 2.
     """
-    return hashing.input_hash(*_deciding(capture, data, schemes, neutral, options))
+    return hashing.input_hash(*_deciding(capture, data, schemes, neutral, options, cranium))
 
 
 def _deciding(
@@ -199,6 +216,7 @@ def _deciding(
     schemes: Mapping[str, LandmarkScheme],
     neutral: Registration | None,
     options: RegisterOptions,
+    cranium: CraniumModel | None,
 ) -> tuple[dict[str, str], dict[str, Any]]:
     """Digests of the inputs, and the resolved options as JSON values."""
     recipe, selected = load_recipe(options.recipe), _select_views(capture, options.views)
@@ -210,6 +228,8 @@ def _deciding(
         detected, digests["detector"] = provider.scheme, provider.version
     used = used_schemes(schemes, capture, detected=detected)
     digests |= {f"landmarks {name}": hashing.hash_fields(scheme) for name, scheme in used.items()}
+    if cranium is not None:
+        digests["cranium"] = hashing.hash_fields(cranium)
     if neutral is not None:
         digests["neutral"] = hashing.hash_fields(neutral)
         recipe = expression_recipe(recipe)

@@ -76,6 +76,8 @@ class RegisterOptions:
         detector: The landmark provider: face478, or the import path MODULE:FUNCTION of a function that returns one.
         camera_sigma_px: Expected error of the given cameras: rms shift of the head in the stored images, pixels. Above
             0, the fit corrects poses and focal lengths, with this prior. 0: the cameras are exact.
+        cranium: What a cranium that hair, a cap or missing cameras hide is like. model: as the auxiliary model beside
+            the head model expects it with this face (`gnmreg model cranium`), if there is one. off: as the fit left it.
         landmark_files: The model's vertices of landmark schemes, instead of the files next to the model.
     """
 
@@ -89,6 +91,7 @@ class RegisterOptions:
     stereo: bool = True
     detector: Annotated[str, arg(metavar="NAME")] = DETECTOR
     camera_sigma_px: Annotated[float, arg(name="camera-sigma", metavar="PX")] = 0.0
+    cranium: Literal["model", "off"] = "model"
     landmark_files: Annotated[Mapping[str, Path], _LANDMARK_FILES, _LANDMARKS_ARGUMENT] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -119,6 +122,7 @@ class RegisterOptions:
         words += ["--no-stereo"] if not self.stereo else []
         words += ["--detector", self.detector] if self.detector != default.detector else []
         words += ["--camera-sigma", f"{self.camera_sigma_px:g}"] if self.camera_sigma_px else []
+        words += ["--cranium", self.cranium] if self.cranium != default.cranium else []
         if self.landmark_files:
             words += ["--landmarks", *(f"{scheme}={file}" for scheme, file in sorted(self.landmark_files.items()))]
         return words

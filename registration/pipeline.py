@@ -4,15 +4,19 @@ import shlex
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
+from jaxtyping import Float
 
 from registration.capture.origin import in_world
 from registration.capture.visual_hull import outside_masks
 from registration.completion.saved import Completion
+from registration.cranium.complete import CompletedCranium, CraniumCompletion
+from registration.cranium.registered import cranium_figure, cranium_note, write_cranium
 from registration.evaluate.audit import audit_penetration
 from registration.evaluate.evaluation import RegistrationEvaluation, evaluate_registration, without_scan
 from registration.evaluate.verdict import judge
@@ -97,10 +101,23 @@ def register(
     fitted = _fit(inputs, options.seed, device, pictures, progress)
     progress.message("comparing with the views")
     comparison = compare_views(fitted.problem)
+    cranium, figure = _complete_cranium(inputs, fitted.problem, comparison.confidence)
+    if cranium is not None:
+        progress.message("comparing with the views, with the completed cranium")
+        comparison = compare_views(fitted.problem)
     provenance = _provenance(capture, model, out, options, neutral)
     collected = _with_made(replace(_collect(inputs, fitted, comparison), provenance=provenance), completion)
+    note = cranium_note(figure, wanted=options.cranium == "model", neutral=neutral is not None)
+    notes = [*collected.figures["notes"], *([] if note is None else [note])]
+    collected = replace(collected, figures={**collected.figures, "cranium": figure, "notes": notes})
     registration, page = _evaluate(inputs, comparison, collected, completion, progress)
-    save_registration(registration, out, page, camera_refinement.writer(fitted.problem.refinement, inputs.capture))
+    save_registration(
+        registration,
+        out,
+        page,
+        camera_refinement.writer(fitted.problem.refinement, inputs.capture),
+        None if cranium is None else partial(write_cranium, cranium),
+    )
     return registration
 
 
@@ -164,6 +181,21 @@ def _fit(
     if snapshots is not None:
         snapshots.stage_begins("end")
     return _Fitted(problem=problem, initial=initial, trace=trace, seconds={**seconds, **trace.seconds})
+
+
+def _complete_cranium(
+    inputs: RegistrationInputs, problem: FitProblem, confidence: Float[np.ndarray, "V"]
+) -> tuple[CompletedCranium | None, dict[str, Any]]:
+    """Complete the hidden cranium of a fit in place; return it, None if it stays as it is, and the figure of it."""
+    head = problem.variables.neutral_vertices().double().cpu().numpy()
+    completed = None
+    if inputs.cranium is not None and np.isfinite(head).all():
+        completed = CraniumCompletion(inputs.data, inputs.cranium)(head, confidence)
+    moved = None
+    if completed is not None:
+        moved = completed.vertices - head
+        problem.variables.move_skin(moved)
+    return completed, cranium_figure(inputs.data, confidence, inputs.cranium, completed, moved)
 
 
 def _context(inputs: RegistrationInputs, seed: int, device: torch.device, progress: Progress) -> FitContext:

@@ -153,6 +153,19 @@ class Variables:
         return self.model.bind(identity, torch.zeros_like(self.tensors["expression"]))
 
     @torch.no_grad()
+    def neutral_vertices(self) -> Float[Tensor, "V 3"]:
+        """Return the head with a neutral expression and the free offsets, model frame, metric size, metres."""
+        offsets = torch.zeros_like(self.fixed_offsets).index_add(0, self._skin, self.skin_offsets())
+        return self.tensors["scale"].exp() * (self.bind_pose_vertices() + offsets)
+
+    @torch.no_grad()
+    def move_skin(self, displacement: Float[np.ndarray, "V 3"]) -> None:
+        """Displace the skin of `neutral_vertices`, and with it the mesh, between two stages; metres."""
+        assert self.latent is None
+        moved = torch.as_tensor(displacement[self.skin], dtype=self._offsets.dtype, device=self._offsets.device)
+        self._offsets = self._offsets + moved / self.tensors["scale"].exp()
+
+    @torch.no_grad()
     def parameters(self) -> tuple[Parameters, Float[Tensor, "V 3"]]:
         """Return the model's parameters and offsets (bind pose, metres) that give the same mesh."""
         rotation, scale = self.rotation(), self.tensors["scale"].exp()

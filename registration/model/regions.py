@@ -242,6 +242,11 @@ def head_skin(data: GNMData) -> Bool[np.ndarray, "V"]:
     return exterior(data) & ~neck_other(data)
 
 
+def cranium(data: GNMData) -> Bool[np.ndarray, "V"]:
+    """Skin of the head around the face mask, with the ears: what hair, a cap or missing cameras may hide."""
+    return head_skin(data) & (group(data, "hockey_mask") <= _INSIDE)
+
+
 def head_regions(data: GNMData) -> dict[str, Bool[np.ndarray, "V"]]:
     """Regions of `head_skin` for which metrics are given; they may overlap and need not cover it."""
     parts = stabilization_regions(data)

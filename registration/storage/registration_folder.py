@@ -37,7 +37,8 @@ FILES = {  # and what each is, for people
     REPORT: "this page",
 }
 SPARSE = "sparse"  # a COLMAP model of the corrected cameras, where the fit corrected or estimated them
-FIT_FILES = {  # of a fit to landmarks alone, and what each is
+FIT_FILES = {  # of some fits, mostly to landmarks alone, and what each is
+    "cranium.npz": "the completed cranium: where, and how far it may be off",
     "overlay.jpg": "the mesh drawn over the images",
     "uncertainty.npz": "posterior covariances and standard deviations",
     "uncertainty.png": "standard deviations of the vertices as colours",

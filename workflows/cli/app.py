@@ -75,6 +75,7 @@ GROUPS: Mapping[str, Mapping[str, Command]] = {
     "Model": {
         "coregister": coregister.coregister,
         "model bootstrap": model.bootstrap,
+        "model cranium": model.cranium,
         "model landmarks": model.landmarks,
         "model fetch": model.fetch,
         "model info": model.info,

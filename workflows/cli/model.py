@@ -122,6 +122,35 @@ def bootstrap(out: OptionalModel = None) -> int:
     return 0
 
 
+def cranium(
+    model: Positional[Annotated[Path, arg(metavar="NPZ")]],
+    /,
+    out: OptionalFile = None,
+    heads: OptionalFolder = None,
+    count: Annotated[int, arg(metavar="N")] = 200,
+    seed: Seed = 0,
+) -> int:
+    """Build the auxiliary model of whole heads that completes a cranium under hair.
+
+    Registrations and builds with the head model find it beside the model's file.
+
+    Args:
+        model: The head model, a GNM NPZ file.
+        out: The file to write; by default head_cranium.npz beside the model.
+        heads: Folder of at least 30 whole heads in the model's topology, meshes or registrations. By default people
+            of MakeHuman's CC0 population, which the first model's topology has.
+        count: Number of MakeHuman's people.
+        seed: Seed of MakeHuman's people.
+    """
+    from registration.progress import console_progress
+    from workflows.steps.cranium_model import lines, make_cranium_model
+
+    with console_progress() as progress:
+        path, built = make_cranium_model(model, out, heads=heads, count=count, seed=seed, progress=progress)
+    print("\n".join((*lines(built), str(path))))
+    return 0
+
+
 def landmarks(
     model: ModelFile,
     provider: Annotated[str, arg(metavar="NAME")] = "face478",

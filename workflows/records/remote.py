@@ -12,6 +12,7 @@ from typing import Any
 import fsspec
 from fsspec.implementations.local import LocalFileSystem
 
+from registration.cranium.auxiliary_model import FILE as CRANIUM
 from registration.errors import InputError
 from registration.model.gnm_npz import extra_path
 from registration.storage.cache import cache_folder, make_cache_folder
@@ -78,7 +79,9 @@ def fetch_folder(location: str, folder: Path) -> None:
 
 
 def fetch_model(location: str) -> Path:
-    """Return a model's file as a local path, with its second file and landmark schemes beside it; downloads are cached.
+    """Return a model's file as a local path, with its second file, landmark schemes and auxiliary model beside it.
+
+    Downloads are cached.
 
     Raises:
         InputError: there is no such file.
@@ -116,7 +119,7 @@ def fetch_model(location: str) -> Path:
 
 def _is_scheme(path: str) -> bool:
     name = PurePosixPath(path).name
-    return name.startswith("head_sparse_") and name.endswith(".txt")
+    return (name.startswith("head_sparse_") and name.endswith(".txt")) or name == CRANIUM
 
 
 def _input_error(location: str, *, expected: Any, got: Any) -> InputError:

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from registration.capture.native import read_capture
-from registration.inputs import input_hash, read_schemes
+from registration.inputs import input_hash, read_schemes, used_cranium
 from registration.model import gnm_npz
 from registration.pipeline import register
 from registration.progress import NullProgress, Progress
@@ -57,9 +57,10 @@ def register_stored(
     file = fetch_model(model)
     data = gnm_npz.read(file)
     schemes = read_schemes(file, data, chosen.landmark_files)
+    cranium = used_cranium(file, data, chosen)
     made = False
     with fetch_capture(capture) as folder:
-        digest = input_hash(read_capture(folder), data, schemes, None, chosen)
+        digest = input_hash(read_capture(folder), data, schemes, None, chosen, cranium)
 
         def make(attempt: Path) -> dict[str, Any]:
             nonlocal made

@@ -13,7 +13,7 @@ from registration.capture.scan import read_truth
 from registration.errors import InputError
 from registration.evaluate.evaluation import evaluate_registration
 from registration.fit.recipes import load_recipe
-from registration.inputs import input_hash, read_schemes
+from registration.inputs import input_hash, read_schemes, used_cranium
 from registration.model import gnm_npz
 from registration.options import RegisterOptions
 from registration.pipeline import register
@@ -114,7 +114,10 @@ def collect_subject(
     captures = read_captures(Path(subject_dir))
     data = gnm_npz.read(Path(model))
     schemes = read_schemes(Path(model), data, chosen.landmark_files)
-    inputs = {capture.root.name: input_hash(capture, data, schemes, None, chosen) for capture in captures.captures}
+    cranium = used_cranium(Path(model), data, chosen)
+    inputs = {
+        capture.root.name: input_hash(capture, data, schemes, None, chosen, cranium) for capture in captures.captures
+    }
     inputs |= {name: error.line for name, error in captures.broken.items()}
     product = Product(folder, hashing.input_hash(inputs, {"subject": captures.subject}), CollectResult)
     existing = product.find()
@@ -160,6 +163,7 @@ def _prepare(
     check_subject_out(out, captures)
     data = gnm_npz.read(model)
     read_schemes(model, data, options.landmark_files)
+    used_cranium(model, data, options)
     initial = SubjectRecord(
         subject=captures.subject,
         model=gnm_npz.content_hash(data),
