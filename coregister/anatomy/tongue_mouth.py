@@ -17,7 +17,7 @@ from registration.geometry.winding import Winding, closed
 from registration.model import regions
 from registration.model.gnm_npz import GNMData
 
-_INCISORS = 6e-3, 8e-3  # metres behind the foremost lower tooth, and to each side of the median plane
+_INCISORS = 6e-3, 8e-3  # metres behind the foremost tooth, and to each side of the median plane
 _INSIDE = 0.5  # winding number
 OBSTACLES = ("teeth and gums", "skin")
 
@@ -33,11 +33,7 @@ class JawOpening:
     def of(cls, data: GNMData) -> "JawOpening":
         """Find it: of the expressions that lower the incisors so far, the one with the smallest coefficients."""
         basis = data.expression_basis[regions.expression_modes(data)["lower_face"]].astype(np.float64)
-        teeth = np.flatnonzero(regions.teeth(data) & regions.lower_teeth(data))
-        points = data.template_vertex_positions[teeth]
-        depth, side = _INCISORS
-        front = teeth[(points[:, 2] > points[:, 2].max() - depth) & (np.abs(points[:, 0]) < side)]
-        lowering = -basis[:, front, 1].mean(1)
+        lowering = -basis[:, incisors(data, upper=False), 1].mean(1)
         return cls(basis=basis, direction=lowering / (lowering @ lowering))
 
     def coefficients(self, gap: float, rng: np.random.Generator | None = None, spread: float = 0.0) -> np.ndarray:
@@ -57,6 +53,15 @@ class JawOpening:
     def displacement(self, coefficients: Float[np.ndarray, "K"]) -> Float[np.ndarray, "V 3"]:
         """Return the displacements of all vertices, the tongue carried by the jaw."""
         return np.tensordot(coefficients, self.basis, 1)
+
+
+def incisors(data: GNMData, *, upper: bool) -> Int[np.ndarray, "M"]:
+    """Return the vertices of the front teeth of one jaw, within 8 mm of the median plane."""
+    lower = regions.lower_teeth(data)
+    teeth = np.flatnonzero(regions.teeth(data) & (~lower if upper else lower))
+    points = data.template_vertex_positions[teeth]
+    depth, side = _INCISORS
+    return teeth[(points[:, 2] > points[:, 2].max() - depth) & (np.abs(points[:, 0]) < side)]
 
 
 class Mouth:

@@ -78,6 +78,14 @@ class TongueRig:
         # Differences from rest, so that zero controls give the points themselves.
         return points + interpolate(self._ends, self._line_moves(c, hinge), share) + (turned - offset) + moved
 
+    def least_radius(self, controls: Float[np.ndarray, "C"], hinge: float = 0.0) -> float:
+        """Return the smallest radius by which the controls bend the centre line, metres."""
+        c = dict(zip(CONTROLS, np.asarray(controls, np.float64), strict=True))
+        ends = self._ends
+        angles = np.radians([self._sum(c, kind, ends, hinge) for kind in ("curl", "bend")])
+        steps = np.diff(self.structure.arc_at(ends)) * self._stretch(c, (ends[1:] + ends[:-1]) / 2, hinge)
+        return float(1 / max((np.linalg.norm(np.diff(angles), axis=0) / steps).max(), 1e-9))
+
     def volume_ratio(self, posed: Float[np.ndarray, "N 3"]) -> float:
         """Return the volume of a posed tongue over that of the template; an open rim is closed alike in both."""
         return _volume(posed, self.structure) / self._volume
