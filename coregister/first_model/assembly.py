@@ -14,6 +14,7 @@ from jaxtyping import Bool, Float, Int
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
+from coregister.anatomy import eye_sections
 from coregister.first_model import dental_arch, eyes, skin, teeth
 from coregister.first_model.dental_arch import Arch
 from coregister.first_model.makehuman import MakeHuman
@@ -168,7 +169,7 @@ class HeadAssembly:
         lids = []
         for centre in self.eye_centres:
             relative = self.parts["skin"].vertices - centre
-            near = np.linalg.norm(relative, axis=1) < eyes.SCLERA_RADIUS + _LID_DISTANCE
+            near = np.linalg.norm(relative, axis=1) < eye_sections.SCLERA_RADIUS + _LID_DISTANCE
             lids.append(np.flatnonzero(near & (relative[:, 2] > 0) & self.parts["skin"].groups["skin_exterior"]))
         return lids
 
@@ -273,7 +274,7 @@ def _eye_centre(helper: Float[np.ndarray, "N 3"]) -> Float[np.ndarray, "3"]:
     """Return the centre that puts the front of our smaller eyeball just behind that of MakeHuman's."""
     centre = helper.mean(0)
     front = helper[:, 2].max()
-    return np.array([centre[0], centre[1], front - eyes.SCLERA_RADIUS - _SETBACK])
+    return np.array([centre[0], centre[1], front - eye_sections.SCLERA_RADIUS - _SETBACK])
 
 
 def push_out_of_eyes(vertices: Float[np.ndarray, "V 3"], centres: Float[np.ndarray, "2 3"]) -> Float[np.ndarray, "V 3"]:
@@ -290,7 +291,9 @@ def _height_above_eye(points: Float[np.ndarray, "N 3"]) -> Float[np.ndarray, "N"
     """Return the distance outside an eyeball that looks along +Z, along rays from its centre, the origin; metres."""
     distance = np.linalg.norm(points, axis=1)
     angle = np.arccos(np.clip(points[:, 2] / np.maximum(distance, 1e-9), -1, 1))
-    return distance - eyes.radius_at(angle, np.array(eyes.LIMBUS_RADIUS), np.array(eyes.CORNEA_RADIUS))
+    return distance - eye_sections.radius_at(
+        angle, np.array(eye_sections.LIMBUS_RADIUS), np.array(eye_sections.CORNEA_RADIUS)
+    )
 
 
 def _tongue_part(source: MakeHuman, base: Float[np.ndarray, "B 3"], arch: Arch) -> tuple[MeshPart, Subdivision]:

@@ -78,7 +78,8 @@ def bootstrap(out: Path | None = None) -> Path:
 def _code() -> bytes:
     """Return the source code that determines the model: this package, and what it uses of coregister and geometry."""
     here, geometry = Path(__file__).parent, Path(gnm_npz.__file__).parents[1] / "geometry"
-    used = [here.parent / "joints.py", here.parent / "region_masks.py", *sorted(geometry.glob("*.py"))]
+    names = ("joints.py", "region_masks.py", "anatomy/eye_sections.py")
+    used = [*(here.parent / name for name in names), *sorted(geometry.glob("*.py"))]
     return b"".join(file.read_bytes() for file in [*sorted(here.glob("*.py")), *used])
 
 
@@ -237,7 +238,7 @@ def _mirrored_tongue(assembly: HeadAssembly, samples: Float[np.ndarray, "N D"]) 
 def _pupils(assembly: HeadAssembly) -> Float[np.ndarray, "1 V 3"]:
     basis = np.zeros((1, *assembly.template.shape))
     for name in ("left_eye", "right_eye"):
-        basis[0, assembly.slices[name]] = eyes.pupil_displacement(eyes.eyeball())
+        basis[0, assembly.slices[name]] = eyes.pupil_basis(eyes.eyeball())
     return basis
 
 

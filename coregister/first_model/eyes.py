@@ -8,19 +8,25 @@ meet at the limbus, blended there. An outline of points (distance from the axis,
 import numpy as np
 from jaxtyping import Float, Int
 
+from coregister.anatomy.eye_sections import (
+    CORNEA_RADIUS,
+    FIXED_FROM,
+    LIMBUS_RADIUS,
+    SCLERA_RADIUS,
+    half_blend,
+    mean_limbus,
+    pupil_displacement,
+    rim,
+    section_modes,
+    surface,
+)
 from coregister.first_model.part import MeshPart
 from registration.errors import InputError
 
-SCLERA_RADIUS = 14.6e-3  # the same for all subjects, so that the lids fit every eye
-LIMBUS_RADIUS, LIMBUS_DEVIATION = 6.0e-3, 0.44e-3  # mean, standard deviation
-CORNEA_RADIUS, CORNEA_DEVIATION = 8.5e-3, 0.73e-3
-BLEND_LENGTH = 1.0e-3  # of the blend from cornea to sclera, along the sclera
 INTERIOR_SCALE = 0.99  # of the inner shell, 0.15 mm inside the sclera
 SEGMENTS = 24
 
-_MEAN_LIMBUS = float(np.arcsin(LIMBUS_RADIUS / SCLERA_RADIUS))  # a polar angle: 24.27 degrees
-_HALF_BLEND = BLEND_LENGTH / SCLERA_RADIUS / 2
-_FIXED_FROM = np.radians(65.0)  # beyond this polar angle all eyes have the same vertices
+_MEAN_LIMBUS, _HALF_BLEND = mean_limbus(), half_blend()  # polar angles
 # Polar angles of the mean eye's rings. Both shells share those of the back, so that they cannot intersect.
 _BACK = np.radians([33.0, 44.0, 57.0, 73.0, 90.0, 118.0, 148.0, 180.0])
 _LIMBUS = _MEAN_LIMBUS + np.array([-_HALF_BLEND, 0, _HALF_BLEND])
@@ -28,7 +34,6 @@ _EXTERIOR = np.concatenate([np.radians([0.0, 6.0, 12.0, 18.0]), _LIMBUS, _BACK])
 _IRIS = np.array([0, 1 / 4, 1 / 2, 2 / 3, 5 / 6, 1])  # fractions of the iris's radius
 _PUPIL_EDGE = 2  # index in `_IRIS`
 _INTERIOR = np.concatenate([_IRIS * _MEAN_LIMBUS, _BACK])  # for the uv map only, where the iris lies on the sphere
-_POLYLINE = np.concatenate([np.linspace(0, _MEAN_LIMBUS, 49), np.linspace(_MEAN_LIMBUS, _FIXED_FROM, 49)[1:]])
 _UV_RADIUS = 0.24  # of the chart of half a shell
 
 
@@ -50,7 +55,7 @@ def eyeball(limbus_radius: float = LIMBUS_RADIUS, cornea_radius: float = CORNEA_
     Raises:
         InputError: not 0 < limbus radius < cornea radius, or the limbus does not fit on the sclera's front.
     """
-    if not 0 < limbus_radius < min(cornea_radius, SCLERA_RADIUS * np.sin(_FIXED_FROM)):
+    if not 0 < limbus_radius < min(cornea_radius, SCLERA_RADIUS * np.sin(FIXED_FROM)):
         raise InputError(
             "These radii do not form an eyeball",
             where="limbus_radius, cornea_radius",
@@ -82,25 +87,16 @@ def eyeball(limbus_radius: float = LIMBUS_RADIUS, cornea_radius: float = CORNEA_
     )
 
 
-def pupil_displacement(part: MeshPart) -> Float[np.ndarray, "V 3"]:
-    """Return the displacement of an `eyeball`'s vertices per unit of the pupil's coefficient c, metres.
-
-    The pupil's radius is r_iris (1/2 + c/6): a point at -3, half the iris at 0, the whole iris at +3. Iris and pupil
-    are stretched linearly.
-    """
+def pupil_basis(part: MeshPart) -> Float[np.ndarray, "V 3"]:
+    """Return the displacement of an `eyeball`'s vertices per unit of the pupil's coefficient, metres."""
     planar = part.vertices * [1, 1, 0] * part.groups["irises"][:, None]
-    radius = np.linalg.norm(planar, axis=1, keepdims=True)
-    change = np.minimum(radius, radius.max() - radius) / 3
-    return planar * np.divide(change, radius, out=np.zeros_like(radius), where=radius > 0)
+    return pupil_displacement(planar, np.linalg.norm(planar, axis=1).max())
 
 
 def variation(samples: int = 10_000, *, components: int = 3, seed: int = 0) -> Float[np.ndarray, "K V 3"]:
-    """Build the linear identity basis of `eyeball()`'s vertices.
+    """Build the linear identity basis of `eyeball()`'s vertices from sampled cross-sections.
 
-    Each sampled pair of radii gives a dense outline whose points keep their position relative to the limbus; the
-    components are those of the outlines (PCA about their mean). Their scores over the samples give the same linear
-    combinations of the mesh's rings, so that nothing is interpolated and the iris follows the limbus. Beyond 65 degrees
-    from the axis nothing moves. Source: [GNM, Eyeball Model Formulation].
+    The iris follows the limbus; beyond 65 degrees from the axis nothing moves. From [GNM, Eyeball Model Formulation].
 
     Args:
         samples: number of sampled eyes.
@@ -110,77 +106,17 @@ def variation(samples: int = 10_000, *, components: int = 3, seed: int = 0) -> F
     Returns:
         Components scaled by their standard deviations, metres; a positive coefficient lengthens the eye.
     """
-    limbus, cornea = sample_radii(samples, np.random.default_rng(seed))
-    lines = _surface(_POLYLINE, limbus, cornea).reshape(samples, -1)
-    lines -= lines.mean(0)
-    variances, axes = np.linalg.eigh(lines.T @ lines / (samples - 1))
-    scores = lines @ axes[:, : -components - 1 : -1] / np.sqrt(variances[: -components - 1 : -1])
-    rings = _outline(limbus, cornea)
-    basis = np.einsum("nk,nrc->krc", scores, rings - rings.mean(0)) / (samples - 1)
-    return _revolve(basis * np.sign(basis[:, :1, 1:]))
-
-
-def sample_radii(samples: int, rng: np.random.Generator) -> tuple[Float[np.ndarray, "N"], Float[np.ndarray, "N"]]:
-    """Sample radii of limbus and cornea, metres; rejects corneas that are no larger than the limbus."""
-    means, deviations = [LIMBUS_RADIUS, CORNEA_RADIUS], [LIMBUS_DEVIATION, CORNEA_DEVIATION]
-    radii = np.empty((0, 2))
-    while len(radii) < samples:
-        candidates = means + rng.standard_normal((samples, 2)) * deviations
-        radii = np.concatenate([radii, candidates[candidates[:, 0] < candidates[:, 1]]])
-    return radii[:samples, 0], radii[:samples, 1]
-
-
-def radius_at(
-    angle: Float[np.ndarray, "..."], limbus_radius: Float[np.ndarray, "..."], cornea_radius: Float[np.ndarray, "..."]
-) -> Float[np.ndarray, "..."]:
-    """Return the exterior's distance from the eye's centre at polar angles from the optical axis.
-
-    The spheres share the limbus: z_l = sqrt(r_s^2 - r_l^2), and the cornea's centre is z_c = z_l - sqrt(r_c^2 - r_l^2).
-    Within half of `BLEND_LENGTH` to either side of the limbus, a cubic matches values and slopes of both spheres.
-
-    Args:
-        angle: radians; broadcasts with the radii.
-        limbus_radius: metres.
-        cornea_radius: metres.
-
-    Returns:
-        Distances, metres.
-    """
-    centre = np.sqrt(SCLERA_RADIUS**2 - limbus_radius**2) - np.sqrt(cornea_radius**2 - limbus_radius**2)
-    start = np.arcsin(limbus_radius / SCLERA_RADIUS) - _HALF_BLEND
-    front = np.minimum(angle, start)
-    root = np.sqrt(cornea_radius**2 - (centre * np.sin(front)) ** 2)
-    rise = centre * np.cos(front) + root - SCLERA_RADIUS
-    slope = -centre * np.sin(front) * (1 + centre * np.cos(front) / root)
-    # Cubic Hermite blend: the cornea for t = 0, the sclera for t = 1.
-    t = np.clip((angle - start) / (2 * _HALF_BLEND), 0, 1)
-    return SCLERA_RADIUS + (1 - t) ** 2 * (rise * (1 + 2 * t) + 2 * _HALF_BLEND * slope * t)
-
-
-def _surface(
-    angles: Float[np.ndarray, "R"], limbus_radius: Float[np.ndarray, "..."], cornea_radius: Float[np.ndarray, "..."]
-) -> Float[np.ndarray, "... R 2"]:
-    """Return the exterior's points at the mean eye's polar angles, shifted so that each point keeps to its structure.
-
-    In front of the limbus all angles scale by one factor; behind it the shift decreases to zero at `_FIXED_FROM`.
-    """
-    limbus_radius, cornea_radius = limbus_radius[..., None], cornea_radius[..., None]
-    t = np.clip((angles - _MEAN_LIMBUS) / (_FIXED_FROM - _MEAN_LIMBUS), 0, 1)
-    weight = np.where(angles < _MEAN_LIMBUS, angles / _MEAN_LIMBUS, (1 - t) ** 2 * (1 + 2 * t))
-    shifted = angles + weight * (np.arcsin(limbus_radius / SCLERA_RADIUS) - _MEAN_LIMBUS)
-    axial = np.stack([np.where(angles < np.pi, np.sin(shifted), 0), np.cos(shifted)], -1)
-    return radius_at(shifted, limbus_radius, cornea_radius)[..., None] * axial
+    modes = section_modes(samples, components, np.random.default_rng(seed))
+    return _revolve(modes.components(_outline)[1])
 
 
 def _outline(
     limbus_radius: Float[np.ndarray, "..."], cornea_radius: Float[np.ndarray, "..."]
 ) -> Float[np.ndarray, "... R 2"]:
     """Return (distance from the axis, z) of every ring: exterior, then interior, each from front to back."""
-    limbus = np.arcsin(limbus_radius / SCLERA_RADIUS)
-    rim = SCLERA_RADIUS * np.stack([np.sin(limbus), np.cos(limbus)], -1)
-    iris = rim[..., None, :] * np.stack([_IRIS, np.ones_like(_IRIS)], -1)
-    interior = np.concatenate([iris, _surface(_BACK, limbus_radius, cornea_radius)], -2)
-    return np.concatenate([_surface(_EXTERIOR, limbus_radius, cornea_radius), INTERIOR_SCALE * interior], -2)
+    iris = rim(limbus_radius)[..., None, :] * np.stack([_IRIS, np.ones_like(_IRIS)], -1)
+    interior = np.concatenate([iris, surface(_BACK, limbus_radius, cornea_radius)], -2)
+    return np.concatenate([surface(_EXTERIOR, limbus_radius, cornea_radius), INTERIOR_SCALE * interior], -2)
 
 
 def _layout() -> tuple[Int[np.ndarray, "V"], Int[np.ndarray, "V"]]:

@@ -12,7 +12,8 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int, UInt8
 
-from coregister.first_model import assembly, eyes, makehuman, population
+from coregister.anatomy import eye_sections
+from coregister.first_model import assembly, makehuman, population
 from registration.geometry.rasterizer import rasterize
 from registration.geometry.topology import vertex_normals
 from registration.model import gnm_npz
@@ -143,7 +144,7 @@ def without_corneas(data: GNMData) -> Bool[np.ndarray, "F"]:
         offset = data.template_vertex_positions - data.template_joint_positions[joint]
         angle = np.arctan2(np.linalg.norm(offset[:, :2], axis=1), offset[:, 2])
         outer = (group(data, side) > 0.5) & (group(data, "eye_exteriors") > 0.5)
-        clear |= outer & (angle < np.arcsin(eyes.LIMBUS_RADIUS / eyes.SCLERA_RADIUS) + 0.05)
+        clear |= outer & (angle < np.arcsin(eye_sections.LIMBUS_RADIUS / eye_sections.SCLERA_RADIUS) + 0.05)
     return ~clear[data.triangles].any(1)
 
 

@@ -76,6 +76,7 @@ GROUPS: Mapping[str, Mapping[str, Command]] = {
         "coregister": coregister.coregister,
         "model bootstrap": model.bootstrap,
         "model cranium": model.cranium,
+        "model anatomy": model.anatomy,
         "model landmarks": model.landmarks,
         "model fetch": model.fetch,
         "model info": model.info,

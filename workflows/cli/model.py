@@ -5,6 +5,7 @@ from typing import Annotated, Literal
 
 from tyro.conf import Positional, arg
 
+from coregister.anatomy.part_basis import PartName
 from workflows.cli.options import Folder, ModelFile, OptionalFile, OptionalFolder, OptionalImage, OptionalModel, Seed
 
 
@@ -148,6 +149,37 @@ def cranium(
     with console_progress() as progress:
         path, built = make_cranium_model(model, out, heads=heads, count=count, seed=seed, progress=progress)
     print("\n".join((*lines(built), str(path))))
+    return 0
+
+
+def anatomy(
+    model: Positional[Annotated[Path, arg(metavar="MODEL")]],
+    /,
+    out: Annotated[Path, arg(metavar="NPZ")],
+    parts: Annotated[tuple[PartName, ...], arg(metavar="PART", help_behavior_hint="(default: all)")] = (),
+    keep_eyes: bool = False,
+    seed: Seed = 0,
+) -> int:
+    """Regenerate eyes, teeth, tongue and pupils of a model from data of their own.
+
+    The written model has the layout head, eyes, teeth of the identity and left eye, right eye, lower face, tongue,
+    pupil of the expression. The head's components, and those of the parts that are not named, are kept.
+
+    Args:
+        model: The head model, a GNM NPZ file.
+        out: The model file to write, with its manifest and landmark schemes beside it.
+        parts: The parts to regenerate.
+        keep_eyes: Keep the shape of the template's eyes, instead of the mean of the sampled ones.
+        seed: Seed of everything random.
+    """
+    from coregister.anatomy.assemble import BUILDERS, AnatomySettings
+    from registration.progress import console_progress
+    from workflows.steps.anatomy import write_anatomy
+
+    settings = AnatomySettings(parts=parts or tuple(BUILDERS), seed=seed, mean_eyes=not keep_eyes)
+    with console_progress() as progress:
+        lines = write_anatomy(model, out, settings, progress)
+    print("\n".join((*lines, str(out))))
     return 0
 
 

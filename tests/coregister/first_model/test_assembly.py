@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from coregister.first_model import eyes
+from coregister.anatomy import eye_sections
 from coregister.first_model.population import sample_unspanned_person
 from registration.frames import axis_angle_to_matrix
 from registration.geometry.quads import boundary_loops, triangles_of
@@ -47,8 +47,8 @@ def above_eyes(points, centres):
     offset = points[None] - centres[:, None]
     distance = np.linalg.norm(offset, axis=-1)
     angle = np.arccos(np.clip(offset[..., 2] / distance, -1, 1))
-    radii = (np.array(eyes.LIMBUS_RADIUS), np.array(eyes.CORNEA_RADIUS))
-    return (distance - eyes.radius_at(angle, *radii)).min(0)
+    radii = (np.array(eye_sections.LIMBUS_RADIUS), np.array(eye_sections.CORNEA_RADIUS))
+    return (distance - eye_sections.radius_at(angle, *radii)).min(0)
 
 
 def enclosed(points, vertices, triangles):
@@ -134,7 +134,7 @@ def test_eyes_rotate_about_the_centres_of_their_eyeballs(model, template):
     for number, side in enumerate(SIDES):
         back = members(model, side, "eye_exteriors") & (template[:, 2] < model.template_joint_positions[2 + number, 2])
         distance = np.linalg.norm(template[back] - model.template_joint_positions[2 + number], axis=1)
-        np.testing.assert_allclose(distance, eyes.SCLERA_RADIUS, atol=1e-7)
+        np.testing.assert_allclose(distance, eye_sections.SCLERA_RADIUS, atol=1e-7)
 
 
 def test_the_regressor_gives_the_joints_of_every_identity(model, template):

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from coregister.anatomy import eye_sections
 from coregister.first_model import eyes
 from coregister.first_model.part import MeshPart
 from registration.errors import InputError
@@ -41,7 +42,7 @@ def test_dimensions_of_the_mean_eye(eye: MeshPart) -> None:
     radius = np.linalg.norm(exterior, axis=1)
     assert exterior[:, 2].max() == pytest.approx(15.789e-3, abs=1e-6)  # z_c + r_c
     behind = exterior[:, 2] < 13.310e-3 - 0.5e-3  # z_l, less half the blend
-    assert radius[behind] == pytest.approx(eyes.SCLERA_RADIUS, abs=1e-12)
+    assert radius[behind] == pytest.approx(eye_sections.SCLERA_RADIUS, abs=1e-12)
     before = exterior[:, 2] > 13.310e-3 + 0.5e-3
     assert np.linalg.norm(exterior[before] - [0, 0, 7.289e-3], axis=1) == pytest.approx(8.5e-3, abs=1e-6)
     ring = np.isclose(np.arctan2(np.hypot(*exterior.T[:2]), exterior[:, 2]), np.arcsin(6 / 14.6), atol=1e-9)
@@ -53,14 +54,14 @@ def test_dimensions_of_the_mean_eye(eye: MeshPart) -> None:
 def test_the_blend_is_continuous_in_value_and_slope(limbus: float, cornea: float) -> None:
     angle = np.linspace(0, np.pi / 2, 200_001)
     step = angle[1]
-    radius = eyes.radius_at(angle, np.array(limbus), np.array(cornea))
+    radius = eye_sections.radius_at(angle, np.array(limbus), np.array(cornea))
     slope = np.diff(radius) / step
-    half = eyes.BLEND_LENGTH / eyes.SCLERA_RADIUS / 2
-    edge = np.arcsin(limbus / eyes.SCLERA_RADIUS)
+    half = eye_sections.BLEND_LENGTH / eye_sections.SCLERA_RADIUS / 2
+    edge = np.arcsin(limbus / eye_sections.SCLERA_RADIUS)
     steepest = np.abs(slope).max()
     # Over the blend the slope changes by `steepest`: one grid step may cause only a few times its fraction of that.
     assert np.abs(np.diff(slope)).max() < 10 * steepest * step / (2 * half)
-    assert (radius[angle > edge + half] == eyes.SCLERA_RADIUS).all()
+    assert (radius[angle > edge + half] == eye_sections.SCLERA_RADIUS).all()
     assert (np.diff(radius) < 1e-15).all()
 
 
@@ -136,7 +137,7 @@ def coverage(uvs: np.ndarray, size: int = 512) -> np.ndarray:
 
 
 def test_the_pupil_spans_from_a_point_to_the_limbus(eye: MeshPart) -> None:
-    basis = eyes.pupil_displacement(eye)
+    basis = eyes.pupil_basis(eye)
     pupil = eye.groups["pupils"]
     iris = eye.groups["irises"] & ~pupil  # the visible ring
     assert (basis[~(pupil | iris)] == 0).all()
@@ -157,7 +158,8 @@ def test_the_pupil_spans_from_a_point_to_the_limbus(eye: MeshPart) -> None:
 def test_three_components_reproduce_sampled_eyes(eye: MeshPart) -> None:
     basis = eyes.variation().reshape(3, -1)
     sampled = [
-        eyes.eyeball(*radii).vertices for radii in zip(*eyes.sample_radii(400, np.random.default_rng(7)), strict=True)
+        eyes.eyeball(*radii).vertices
+        for radii in zip(*eye_sections.sample_radii(400, np.random.default_rng(7)), strict=True)
     ]
     displacements = (np.stack(sampled) - eye.vertices).reshape(len(sampled), -1)
     coefficients = displacements @ np.linalg.pinv(basis)
@@ -182,7 +184,7 @@ def test_variation_is_deterministic_and_preserves_the_sclera(eye: MeshPart) -> N
     for sign in (-3, 3):
         vertices = eye.vertices + sign * basis[0]
         on_sclera = eye.groups["eye_exteriors"] & (angle > np.radians(32))
-        assert np.linalg.norm(vertices[on_sclera], axis=1) == pytest.approx(eyes.SCLERA_RADIUS, abs=0.055e-3)
+        assert np.linalg.norm(vertices[on_sclera], axis=1) == pytest.approx(eye_sections.SCLERA_RADIUS, abs=0.055e-3)
 
 
 @pytest.mark.parametrize("limbus, cornea", [(8.5e-3, 8.5e-3), (0.0, 8.5e-3), (13.5e-3, 14e-3), (6.0, 8.5)])
