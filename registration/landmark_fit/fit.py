@@ -19,6 +19,8 @@ from registration.model.gnm_npz import GNMData
 from registration.model.landmarks import LandmarkScheme
 from registration.types import HeadPose
 
+_KEPT = 3  # bases of different accuracy: the sizes of faces in a batch of images differ
+
 
 def fit_landmarks(
     observations: Observations,
@@ -89,14 +91,14 @@ class _Prepared:
     def __init__(self, scheme: LandmarkScheme, data: GNMData, options: FitOptions):
         self.scheme, self._data, self._options = scheme, data, options
         self._mean = mean_head(scheme, data, options)
-        self._restricted: tuple[Reduction, LandmarkModel, Anatomy | None] | None = None
+        self._restricted: dict[float, tuple[Reduction, LandmarkModel, Anatomy | None]] = {}  # by information
 
     def _model(
         self, observations: Observations, pixels_per_metre: float
     ) -> tuple[Reduction, LandmarkModel, Anatomy | None]:
         information = information_per_metre(observations, pixels_per_metre)
-        if self._restricted is None or not self._restricted[0].covers(information):
-            reduction = reduce_expression(self._data, observations, self._options, information)
+        if information not in self._restricted:
+            reduction = reduce_expression(self._data, self.scheme, self._options, information)
             model = LandmarkModel(
                 self._data,
                 self.scheme.indices,
@@ -108,8 +110,10 @@ class _Prepared:
             anatomy = None
             if self._options.anatomy > 0:
                 anatomy = Anatomy(self._data, reduction, self._options.anatomy, self._options.offsets, model.anchor)
-            self._restricted = (reduction, model, anatomy)
-        return self._restricted
+            if len(self._restricted) == _KEPT:
+                self._restricted.pop(next(iter(self._restricted)))
+            self._restricted[information] = (reduction, model, anatomy)
+        return self._restricted[information]
 
     def fit(self, observations: Observations, poses: Sequence[HeadPose] | None = None) -> LandmarkFit:
         began = time.perf_counter()

@@ -8,9 +8,10 @@ from jaxtyping import Float
 from registration.landmark_fit.observations import Observations
 from registration.landmark_fit.options import FitOptions
 from registration.model.gnm_npz import GNMData
+from registration.model.landmarks import LandmarkScheme
 
 _LEAST_INFORMATION = 0.1  # of a direction relative to its prior: less recovers less than a tenth of what is true
-_MARGIN = 2.0  # so much more information may other observations hold with the same basis
+_STEP = 4.0  # information is rounded up to a power of it: fits of similar images share a basis
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -20,21 +21,17 @@ class Reduction:
     mean: Float[np.ndarray, "E"]
     basis: Float[np.ndarray, "E Q"]
     root: Float[np.ndarray, "E E"]  # of the prior's covariance, root @ root^T
-    information: float  # of a displacement of one metre, for which it was made
-
-    def covers(self, information: float) -> bool:
-        """Whether the basis suffices for observations of so much information."""
-        return self.information / _MARGIN**2 <= information <= self.information
 
 
 def information_per_metre(observations: Observations, pixels_per_metre: float) -> float:
-    """Information of all observations of one landmark on a displacement, 1 / m^2."""
+    """Information of all observations of one landmark on a displacement, 1 / m^2, rounded up to a power of `_STEP`."""
     sigma = float(np.median(observations.sigma_px[observations.seen]))
     counts = observations.seen.sum((1, 2)) / max(1, observations.seen.any((0, 1)).sum())
-    return float(counts.max()) * (pixels_per_metre / sigma) ** 2
+    information = float(counts.max()) * (pixels_per_metre / sigma) ** 2
+    return float(_STEP ** np.ceil(np.log(information) / np.log(_STEP)))
 
 
-def reduce_expression(data: GNMData, observations: Observations, options: FitOptions, information: float) -> Reduction:
+def reduce_expression(data: GNMData, scheme: LandmarkScheme, options: FitOptions, information: float) -> Reduction:
     """Return the directions of the expression coefficients that the landmarks move visibly.
 
     In an eigenbasis of the landmarks' information the prior stays the identity; directions without information stay at
@@ -42,7 +39,7 @@ def reduce_expression(data: GNMData, observations: Observations, options: FitOpt
 
     Args:
         data: the model.
-        observations: whose landmarks count.
+        scheme: whose landmarks may be seen.
         options: the prior.
         information: per square metre of displacement (`information_per_metre`).
     """
@@ -54,10 +51,8 @@ def reduce_expression(data: GNMData, observations: Observations, options: FitOpt
     else:
         values, vectors = np.linalg.eigh(prior.covariance.astype(np.float64))
         root = vectors * np.sqrt(np.maximum(values, 0))
-    seen = observations.seen.any((0, 1))
-    scheme = observations.scheme
-    vertices = data.expression_basis[:, scheme.indices[seen]].astype(np.float64)
-    moved = np.einsum("elkd,lk->lde", vertices, scheme.weights[seen], optimize=True).reshape(-1, count) @ root
-    values, vectors = np.linalg.eigh(information * _MARGIN * (moved.T @ moved))
+    vertices = data.expression_basis[:, scheme.indices].astype(np.float64)
+    moved = np.einsum("elkd,lk->lde", vertices, scheme.weights, optimize=True).reshape(-1, count) @ root
+    values, vectors = np.linalg.eigh(information * (moved.T @ moved))
     kept = values > _LEAST_INFORMATION
-    return Reduction(mean=mean, basis=root @ vectors[:, kept][:, ::-1], root=root, information=information * _MARGIN)
+    return Reduction(mean=mean, basis=root @ vectors[:, kept][:, ::-1], root=root)

@@ -28,7 +28,7 @@ def full() -> GNMData:
 def anatomy(full) -> Anatomy:
     count = len(full.expression_basis)
     root = SIGMA * np.eye(count)
-    return Anatomy(full, Reduction(mean=np.zeros(count), basis=root, root=root, information=1.0))
+    return Anatomy(full, Reduction(mean=np.zeros(count), basis=root, root=root))
 
 
 def crossed(data: GNMData, seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
