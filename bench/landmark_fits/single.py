@@ -39,7 +39,7 @@ IN_MODEL_LIMIT_MM = 1.7
 PAPER = {"GNM": (1.683, 1.589, 0.591), "FLAME": (2.172, 2.086, 0.458)}
 ALIGNMENTS = ("rigid", "with scale", "camera frame")
 _FACE_PX = 300.0  # height of a face of 0.2 m
-_CHUNK = 100  # pictures of one task; each task prepares the model anew
+_CHUNK = 125  # pictures of one task; each task prepares the model anew
 _EVERY = 4  # of the landmarks, one in so many is measured
 CROSSED = 300  # pictures at most of people that are not the model's own
 

@@ -18,6 +18,7 @@ from registration.landmark_fit.state import Free, Layout, State
 from registration.landmark_fit.views import NEAR_M, ViewState, ViewTerms, view_terms
 
 _POSE_SCALE = 100.0  # damping of poses, which have no prior: that of a standard deviation of 0.1 rad or m
+_BLOCK = 512  # landmarks whose derivatives are computed at once: they stay in the processor's cache
 _BEHIND = 1e8  # squared standard deviations of a landmark behind a camera
 
 
@@ -247,7 +248,7 @@ class Problem:
         seen = np.isfinite(self.points_px[f, :, :, 0])
         rows = np.flatnonzero(seen.any(0))
         result = []
-        if len(rows):
+        for rows in np.split(rows, range(_BLOCK, len(rows), _BLOCK)) if len(rows) else ():
             posed = self.model(
                 state.identity,
                 state.expression[f],
@@ -259,7 +260,7 @@ class Problem:
             )
             world = self._world(state, f, posed.points)
             columns = self._world_columns(state, f, posed, world, free)
-            for v in np.flatnonzero(seen.any(1)):
+            for v in np.flatnonzero(seen[:, rows].any(1)):
                 result.append(self._view_rows(state, f, int(v), world, columns, rows, free))
         return result
 

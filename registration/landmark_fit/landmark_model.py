@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from scipy.spatial.transform import Rotation
 
 from registration.model.gnm_npz import GNMData
@@ -151,8 +151,8 @@ class LandmarkModel:
                 own = np.flatnonzero(where[part.rows] >= 0)
                 if not len(own):
                     continue
-                target = where[part.rows[own]]
-                own = slice(None) if len(own) == len(part.rows) else own
+                target = slice(None) if len(own) == count else where[part.rows[own]]
+                own = _slice(own)
             R, weight = chain.rotations[part.joint], part.weight[own]
             moved = R @ part.local(identity, expression, chain.feature, own) + weight * chain.shift(part.joint)[:, None]
             points = _added(points, target, count, moved)
@@ -322,6 +322,11 @@ class _OfJoint:
         """Points in the bind pose, with pose correctives, times their weights."""
         points = self.mean[:, own] + self.identity[:, own] @ identity + self.expression[:, own] @ expression
         return points if feature is None or self.corrective is None else points + self.corrective[:, own] @ feature
+
+
+def _slice(rows: Int[np.ndarray, "N"]) -> slice | np.ndarray:
+    """Sorted rows as a slice, which needs no copy, if none is left out between them."""
+    return slice(rows[0], rows[-1] + 1) if rows[-1] - rows[0] + 1 == len(rows) else rows
 
 
 def _added(total: np.ndarray | None, target: Any, count: int, part: np.ndarray) -> np.ndarray:
