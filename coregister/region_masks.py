@@ -4,10 +4,9 @@
 from collections.abc import Mapping
 
 import numpy as np
-import scipy.sparse as sp
 from jaxtyping import Bool, Float, Int
-from scipy.sparse.csgraph import dijkstra
 
+from registration.geometry.geodesic import edge_distances
 from registration.geometry.smoothstep import smoothstep
 from registration.geometry.topology import edges as edges_of
 from registration.model import regions
@@ -34,12 +33,10 @@ def soft_masks(
         mirror: each vertex' mirror image.
         groups: official vertex groups by name.
     """
-    length = np.linalg.norm(vertices[edges[:, 0]] - vertices[edges[:, 1]], axis=1)
-    graph = sp.csr_matrix((length, (edges[:, 0], edges[:, 1])), (len(vertices),) * 2)
     upper = np.any([groups[name] for name in (*_UPPER_REGIONS, "eye_sockets")], axis=0)
     scalp = ~groups["hockey_mask"] & ~groups["ears"] & (vertices[:, 1] > vertices[upper, 1].max())
     upper |= scalp & groups["skin_exterior"]
-    return _split(graph, upper, vertices[:, 0], mirror)
+    return _split(vertices, edges, upper, mirror)
 
 
 def regional_masks(data: GNMData) -> Float[np.ndarray, "3 V"]:
@@ -52,24 +49,21 @@ def regional_masks(data: GNMData) -> Float[np.ndarray, "3 V"]:
     vertices = (vertices + vertices[mirror] * FLIP) / 2
     upper = regions.expression_skin(data)
     edges = edges_of(data.triangles[skin[data.triangles].all(1)]).vertices
-    length = np.linalg.norm(vertices[edges[:, 0]] - vertices[edges[:, 1]], axis=1)
-    graph = sp.csr_matrix((length, (edges[:, 0], edges[:, 1])), (len(vertices),) * 2)
-    return _split(graph, upper | upper[mirror], vertices[:, 0], mirror) * skin
+    return _split(vertices, edges, upper | upper[mirror], mirror) * skin
 
 
 def _split(
-    graph: sp.csr_matrix, upper: Bool[np.ndarray, "V"], x: Float[np.ndarray, "V"], mirror: Int[np.ndarray, "V"]
+    vertices: Float[np.ndarray, "V 3"],
+    edges: Int[np.ndarray, "E 2"],
+    upper: Bool[np.ndarray, "V"],
+    mirror: Int[np.ndarray, "V"],
 ) -> Float[np.ndarray, "3 V"]:
-    left_of = smoothstep(0, 1, 0.5 + x / _BLEND_M)
-    eyes = _fade(graph, upper)
+    left_of = smoothstep(0, 1, 0.5 + vertices[:, 0] / _BLEND_M)
+    # A mask that is 1 inside, 0 outside and 1/2 on the border.
+    to_upper, to_lower = (edge_distances(vertices, edges, side) for side in (upper, ~upper))
+    eyes = smoothstep(0, 1, 0.5 + (to_lower - to_upper) / _BLEND_M)
     eyes = (eyes + eyes[mirror]) / 2
     return np.stack([eyes * left_of, eyes * (1 - left_of), 1 - eyes])
-
-
-def _fade(graph: sp.csr_matrix, inside: Bool[np.ndarray, "V"]) -> Float[np.ndarray, "V"]:
-    """A mask that is 1 inside, 0 outside and 1/2 on the border."""
-    distance = [dijkstra(graph, directed=False, indices=np.flatnonzero(s), min_only=True) for s in (inside, ~inside)]
-    return smoothstep(0, 1, 0.5 + (distance[1] - distance[0]) / _BLEND_M)
 
 
 def mirrored(basis: Float[np.ndarray, "K V 3"], mirror: Int[np.ndarray, "V"]) -> Float[np.ndarray, "K V 3"]:

@@ -5,13 +5,12 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
-import scipy.sparse as sp
 from jaxtyping import Bool, Float, Int
-from scipy.sparse.csgraph import dijkstra
 from scipy.spatial import cKDTree
 
 from coregister.first_model.makehuman import MakeHuman
 from coregister.first_model.part import MeshPart
+from registration.geometry.geodesic import edge_distances
 from registration.geometry.parameterization import flat_map
 from registration.geometry.quads import Subdivision, beyond_loop, boundary_loops, edge_loop, edges_of, pieces, subdivide
 
@@ -216,13 +215,9 @@ def _above_mouth(
 ) -> Bool[np.ndarray, "V"]:
     """Return whether vertices lie above the mouth's slit, by geodesic distance to the front of upper and lower lip."""
     edges, _, _ = edges_of(quads)
-    length = np.linalg.norm(vertices[edges[:, 0]] - vertices[edges[:, 1]], axis=1)
-    graph = sp.csr_matrix((length, (edges[:, 0], edges[:, 1])), (len(vertices),) * 2)
-    central = np.abs(vertices[:, 0]) < 0.012
-    above = np.flatnonzero(lips & central & (vertices[:, 1] > height + 0.003))
-    below = np.flatnonzero(lips & central & (vertices[:, 1] < height - 0.005))
-    distances = [dijkstra(graph, directed=False, indices=seeds, min_only=True) for seeds in (above, below)]
-    return distances[0] < distances[1]
+    central = lips & (np.abs(vertices[:, 0]) < 0.012)
+    above, below = central & (vertices[:, 1] > height + 0.003), central & (vertices[:, 1] < height - 0.005)
+    return edge_distances(vertices, edges, above) < edge_distances(vertices, edges, below)
 
 
 def front_points(
@@ -253,12 +248,12 @@ def _face_regions(
 ) -> dict[str, Bool[np.ndarray, "V"]]:
     """Return the official file's regions of the face by nearest seed along the surface; the sides mirror each other."""
     inner = edges[face[edges].all(1)]
-    length = np.linalg.norm(vertices[inner[:, 0]] - vertices[inner[:, 1]], axis=1)
-    graph = sp.csr_matrix((length, (inner[:, 0], inner[:, 1])), (len(vertices),) * 2)
     names, distances = [], []
     for name, points in _REGIONS.items():
         left = front_points(vertices, face & (vertices[:, 0] > -1e-4), np.array(points, float))
-        distance = dijkstra(graph, directed=False, indices=left, min_only=True)
+        seeds = np.zeros(len(vertices), bool)
+        seeds[left] = True
+        distance = edge_distances(vertices, inner, seeds)
         if name in _UNPAIRED:
             names.append(f"{name}_region")
             distances.append(np.minimum(distance, distance[mirror]))

@@ -14,6 +14,8 @@ from jaxtyping import Bool, Float, Int
 from scipy.spatial import cKDTree
 
 from registration.frames import MM_PER_M
+from registration.geometry.geodesic import edge_distances
+from registration.geometry.topology import edges
 from registration.landmark_fit.contact import MIN_TRIANGLES, Contact, ContactDepths, Depths
 from registration.landmark_fit.landmark_model import LandmarkModel
 from registration.landmark_fit.reduction import Reduction
@@ -26,6 +28,7 @@ _SIGMA = 0.2
 _MARGIN = 0.05  # added to the depth in the template
 _LIDS, _MOUTH, _OF_JAWS = 8.0, 15.0, 18.0  # distance of points from eyeballs and jaws, and of jaws from the points
 _LIP = 5.0  # of a lip's points from the other lip
+_CORNER = 4.0  # along the skin, within which a lip's points belong to the corner of the mouth
 _REACH = 6.0
 _KEPT = 4096  # frames
 _ACCURACY_M = 5e-6  # of the parts' restricted bases, at unit coefficients
@@ -276,8 +279,11 @@ def _contacts(data: GNMData) -> list[Contact]:
     for jaw in (jaws & ~teeth, jaws & teeth):
         found.append((touching, jaw & _near(rest, touching, _OF_JAWS), "rigid"))
     found.append((mouth, tongue, "solid"))
+    along = edges(mesh).vertices
     for lip, other in ((upper & ~lower, lower), (lower & ~upper, upper)):
-        found.append((lip & _near(rest, other, _LIP), other & _near(rest, lip, 2 * _LIP), ""))
+        # At the corner of the mouth either lip continues the other's surface.
+        apart = edge_distances(rest, along, other, _CORNER) > _CORNER
+        found.append((lip & apart & _near(rest, other, _LIP), other & _near(rest, lip, 2 * _LIP), ""))
     contacts = []
     for points, surface, kind in found:
         triangles = mesh[surface[mesh].all(1)]

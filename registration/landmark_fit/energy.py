@@ -246,9 +246,9 @@ class Problem:
         layout = self.layout
         wants = _wanted(layout, free)
         seen = np.isfinite(self.points_px[f, :, :, 0])
-        rows = np.flatnonzero(seen.any(0))
+        in_frame = np.flatnonzero(seen.any(0))
         result = []
-        for rows in np.split(rows, range(_BLOCK, len(rows), _BLOCK)) if len(rows) else ():
+        for rows in np.split(in_frame, range(_BLOCK, len(in_frame), _BLOCK)) if len(in_frame) else ():
             posed = self.model(
                 state.identity,
                 state.expression[f],

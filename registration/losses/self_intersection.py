@@ -15,13 +15,12 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
-from scipy.sparse import coo_matrix
-from scipy.sparse.csgraph import dijkstra
 from scipy.spatial import cKDTree
 from torch import Tensor
 
 from registration.frames import MM_PER_M
 from registration.geometry.contacts import ContactCandidates, ContactSearch, Interior, depths
+from registration.geometry.geodesic import edge_distances
 from registration.geometry.spheres import fit_sphere, on_main_sphere
 from registration.geometry.topology import connected_parts, edges
 from registration.model import regions
@@ -248,15 +247,8 @@ def _linings(data: GNMData, rest: Float[np.ndarray, "V 3"]) -> tuple[Bool[np.nda
     Lips overlap in the template; the distance along the surface decides which vertex belongs to which.
     """
     lining = regions.mouth_lining(data)
-    ends = edges(data.triangles.astype(np.int64)).vertices
-    length = np.linalg.norm(rest[ends[:, 0]] - rest[ends[:, 1]], axis=1)
-    graph = coo_matrix((length, ends.T), (len(rest), len(rest))).tocsr()
-    to_upper, to_lower = (
-        dijkstra(graph, directed=False, indices=np.flatnonzero(lip), min_only=True, limit=_LINING)
-        if lip.any()
-        else np.full(len(rest), np.inf)
-        for lip in regions.lips(data)
-    )
+    along = edges(data.triangles.astype(np.int64)).vertices
+    to_upper, to_lower = (edge_distances(rest, along, lip, _LINING) for lip in regions.lips(data))
     lining &= np.isfinite(np.minimum(to_upper, to_lower))
     return lining & (to_upper <= to_lower), lining & (to_lower <= to_upper)
 
