@@ -9,6 +9,7 @@ from jaxtyping import Bool, Float, Int
 from bench.landmark_fits.heads import Head, HeadModel
 from bench.landmark_fits.pictures import cameras_around, observe
 from bench.landmark_fits.rows import Row, at_most
+from registration.evaluate.audit import BEYOND_KEY, audit_penetration
 from registration.export.arkit import arkit_shapes
 from registration.export.arkit_anatomy import Anatomy
 from registration.geometry.rigid import similarity_transform
@@ -51,7 +52,7 @@ def talk(model: HeadModel, frames: int, seed: int = 7) -> Talk:
     # The most probable coefficients, as in the shapes themselves: their basis is the model's with its mirror image.
     coefficients = np.linalg.solve(basis @ basis.T + _FIT_M**2 * np.eye(len(basis)), basis @ wanted.T).T
     expressions = weights @ coefficients
-    person = model.sample(rng)
+    person = _person(model, rng)
     phases = rng.uniform(0, 2 * np.pi, 7)
 
     def wave(k: int, size: float, hertz: float) -> np.ndarray:
@@ -76,6 +77,15 @@ def talk(model: HeadModel, frames: int, seed: int = 7) -> Talk:
         closed=weights[:, 0] < _CLOSED,
         still=np.flatnonzero(model.face & (spread < _STILL_M)),
     )
+
+
+def _person(model: HeadModel, rng: np.random.Generator) -> Head:
+    """Sample a person whose parts do not lie in one another at rest: the fit's anatomical term assumes so."""
+    while True:
+        person = model.sample(rng)
+        rest = model.template + model.shape(person.identity, np.zeros_like(person.expression))
+        if not audit_penetration(rest, model.data).metrics[BEYOND_KEY]:
+            return person
 
 
 def _weights(seconds: np.ndarray, rng: np.random.Generator) -> Float[np.ndarray, "F S"]:

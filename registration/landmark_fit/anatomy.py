@@ -58,9 +58,9 @@ class Anatomy:
         offsets: Float[np.ndarray, "V 3"] | None = None,
         anchor: int = 0,
     ):
-        contacts = _contacts(data)
+        pairs = contacts(data)
         used = np.zeros(len(data.template_vertex_positions), bool)
-        for contact in contacts:
+        for contact in pairs:
             used[contact.points] = True
             used[contact.triangles] = True
         self._parts: list[_Part] = []
@@ -73,7 +73,7 @@ class Anatomy:
                 self._parts.append(_Part(data, index, first, reduction, offsets, anchor))
                 first += len(index)
         self.index = np.argsort(np.where(used, place, len(used)))[:first]
-        placed = [replace(c, points=place[c.points], triangles=place[c.triangles]) for c in contacts]
+        placed = [replace(c, points=place[c.points], triangles=place[c.triangles]) for c in pairs]
         rest = np.zeros((first, 3))
         rest[place[used]] = data.template_vertex_positions[used].astype(np.float64) * MM_PER_M
         self._depths = ContactDepths(placed, rest, _REACH)
@@ -267,7 +267,12 @@ def _jaws(data: GNMData) -> Bool[np.ndarray, "V"]:
     return members
 
 
-def _contacts(data: GNMData) -> list[Contact]:
+def contacts(data: GNMData) -> list[Contact]:
+    """Return the parts that must not lie in one another: lids and eyes, mouth and jaws, lips and tongue, either lip.
+
+    Args:
+        data: the model; its vertex groups name the parts.
+    """
     rest = data.template_vertex_positions.astype(np.float64) * MM_PER_M
     mesh = data.triangles.astype(np.int64)
     exterior, tongue, jaws = regions.exterior(data), regions.tongue(data), _jaws(data)
@@ -284,13 +289,13 @@ def _contacts(data: GNMData) -> list[Contact]:
         # At the corner of the mouth either lip continues the other's surface.
         apart = edge_distances(rest, along, other, _CORNER) > _CORNER
         found.append((lip & apart & _near(rest, other, _LIP), other & _near(rest, lip, 2 * _LIP), ""))
-    contacts = []
+    result = []
     for points, surface, kind in found:
         triangles = mesh[surface[mesh].all(1)]
         if points.any() and len(triangles) >= MIN_TRIANGLES:
             index = np.flatnonzero(points)
-            contacts.append(Contact(points=index, triangles=triangles, rigid=kind == "rigid", solid=kind == "solid"))
-    return contacts
+            result.append(Contact(points=index, triangles=triangles, rigid=kind == "rigid", solid=kind == "solid"))
+    return result
 
 
 def _near(rest: Float[np.ndarray, "V 3"], members: Bool[np.ndarray, "V"], distance: float) -> Bool[np.ndarray, "V"]:

@@ -3,7 +3,9 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from registration.landmark_fit.anatomy import Anatomy
+from registration.geometry.geodesic import edge_distances
+from registration.geometry.topology import edges
+from registration.landmark_fit.anatomy import Anatomy, contacts
 from registration.landmark_fit.fit import fit_landmarks
 from registration.landmark_fit.landmark_model import turned
 from registration.landmark_fit.observations import Observations
@@ -43,6 +45,17 @@ def crossed(data: GNMData, seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarra
 def test_the_template_costs_nothing(full, anatomy):
     still = np.tile(np.eye(3), (4, 1, 1))
     assert anatomy.energy(np.zeros(len(full.vertex_identity_basis)), np.zeros(len(full.expression_basis)), still) == 0
+
+
+@needs_shared
+def test_lips_do_not_touch_at_the_corners_of_the_mouth(full):
+    rest = 1e3 * full.template_vertex_positions.astype(np.float64)
+    along = edges(full.triangles.astype(np.int64)).vertices
+    for contact in contacts(full)[-2:]:  # either lip against the other
+        surface = np.isin(np.arange(len(rest)), contact.triangles)
+        corners = np.flatnonzero(edge_distances(rest, along, surface, 2.0) < 2.0)
+        assert len(contact.points) > 100
+        assert not np.isin(contact.points, corners).any()
 
 
 @needs_shared
