@@ -14,6 +14,8 @@ from jaxtyping import Bool, Float, Int
 
 from coregister.anatomy.eyes import EyeSettings, eye_basis, pupils_basis
 from coregister.anatomy.part_basis import PartBasis, PartName
+from coregister.anatomy.teeth import TeethSettings, teeth_basis
+from coregister.anatomy.tongue import TongueSettings, tongue_basis
 from registration.errors import InputError, check_seed
 from registration.model import gnm_npz, regions
 from registration.model.gnm_npz import GNMData
@@ -30,12 +32,16 @@ class AnatomySettings:
     Attributes:
         parts: their names; in any order.
         seed: of everything random.
-        mean_eyes: as `EyeSettings.mean_template`.
+        eyes: of the eyeballs; the seeds in here are not used.
+        teeth: of the dentitions.
+        tongue: of the tongue's poses.
     """
 
     parts: tuple[PartName, ...] = field(default_factory=lambda: tuple(BUILDERS))
     seed: int = 0
-    mean_eyes: bool = True
+    eyes: EyeSettings = field(default_factory=EyeSettings)
+    teeth: TeethSettings = field(default_factory=TeethSettings)
+    tongue: TongueSettings = field(default_factory=TongueSettings)
 
     def check(self) -> None:
         """Raises InputError for an unknown or repeated part, or a seed out of range."""
@@ -54,7 +60,9 @@ Builder = Callable[[GNMData, AnatomySettings], PartBasis]
 # In the order in which they are built: pupils put the iris in place before the eyes' components move it.
 BUILDERS: Mapping[PartName, Builder] = {
     "pupils": lambda data, settings: pupils_basis(data),
-    "eyes": lambda data, settings: eye_basis(data, EyeSettings(seed=settings.seed, mean_template=settings.mean_eyes)),
+    "eyes": lambda data, settings: eye_basis(data, replace(settings.eyes, seed=settings.seed)),
+    "teeth": lambda data, settings: teeth_basis(data, replace(settings.teeth, seed=settings.seed)),
+    "tongue": lambda data, settings: tongue_basis(data, replace(settings.tongue, seed=settings.seed)),
 }
 
 

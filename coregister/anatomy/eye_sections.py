@@ -115,12 +115,20 @@ def rim(limbus_radius: Float[np.ndarray, "..."], sclera_radius: float = SCLERA_R
 class SectionModes:
     """The principal components of sampled cross-sections: N samples, K components."""
 
+    angles: Float[np.ndarray, "P"]  # of the cross-sections' points: polar angles on the mean eye's radii
+    mean: Float[np.ndarray, "P 2"]  # of the samples' cross-sections
     limbus: Float[np.ndarray, "N"]  # radii of the samples, metres
     cornea: Float[np.ndarray, "N"]
     rejected: int  # samples whose cornea was no larger than the limbus
     scores: Float[np.ndarray, "N K"]  # of the samples, with unit variance
     signs: Float[np.ndarray, "K"]  # with which a positive score lengthens the eye
     variances: Float[np.ndarray, "L"]  # of all components, descending
+
+    def reference_angles(self, polar_angles: Float[np.ndarray, "R"]) -> Float[np.ndarray, "R"]:
+        """Return which points of the cross-sections have these polar angles in the mean of the samples."""
+        of_mean = np.arctan2(self.mean[:, 0], self.mean[:, 1])
+        shift = np.interp(polar_angles, of_mean, self.angles - of_mean, left=0.0, right=0.0)
+        return polar_angles + shift
 
     def components(self, outline: Outline) -> tuple[Float[np.ndarray, "R 2"], Float[np.ndarray, "K R 2"]]:
         """Return the mean and the components of other points of the same eyes, per standard deviation, metres.
@@ -152,13 +160,21 @@ def section_modes(
     mean = mean_limbus(sclera_radius)
     angles = np.concatenate([np.linspace(0, mean, _POINTS), np.linspace(mean, FIXED_FROM, _POINTS)[1:]])
     lines = surface(angles, limbus, cornea, sclera_radius).reshape(samples, -1)
-    lines -= lines.mean(0)
+    middle = lines.mean(0)
+    lines -= middle
     variances, axes = np.linalg.eigh(lines.T @ lines / (samples - 1))
     axes = axes[:, : -components - 1 : -1]
     scores = lines @ axes / np.sqrt(variances[: -components - 1 : -1])
     signs = np.sign(axes[1])  # row 1 is the apex's z
     return SectionModes(
-        limbus=limbus, cornea=cornea, rejected=rejected, scores=scores, signs=signs, variances=variances[::-1]
+        angles=angles,
+        mean=middle.reshape(-1, 2),
+        limbus=limbus,
+        cornea=cornea,
+        rejected=rejected,
+        scores=scores,
+        signs=signs,
+        variances=variances[::-1],
     )
 
 

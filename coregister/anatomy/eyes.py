@@ -55,8 +55,8 @@ def eye_basis(data: GNMData, settings: EyeSettings = EyeSettings()) -> PartBasis
     """Build the identity components of both eyeballs, named eye_000, eye_001 ...
 
     Sampled cross-sections (`eye_sections`) give the components; each vertex of the exterior follows the cross-section
-    at its polar angle, the inner shell the sclera below it, and the iris the limbus. All is evaluated on the samples at
-    the vertex' own angle. The sclera's radius, the same for all samples, is the model's own.
+    at its polar angle in their mean, the inner shell the sclera below it, and the iris the limbus. All is evaluated on
+    the samples at the vertex' own angle. The sclera's radius, the same for all samples, is the model's own.
 
     Args:
         data: any model of the official schema.
@@ -71,7 +71,8 @@ def eye_basis(data: GNMData, settings: EyeSettings = EyeSettings()) -> PartBasis
     modes = eye_sections.section_modes(
         settings.samples, settings.components, np.random.default_rng(settings.seed), eyes.sclera_radius
     )
-    mean, components = modes.components(lambda limbus, cornea: _outlines(eyes, limbus, cornea))
+    angles = modes.reference_angles(eyes.polar_angle)
+    mean, components = modes.components(lambda limbus, cornea: _outlines(eyes, angles, limbus, cornea))
     template, moved = None, 0.0
     if settings.mean_template:
         change = _mean_change(eyes, mean)
@@ -169,18 +170,21 @@ def _check_size(eyes: EyeStructure) -> None:
 
 
 def _outlines(
-    eyes: EyeStructure, limbus: Float[np.ndarray, "S"], cornea: Float[np.ndarray, "S"]
+    eyes: EyeStructure,
+    angles: Float[np.ndarray, "N"],
+    limbus: Float[np.ndarray, "S"],
+    cornea: Float[np.ndarray, "S"],
 ) -> Float[np.ndarray, "S N 2"]:
-    """Return (distance from the axis, z) of every vertex for sampled radii.
+    """Return (distance from the axis, z) of every vertex for sampled radii; `angles` are its points' on the mean radii.
 
     The exterior lies on the sampled surfaces. Of the inner shell, what is in front of the limbus, the iris, scales with
     the limbus and moves with it along the axis; the rest slides on its own sphere as the sclera's points do.
     """
-    radius, angle = eyes.sclera_radius, eyes.polar_angle
-    points = np.empty((len(limbus), len(angle), 2))
-    points[:, eyes.exterior] = eye_sections.surface(angle[eyes.exterior], limbus, cornea, radius)
-    behind = ~eyes.exterior & (angle >= eye_sections.mean_limbus(radius))
-    slid = eye_sections.slide(angle[behind], limbus, radius)
+    radius = eyes.sclera_radius
+    points = np.empty((len(limbus), len(angles), 2))
+    points[:, eyes.exterior] = eye_sections.surface(angles[eyes.exterior], limbus, cornea, radius)
+    behind = ~eyes.exterior & (angles >= eye_sections.mean_limbus(radius))
+    slid = eye_sections.slide(angles[behind], limbus, radius)
     points[:, behind] = eyes.radius[behind, None] * np.stack([np.sin(slid), np.cos(slid)], -1)
     front = ~eyes.exterior & ~behind
     scale = eyes.radius[behind].mean() / radius

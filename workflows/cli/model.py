@@ -173,10 +173,11 @@ def anatomy(
         seed: Seed of everything random.
     """
     from coregister.anatomy.assemble import BUILDERS, AnatomySettings
+    from coregister.anatomy.eyes import EyeSettings
     from registration.progress import console_progress
     from workflows.steps.anatomy import write_anatomy
 
-    settings = AnatomySettings(parts=parts or tuple(BUILDERS), seed=seed, mean_eyes=not keep_eyes)
+    settings = AnatomySettings(parts=parts or tuple(BUILDERS), seed=seed, eyes=EyeSettings(mean_template=not keep_eyes))
     with console_progress() as progress:
         lines = write_anatomy(model, out, settings, progress)
     print("\n".join((*lines, str(out))))

@@ -157,10 +157,8 @@ def test_the_pupil_spans_from_a_point_to_the_limbus(eye: MeshPart) -> None:
 
 def test_three_components_reproduce_sampled_eyes(eye: MeshPart) -> None:
     basis = eyes.variation().reshape(3, -1)
-    sampled = [
-        eyes.eyeball(*radii).vertices
-        for radii in zip(*eye_sections.sample_radii(400, np.random.default_rng(7)), strict=True)
-    ]
+    limbus, cornea, _ = eye_sections.sample_radii(400, np.random.default_rng(7))
+    sampled = [eyes.eyeball(*pair).vertices for pair in zip(limbus, cornea, strict=True)]
     displacements = (np.stack(sampled) - eye.vertices).reshape(len(sampled), -1)
     coefficients = displacements @ np.linalg.pinv(basis)
     residual = np.linalg.norm((displacements - coefficients @ basis).reshape(len(sampled), -1, 3), axis=2)
