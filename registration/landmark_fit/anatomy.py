@@ -29,7 +29,7 @@ _MARGIN = 0.05  # added to the depth in the template
 _LIDS, _MOUTH, _OF_JAWS = 8.0, 15.0, 18.0  # distance of points from eyeballs and jaws, and of jaws from the points
 _LIP = 5.0  # of a lip's points from the other lip
 _CORNER = 4.0  # along the skin, within which a lip's points belong to the corner of the mouth
-_REACH = 6.0
+_LIP_REACH = 2.0  # depth in the other lip: beyond, a point is on the other side of it and not in it
 _KEPT = 4096  # frames
 _ACCURACY_M = 5e-6  # of the parts' restricted bases, at unit coefficients
 
@@ -76,7 +76,7 @@ class Anatomy:
         placed = [replace(c, points=place[c.points], triangles=place[c.triangles]) for c in pairs]
         rest = np.zeros((first, 3))
         rest[place[used]] = data.template_vertex_positions[used].astype(np.float64) * MM_PER_M
-        self._depths = ContactDepths(placed, rest, _REACH)
+        self._depths = ContactDepths(placed, rest)
         self._factor = np.sqrt(weight) / _SIGMA
         self._tolerance = np.zeros(self._depths.count)
         deep = self._depths(rest, self._tolerance)
@@ -294,7 +294,8 @@ def contacts(data: GNMData) -> list[Contact]:
         triangles = mesh[surface[mesh].all(1)]
         if points.any() and len(triangles) >= MIN_TRIANGLES:
             index = np.flatnonzero(points)
-            result.append(Contact(points=index, triangles=triangles, rigid=kind == "rigid", solid=kind == "solid"))
+            contact = Contact(points=index, triangles=triangles, rigid=kind == "rigid", solid=kind == "solid")
+            result.append(contact if kind else replace(contact, reach=_LIP_REACH))
     return result
 
 

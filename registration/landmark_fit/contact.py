@@ -30,6 +30,7 @@ class Contact:
     triangles: Int[np.ndarray, "F 3"]  # of the surface, normals outwards
     rigid: bool = False  # the surface moves almost rigidly, and its shape changes little
     solid: bool = False  # the surface is closed but where it is attached: its bounding box contains what is behind it
+    reach: float = 6.0  # largest depth, and distance from a triangle's centroid, of points that count, mm
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -50,18 +51,18 @@ class ContactDepths:
     Args:
         contacts: each with at least one point and `MIN_TRIANGLES` triangles.
         rest: vertices of the template, mm.
-        reach: largest depth, and distance from a triangle's centroid, of points that count.
     """
 
-    def __init__(self, contacts: Sequence[Contact], rest: Float[np.ndarray, "V 3"], reach: float):
-        self._reach, self._contacts = reach, contacts
+    def __init__(self, contacts: Sequence[Contact], rest: Float[np.ndarray, "V 3"]):
+        self._contacts = contacts
+        self._reach = np.repeat([c.reach for c in contacts], [len(c.triangles) for c in contacts])
         self._point_offsets = np.cumsum([0, *(len(contact.points) for contact in contacts)])
         self._triangle_offsets = np.cumsum([0, *(len(contact.triangles) for contact in contacts)])
         self._points = np.concatenate([contact.points for contact in contacts])
         self._triangles = np.concatenate([contact.triangles for contact in contacts])
         self._corners = [np.ascontiguousarray(contact.triangles.T) for contact in contacts]
         self._surfaces = [np.unique(contact.triangles) for contact in contacts]
-        self._grids = [_Grid(rest, contact.triangles, reach) if contact.rigid else None for contact in contacts]
+        self._grids = [_Grid(rest, contact.triangles, contact.reach) if contact.rigid else None for contact in contacts]
         pieces, rims, count = [], [], 0
         for contact in contacts:
             piece, connectivity = connected_parts(contact.triangles), edges(contact.triangles)
@@ -117,7 +118,7 @@ class ContactDepths:
         a, b, c = (vertices[corner] for corner in self._corners[number])
         centres = (a + b + c) / 3
         tree = cKDTree(centres, balanced_tree=False, compact_nodes=False)
-        near = tree.query(x[own], np.arange(1, _PLANES + 1), distance_upper_bound=self._reach)[1]
+        near = tree.query(x[own], np.arange(1, _PLANES + 1), distance_upper_bound=self._contacts[number].reach)[1]
         rows, columns = np.nonzero(near < len(centres))
         chosen = near[rows, columns]
         behind = _plane(x[own[rows]], a[chosen], b[chosen], c[chosen]) < 0
@@ -141,7 +142,7 @@ class ContactDepths:
         order = (distance - 1e-4 * np.abs(along)).reshape(near.shape)
         side = np.sign(along)
         outside = (np.abs(along) < _MIN_COSINE * distance) | ((weights * self._rim[flat]).sum(1) > _ON_RIM)
-        depth = np.where(outside | (distance > self._reach), -np.inf, distance * side).reshape(near.shape)
+        depth = np.where(outside | (distance > self._reach[flat]), -np.inf, distance * side).reshape(near.shape)
         piece = self._piece[near]
         rival = (piece[:, :, None] == piece[:, None, :]) & (order[:, None, :] < order[:, :, None])
         depth[rival.any(2)] = -np.inf

@@ -33,7 +33,7 @@ def scene(**kind: bool) -> tuple[ContactDepths, np.ndarray, int]:
     triangles = np.concatenate([first, second + len(a)])
     index = np.arange(len(a) + len(b), len(rest))
     contact = Contact(points=index, triangles=triangles, **kind)
-    return ContactDepths([contact], rest, 6.0), rest, len(a) + len(b)
+    return ContactDepths([contact], rest), rest, len(a) + len(b)
 
 
 @pytest.mark.parametrize("kind", [{}, {"solid": True}, {"rigid": True}])
