@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float, Int
 from coregister.anatomy.dental_rig import ArchPose, RiggedArch, ToothPose
 
 # Congenitally missing teeth by kind, of all missing ones [Polder 2004]: second premolars and upper lateral incisors.
-_MISSING = {35: 0.21, 45: 0.21, 12: 0.115, 22: 0.115, 15: 0.105, 25: 0.105, 31: 0.035, 41: 0.035, 14: 0.035, 24: 0.035}
+_MISSING = {35: 0.21, 45: 0.21, 12: 0.115, 22: 0.115, 15: 0.105, 25: 0.105, 31: 0.02, 41: 0.02, 14: 0.05, 24: 0.05}
 _CROWDED_TURN_DEG = 8.0  # for each millimetre of crowding
 _LEFT_OUT = np.array([0.75, 0.75, 0.10])  # size of a missing tooth, which stays in the gum as a flat remnant
 

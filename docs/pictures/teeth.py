@@ -33,15 +33,16 @@ class _Painter:
         self.all = data.triangles[members[data.triangles].all(1)]
         upper = np.isin(self.all[:, 0], find_teeth(data)[0].vertices)
         self.upper = self.all[upper]
-        assert basis.template is not None
-        self.centre = basis.template.mean(0)
+        corners = self.vertices[self.all]
+        self.centre = (corners.min((0, 1)) + corners.max((0, 1))) / 2
+        self.width = 1.25 * float(np.ptp(corners[..., 0]))
 
     def __call__(self, coefficients: Float[np.ndarray, "K"]) -> Picture:
         assert self.basis.template is not None
         vertices = self.vertices.copy()
         vertices[self.basis.vertices] = self.basis.template + np.tensordot(coefficients, self.basis.components, 1)
-        front = Shot(target=tuple(self.centre), direction=(0.0, 0.0, 1.0), width=0.085, size=SIZE)
-        below = Shot(target=tuple(self.centre), direction=(0.0, -1.0, 0.02), width=0.1, size=SIZE)
+        front = Shot(target=tuple(self.centre), direction=(0.0, 0.0, 1.0), width=self.width, size=SIZE)
+        below = Shot(target=tuple(self.centre), direction=(0.0, -1.0, 0.02), width=1.3 * self.width, size=SIZE)
         return np.concatenate(
             [draw(vertices, self.all, self.colours, front), draw(vertices, self.upper, self.colours, below)]
         )
