@@ -10,7 +10,7 @@ from scipy.sparse import coo_matrix
 from coregister.anatomy.cranium_model import under_hair
 from coregister.next_model.completion import CompletionSettings, MissingDataCompletion
 from registration.cranium.auxiliary_model import CraniumModel
-from registration.cranium.complete import CraniumCompletion, CraniumSettings
+from registration.cranium.complete import CompletedCranium, CraniumCompletion, CraniumSettings
 from registration.frames import MM_PER_M
 from registration.geometry import rigid
 from registration.geometry.extrapolation import extrapolate
@@ -80,6 +80,13 @@ class CraniumMeasure:
 
     def __init__(self, data: GNMData, hidden: Bool[np.ndarray, "V"], band: Bool[np.ndarray, "V"]):
         self._triangles, self._rows, self._band = data.triangles, hidden & under_hair(data), band
+
+    @classmethod
+    def of(cls, data: GNMData, completed: CompletedCranium) -> "CraniumMeasure":
+        """Return the measure for the skin that was completed in a head, and other heads that hide the same."""
+        near = np.zeros(len(completed.hidden), bool)
+        near[data.triangles[completed.hidden[data.triangles].any(1)]] = True
+        return cls(data, completed.hidden, near & (completed.weights < 1))
 
     def __call__(self, filled: Float[np.ndarray, "V 3"], truth: Float[np.ndarray, "V 3"]) -> CraniumError:
         area = vertex_areas(truth, self._triangles)[self._rows]

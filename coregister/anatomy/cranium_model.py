@@ -23,6 +23,7 @@ from registration.render.studio.skin import depth_inside_hairline
 MIN_HEADS = 30
 RANKS = (20, 30, 40, 50, 60)
 NOISES_MM = (0.5, 1.0, 2.0, 3.0, 5.0, 8.0)  # of a square centimetre of skin; less than a registration's is not tried
+_ROUNDING = 1e-5  # of the largest standard deviation of a component
 
 
 def under_hair(data: GNMData) -> Bool[np.ndarray, "V"]:
@@ -67,13 +68,14 @@ def build_cranium_model(
     mean = aligned.mean(0)
     rows = np.flatnonzero(exterior)
     deviations = (aligned - mean)[:, rows]
+    roots = np.repeat(np.sqrt(area[rows]), 3)
+    components, spread = dense_components(deviations.reshape(len(heads), -1) * roots, 1.0, centred=True)
+    most = min(int((spread > _ROUNDING * spread[0]).sum()), len(heads) - 2)  # fewer than heads if they are of a model
     products = _Products.of(data, mean, deviations, rows)
-    ranks = [rank for rank in ranks if rank <= len(heads) - 2] or [len(heads) - 2]
+    ranks = [rank for rank in ranks if rank <= most] or [most]
     tried = [(rank, noise / 1000) for rank in ranks for noise in noises_mm]
     errors = np.array([products.hidden_error(*setting) for setting in tried])
     rank, noise = tried[int(errors.argmin())]
-    roots = np.repeat(np.sqrt(area[rows]), 3)
-    components, _ = dense_components(deviations.reshape(len(heads), -1) * roots, 1.0, centred=True)
     basis, residual = np.zeros((rank, *mean.shape)), np.zeros(len(mean))
     basis[:, rows] = (components[:rank] / roots).reshape(rank, -1, 3)
     left = products.left_out(rank, noise, products.seen)[:, : len(heads)] @ deviations.reshape(len(heads), -1)

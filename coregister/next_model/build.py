@@ -32,6 +32,8 @@ from coregister.next_model.identity import IdentityBasis
 from coregister.next_model.provenance import BuildInputs, build_manifest
 from coregister.next_model.recipes import ModelRecipe, few_registrations
 from coregister.next_model.training_data import TrainingSet, TrainingSubject, check_rank, validate_training_set
+from registration.cranium.auxiliary_model import CraniumModel
+from registration.cranium.complete import CraniumCompletion, CraniumSettings
 from registration.frames import transform_points
 from registration.geometry.rigid import align
 from registration.model.gnm_npz import GNMData
@@ -53,6 +55,7 @@ def build_model(
     recipe: ModelRecipe | None = None,
     *,
     categories: Mapping[str, str] | None = None,
+    cranium: CraniumModel | None = None,
 ) -> BuiltModel:
     """Build the next model. Deterministic.
 
@@ -61,6 +64,8 @@ def build_model(
         previous: the model in whose topology the meshes are.
         recipe: all settings; None: `recipes.few_registrations()`, as `gnmreg coregister` uses.
         categories: every permitted label of an expression -> its category; None: any label.
+        cranium: completes unobserved craniums of neutrals, unless the recipe's `completion.cranium` is off; None: the
+            previous model does.
 
     Returns:
         The model, in the topology of the previous one, and its provenance.
@@ -72,7 +77,7 @@ def build_model(
     recipe = recipe or few_registrations()
     training = validate_training_set(subjects, previous, labels=None if categories is None else {*categories})
     _check_rank(training, previous, recipe)
-    aligned, completed = _align(training, previous, recipe)
+    aligned, completed = _align(training, previous, recipe, cranium)
     head = identity.build_identity_basis(aligned.vertices, previous, recipe.identity, recipe.memory_gb)
     data = _with_identity(previous, head)
     with DisplacementStore(training.expression_count, len(head.template)) as store:
@@ -118,16 +123,25 @@ def _check_rank(training: TrainingSet, previous: GNMData, recipe: ModelRecipe) -
     )
 
 
-def _align(training: TrainingSet, previous: GNMData, recipe: ModelRecipe) -> tuple[AlignedNeutrals, int]:
+def _align(
+    training: TrainingSet, previous: GNMData, recipe: ModelRecipe, cranium: CraniumModel | None
+) -> tuple[AlignedNeutrals, int]:
     """Completed and aligned neutrals, and the number of those with missing data."""
     stable, template = SkullSkin.from_model(previous).area, previous.template_vertex_positions.astype(np.float64)
     T_model_head = align(training.neutrals, template, training.confidence * stable)
     complete = MissingDataCompletion(previous, previous.vertex_identity_basis, recipe.completion)
+    of_cranium = None
+    if cranium is not None and recipe.completion.cranium == "model":
+        settings = CraniumSettings(min_confidence=recipe.completion.min_confidence)
+        of_cranium = CraniumCompletion(previous, cranium, settings)
     heads, completed = np.empty_like(training.neutrals), 0
     rows = zip(T_model_head, training.neutrals, training.confidence, strict=True)
     for index, (T, vertices, confidence) in enumerate(rows):
-        displacement = transform_points(T, vertices.astype(np.float64)) - template
-        heads[index] = template + complete(displacement, confidence)
+        head, known = transform_points(T, vertices.astype(np.float64)), confidence
+        if of_cranium is not None and (whole := of_cranium(head, confidence)) is not None:
+            head = whole.vertices  # what it completes is no longer missing: the previous model does the rest
+            known = np.where(whole.hidden, np.float32(recipe.completion.min_confidence), confidence)
+        heads[index] = template + complete(head - template, known)
         completed += complete.has_missing(confidence)
     aligned = align_neutrals(
         heads,

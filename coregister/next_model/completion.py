@@ -4,6 +4,7 @@ See docs/algorithms.md, "Missing-data completion".
 """
 
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -25,12 +26,15 @@ class CompletionSettings:
         detail_mm: standard deviation of the difference between a face and its best approximation by the model, and
         detail_size_mm: the length over which that difference is correlated; nearer points are no new evidence.
         fade_mm: distance over which that difference fades into unobserved skin.
+        cranium: what the unobserved cranium of a neutral is like. model: as the auxiliary model beside the previous
+            model expects it (`registration.cranium`), if there is one. off: as all other unobserved skin.
     """
 
     min_confidence: float = 0.1
     detail_mm: float = 1.0
     detail_size_mm: float = 15.0
     fade_mm: float = 15.0
+    cranium: Literal["model", "off"] = "model"
 
 
 class MissingDataCompletion:

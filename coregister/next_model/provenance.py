@@ -1,5 +1,6 @@
 """Provenance of a built model: its manifest, and the files beside the model file (docs/formats.md, "Built models")."""
 
+import shutil
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -15,6 +16,7 @@ from coregister.next_model.identity import IdentityBasis
 from coregister.next_model.recipes import ModelRecipe
 from coregister.next_model.training_data import TrainingSet
 from coregister.tag_groups import tag_group
+from registration.cranium import auxiliary_model
 from registration.frames import MM_PER_M
 from registration.model import gnm_npz, landmarks
 from registration.model.gnm_npz import GNMData
@@ -83,8 +85,8 @@ def write(
     path: Path,
     previous: Path,
 ) -> None:
-    """Write the model file and, beside it, the previous model's landmark schemes, `NAME.manifest.json` and
-    `NAME.expressions.npz`. The model file is written last.
+    """Write the model file and, beside it, `NAME.manifest.json`, `NAME.expressions.npz`, and the landmark schemes and
+    the auxiliary model of the cranium of the previous model. The model file is written last.
 
     Args:
         data: the model.
@@ -100,6 +102,10 @@ def write(
     path.parent.mkdir(parents=True, exist_ok=True)
     for scheme in landmarks.schemes_beside(previous, data.template_vertex_positions).values():
         landmarks.write_scheme(scheme, path)
+    cranium = auxiliary_model.beside(previous)
+    if cranium.is_file() and cranium != auxiliary_model.beside(path):
+        with atomic_file(auxiliary_model.beside(path)) as temporary:
+            shutil.copyfile(cranium, temporary)
     if coefficients is not None:
         arrays = {"mean": coefficients.mean, "covariance": coefficients.covariance}
         with atomic_file(path.with_name(f"{path.stem}.expressions.npz")) as temporary:

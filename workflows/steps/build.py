@@ -8,6 +8,7 @@ from typing import Any
 from coregister.next_model import provenance
 from coregister.next_model.build import build_model
 from coregister.next_model.recipes import ModelRecipe
+from registration.cranium import auxiliary_model
 from registration.errors import InputError
 from registration.model import gnm_npz
 from registration.progress import NullProgress, Progress
@@ -59,13 +60,16 @@ def build_next_model(
     subjects = RegisteredSubjects(run=Path(run), names=names, model=data, stabilized_set=stabilized_set, tags=tags)
     settings = ModelRecipe.from_json(recipe, where="the job's recipe")
     inputs = {**subjects.inputs, "previous": gnm_npz.content_hash(data)}
+    cranium = auxiliary_model.find(Path(previous), data) if settings.completion.cranium == "model" else None
+    if cranium is not None:
+        inputs["cranium"] = hashing.hash_fields(cranium)
     config = {"recipe": hashing.to_jsonable(settings), "categories": source.categories, "tags": tags}
     folder = Path(out)
     product = Product(folder, hashing.input_hash(inputs, config), BuildResult)
     if (existing := product.find()) is not None and _is_model(folder / MODEL, existing.content_id):
         return replace(existing, model=str(folder / MODEL)).to_json()
     (progress or NullProgress()).message(f"building a model from {len(subjects.usable)} subjects")
-    built = build_model(subjects, data, settings, categories=source.categories)
+    built = build_model(subjects, data, settings, categories=source.categories, cranium=cranium)
     result = BuildResult(
         input_hash=product.input_hash,
         model=str(folder / MODEL),

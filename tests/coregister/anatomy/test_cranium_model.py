@@ -81,3 +81,12 @@ def test_heads_that_are_refused(spoil, what, got, tmp_path):
     with pytest.raises(InputError) as error:
         read_heads(tmp_path, data)
     assert what in error.value.what and got in error.value.got
+
+
+def test_heads_of_a_small_span_give_a_model_of_no_higher_rank():
+    """Such as registrations of a model with few components."""
+    data = tiny()
+    weights = np.random.default_rng(0).normal(size=(40, len(data.vertex_identity_basis)))
+    heads = data.template_vertex_positions + np.tensordot(weights, data.vertex_identity_basis, 1)
+    model = build_cranium_model(data, heads, seed=0, source="the model")
+    assert 4 <= model.rank < 20 and model.tried_errors.min() < 1e-3

@@ -8,13 +8,18 @@ import numpy as np
 import pytest
 import torch
 
+from bench.support.population import true_neutrals
+from coregister.anatomy.cranium_model import build_cranium_model, under_hair
+from coregister.first_model.build import TargetDisplacements
 from coregister.next_model import provenance
 from coregister.next_model.alignment import align_neutrals
-from coregister.next_model.build import BuiltModel, build_model
+from coregister.next_model.build import BuiltModel, _align, build_model
 from coregister.next_model.recipes import ModelRecipe, few_registrations, load_model_recipe, true_meshes
-from coregister.next_model.training_data import TrainingSubject, unpose
+from coregister.next_model.training_data import TrainingSubject, unpose, validate_training_set
+from registration.cranium.auxiliary_model import CraniumModel
 from registration.errors import InputError
-from registration.frames import axis_angle_to_matrix
+from registration.frames import axis_angle_to_matrix, transform_points
+from registration.geometry import rigid
 from registration.model import gnm_npz, landmarks, regions
 from registration.model.gnm import GNM
 from registration.model.gnm_npz import AXES, GNMData
@@ -210,6 +215,33 @@ def test_outliers_are_rejected_by_name(subjects, model):
     rows = {row["subject"]: row for row in built.manifest["subjects"]}
     assert len(rows) == 7 and rows[subjects[5].name]["expressions"] == 3
     assert rows[subjects[5].name]["weight_of_each"] == pytest.approx(1 / 3)
+
+
+def test_an_auxiliary_model_completes_unobserved_craniums(head_assembly, subjects, model):
+    hair = under_hair(model)
+    displacements = TargetDisplacements(head_assembly.source)
+    heads = true_neutrals(head_assembly, displacements, 40, np.random.default_rng(600))
+    cranium = build_cranium_model(model, heads, seed=0, source="samples", ranks=(20,), noises_mm=(2.0,))
+    partial = []
+    for subject in subjects:
+        vertices = subject.neutral.vertices + np.float32(0.05) * hair[:, None]
+        partial.append(replace(subject, neutral=samples.mesh("neutral", vertices, model, ~hair), expressions=()))
+    training = validate_training_set(partial, model)
+
+    def error_mm(recipe: ModelRecipe, cranium: CraniumModel | None) -> float:
+        aligned, completed = _align(training, model, recipe, cranium)
+        assert completed == len(subjects)
+        truths = np.stack([subjects[k].neutral.vertices for k in aligned.kept]).astype(np.float64)
+        T = rigid.align(
+            truths, model.template_vertex_positions, np.tile((~hair & regions.head_skin(model)).astype(float), (8, 1))
+        )
+        moved = np.stack([transform_points(t, vertices) for t, vertices in zip(T, truths, strict=True)])
+        return float(1e3 * np.linalg.norm(aligned.vertices - moved, axis=2)[:, hair].mean())
+
+    recipe = few_registrations()
+    off = replace(recipe, completion=replace(recipe.completion, cranium="off"))
+    assert error_mm(off, cranium) == error_mm(recipe, None)
+    assert error_mm(recipe, cranium) < 0.8 * error_mm(recipe, None)
 
 
 def test_unobserved_skin_follows_the_previous_model(subjects, model):
