@@ -14,7 +14,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float
 from rich.console import Console
 from rich.table import Table
 
@@ -29,7 +28,6 @@ from registration.cranium import auxiliary_model
 from registration.cranium.auxiliary_model import CraniumModel
 from registration.cranium.complete import CraniumCompletion
 from registration.frames import MM_PER_M
-from registration.geometry import rigid
 from registration.geometry.closest_point import closest_points
 from registration.model import gnm_npz, regions
 from registration.model.gnm_npz import GNMData
@@ -86,8 +84,7 @@ def main() -> int:
 
 def _with_hair(data: GNMData, model: CraniumModel, registered: Registration, root: Path) -> Row:
     """By true vertices of the same index."""
-    head, T = neutral_head(data, registered)
-    truth = _into(T, read_truth(root / "ground_truth.npz"))
+    head, truth = registered.vertices.astype(np.float64), read_truth(root / "ground_truth.npz").astype(np.float64)
     confidence = registered.confidence
     completed = CraniumCompletion(data, model)(head, confidence)
     assert completed is not None
@@ -104,14 +101,14 @@ def _with_hair(data: GNMData, model: CraniumModel, registered: Registration, roo
 
 def _hidden(data: GNMData, model: CraniumModel, registered: Registration, root: Path) -> Row:
     """By distance to the scan's surface. What was registered there saw the cranium, and is no fill."""
-    head, T = neutral_head(data, registered)
+    head = registered.vertices.astype(np.float64)
     file = read_capture(root).scan
     assert file is not None
     scan = read_scan(file)
     hair = under_hair(data)
     confidence = np.where(hair, 0.0, registered.confidence).astype(np.float32)
     filled = {name: fill(head, confidence) for name, fill in fills(data, model).items()}
-    surface = _into(T, scan.vertices)
+    surface = scan.vertices.astype(np.float64)
     means = {
         name: float(MM_PER_M * closest_points(vertices[hair], surface, scan.triangles)[0].mean())
         for name, vertices in filled.items()
@@ -119,21 +116,9 @@ def _hidden(data: GNMData, model: CraniumModel, registered: Registration, root: 
     return Row(name=root.parent.name, cranium_mm=means, face_moved_mm=_face_moved(data, filled[MODEL], head))
 
 
-def neutral_head(data: GNMData, registered: Registration) -> tuple[Float[np.ndarray, "V 3"], Float[np.ndarray, "4 4"]]:
-    """Return a registration's head at rest, of metric size, and T_rest_world of its head without the neck."""
-    identity = np.tensordot(registered.identity, data.vertex_identity_basis, 1)
-    head = float(registered.scale) * (data.template_vertex_positions + identity + registered.offsets).astype(np.float64)
-    skin = regions.head_skin(data).astype(np.float64)
-    return head, rigid.align(registered.vertices[None].astype(np.float64), head, skin[None])[0]
-
-
 def _face_moved(data: GNMData, filled: np.ndarray, head: np.ndarray) -> float:
     face = regions.head_skin(data) & ~regions.cranium(data)
     return float(MM_PER_M * np.linalg.norm(filled - head, axis=1)[face].max())
-
-
-def _into(T: Float[np.ndarray, "4 4"], points: np.ndarray) -> Float[np.ndarray, "N 3"]:
-    return points.astype(np.float64) @ T[:3, :3].T + T[:3, 3]
 
 
 def _show(title: str, rows: list[Row]) -> None:

@@ -16,7 +16,7 @@ from registration.capture.origin import in_world
 from registration.capture.visual_hull import outside_masks
 from registration.completion.saved import Completion
 from registration.cranium.complete import CompletedCranium, CraniumCompletion
-from registration.cranium.registered import cranium_figure, cranium_note, write_cranium
+from registration.cranium.registered import NEUTRAL, cranium_figure, cranium_note, write_cranium
 from registration.evaluate.audit import audit_penetration
 from registration.evaluate.evaluation import RegistrationEvaluation, evaluate_registration, without_scan
 from registration.evaluate.verdict import judge
@@ -187,10 +187,13 @@ def _complete_cranium(
     inputs: RegistrationInputs, problem: FitProblem, confidence: Float[np.ndarray, "V"]
 ) -> tuple[CompletedCranium | None, dict[str, Any]]:
     """Complete the hidden cranium of a fit in place; return it, None if it stays as it is, and the figure of it."""
-    head = problem.variables.neutral_vertices().double().cpu().numpy()
+    head = problem.vertices().double().cpu().numpy()
     completed = None
     if inputs.cranium is not None and np.isfinite(head).all():
-        completed = CraniumCompletion(inputs.data, inputs.cranium)(head, confidence)
+        expression_m = None
+        if inputs.capture.expression != NEUTRAL:  # a neutral face is as it looks, whatever coefficients it took
+            expression_m = problem.variables.expression_vertices().norm(dim=1).double().cpu().numpy()
+        completed = CraniumCompletion(inputs.data, inputs.cranium)(head, confidence, expression_m)
     moved = None
     if completed is not None:
         moved = completed.vertices - head

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 
 from registration.cranium.auxiliary_model import CraniumModel
 from registration.cranium.conditional import patch_areas, predict, twist_fields
@@ -21,8 +21,8 @@ from registration.model.gnm_npz import GNMData, topology_hash
 from registration.render.studio.skin import depth_inside_hairline
 
 MIN_HEADS = 30
-RANKS = (20, 30, 40, 50, 60)
-NOISES_MM = (0.5, 1.0, 2.0, 3.0, 5.0, 8.0)  # of a square centimetre of skin; less than a registration's is not tried
+RANKS = (20, 40, 60, 80, 100)
+NOISES_MM = (0.5, 1.0, 2.0, 4.0, 8.0)  # of a square centimetre of skin; less than a registration's is not tried
 _ROUNDING = 1e-5  # of the largest standard deviation of a component
 
 
@@ -40,7 +40,7 @@ def build_cranium_model(
     ranks: Sequence[int] = RANKS,
     noises_mm: Sequence[float] = NOISES_MM,
 ) -> CraniumModel:
-    """Build an auxiliary model.
+    """Build an auxiliary model from heads and their mirror images.
 
     Args:
         data: the head model of the topology.
@@ -61,6 +61,8 @@ def build_cranium_model(
             got=len(heads),
             fix="add heads of other people",
         )
+    count = len(heads)
+    heads = np.concatenate([heads, heads[:, data.mirror_indices] * np.array([-1, 1, 1], heads.dtype)])
     exterior = regions.exterior(data)
     face = exterior & ~regions.cranium(data) & ~regions.neck_other(data)
     area = vertex_areas(data.template_vertex_positions.astype(np.float64), data.triangles)
@@ -70,23 +72,23 @@ def build_cranium_model(
     deviations = (aligned - mean)[:, rows]
     roots = np.repeat(np.sqrt(area[rows]), 3)
     components, spread = dense_components(deviations.reshape(len(heads), -1) * roots, 1.0, centred=True)
-    most = min(int((spread > _ROUNDING * spread[0]).sum()), len(heads) - 2)  # fewer than heads if they are of a model
-    products = _Products.of(data, mean, deviations, rows)
+    most = min(int((spread > _ROUNDING * spread[0]).sum()), count - 2)  # fewer than heads if they are of a model
     ranks = [rank for rank in ranks if rank <= most] or [most]
+    products = _Products.of(data, mean, deviations, rows, max(ranks))
     tried = [(rank, noise / 1000) for rank in ranks for noise in noises_mm]
     errors = np.array([products.hidden_error(*setting) for setting in tried])
     rank, noise = tried[int(errors.argmin())]
     basis, residual = np.zeros((rank, *mean.shape)), np.zeros(len(mean))
     basis[:, rows] = (components[:rank] / roots).reshape(rank, -1, 3)
     left = products.left_out(rank, noise, products.seen)[:, : len(heads)] @ deviations.reshape(len(heads), -1)
-    residual[rows] = np.sqrt(np.square(left).reshape(len(heads), -1, 3).sum(2).mean(0))
+    residual[rows] = np.sqrt(np.square(left).reshape(count, -1, 3).sum(2).mean(0))
     model = CraniumModel(
         topology=topology_hash(data.triangles),
         mean=mean,
         basis=basis,
         residual=residual,
         noise=noise,
-        heads=len(heads),
+        heads=count,
         seed=seed,
         source=source,
         tried_ranks=np.array([setting[0] for setting in tried]),
@@ -112,19 +114,25 @@ def _aligned(heads: Float[np.ndarray, "N V 3"], weights: Float[np.ndarray, "V"])
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _Products:
-    """Inner products of N heads and six motions, from which all leave-one-out fits follow without their vertices.
+    """Inner products of N heads, their images and six motions: all leave-one-out fits follow without their vertices.
 
-    Rows and columns: the heads' deviations from their mean, then the fields of six twists.
+    Rows and columns: deviations from the mean of the heads, then of their mirror images; then the fields of six twists.
     """
 
-    count: int
+    count: int  # N
+    rank: int  # the largest that will be asked for
     shape: Float[np.ndarray, "M M"]  # over all skin, by area: what the components explain
     seen: Float[np.ndarray, "M M"]  # over the skin that hair does not hide, by patches
     hidden: Float[np.ndarray, "M M"]  # over the cranium that hair hides, by share of its area
 
     @classmethod
     def of(
-        cls, data: GNMData, mean: Float[np.ndarray, "V 3"], deviations: Float[np.ndarray, "N E 3"], rows: np.ndarray
+        cls,
+        data: GNMData,
+        mean: Float[np.ndarray, "V 3"],
+        deviations: Float[np.ndarray, "2*N E 3"],
+        rows: Int[np.ndarray, "E"],
+        rank: int,
     ) -> "_Products":
         patches = patch_areas(mean, data.triangles)
         hair, head = under_hair(data), regions.head_skin(data)
@@ -136,7 +144,8 @@ class _Products:
             return np.asarray(weighted @ vectors.reshape(len(vectors), -1).T)
 
         return cls(
-            count=len(deviations),
+            count=len(deviations) // 2,
+            rank=rank,
             shape=products(patches),
             seen=products(patches * (head & ~hair)),
             hidden=products(patches * hair / max(patches[hair].sum(), 1e-12)),
@@ -144,15 +153,15 @@ class _Products:
 
     @cached_property
     def _spectra(self) -> list[tuple[Float[np.ndarray, "M"], Float[np.ndarray, "K M"]]]:
-        """For each head the mean and all components of the others."""
+        """For each head the mean and the components of the others and their images."""
         spectra = []
         for left_out in range(self.count):
-            others = np.delete(np.arange(self.count), left_out)
+            others = np.delete(np.arange(2 * self.count), [left_out, left_out + self.count])
             mean = np.zeros(len(self.shape))
             mean[others] = 1 / len(others)
             centred = np.eye(len(self.shape))[others] - mean
             _, vectors = np.linalg.eigh(centred @ self.shape @ centred.T)
-            spectra.append((mean, vectors[:, ::-1].T @ centred / np.sqrt(len(others) - 1)))
+            spectra.append((mean, vectors[:, : -self.rank - 1 : -1].T @ centred / np.sqrt(len(others) - 1)))
         return spectra
 
     def hidden_error(self, rank: int, noise: float) -> float:
@@ -162,7 +171,7 @@ class _Products:
 
     def left_out(self, rank: int, noise: float, observed: Float[np.ndarray, "M M"]) -> Float[np.ndarray, "N M"]:
         """Each head minus its prediction by a model of the others, as a combination of deviations and motions."""
-        motions = np.eye(len(self.shape))[self.count :]
+        motions = np.eye(len(self.shape))[2 * self.count :]
         result = np.zeros((self.count, len(self.shape)))
         for index, (mean, components) in enumerate(self._spectra):
             basis = np.concatenate([components[:rank], motions])

@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from registration.cranium.registered import hidden_share
+from registration.cranium.registered import NEUTRAL, hidden_share
 from registration.errors import InputError
 from registration.geometry.topology import vertex_areas
 from registration.model import regions
@@ -22,7 +22,7 @@ def read_heads(folder: Path, data: GNMData) -> Float[np.ndarray, "N V 3"]:
 
     Args:
         folder: mesh files (.obj, .ply, .glb, .gltf; metres, vertices in the model's order) and folders of
-            registrations, of which the neutral head at rest is taken.
+            registrations of neutrals.
         data: the head model of the topology.
 
     Returns:
@@ -84,13 +84,11 @@ def _registered(path: Path, data: GNMData) -> Float[np.ndarray, "V 3"]:
     registration = load_registration(path)
     if topology_hash(registration.triangles) != topology_hash(data.triangles):
         raise _error("A head has another topology than the model", path, "the model's triangles", "other triangles")
-    if len(registration.identity) != len(data.vertex_identity_basis):
-        expected = f"{len(data.vertex_identity_basis)} identity coefficients"
-        raise _error("A head was registered with another model", path, expected, len(registration.identity))
+    if (expression := registration.figures.get("expression", NEUTRAL)) != NEUTRAL:
+        raise _error("A head is no neutral", path, f"a registration of the expression {NEUTRAL}", expression)
     share = hidden_share(data, registration.confidence)
     _check_share(path, share, "was observed by no camera")
-    neutral = data.template_vertex_positions + np.tensordot(registration.identity, data.vertex_identity_basis, 1)
-    return _checked(float(registration.scale) * (neutral + registration.offsets), path, data)
+    return _checked(registration.vertices, path, data)
 
 
 def _check_scalp(path: Path, data: GNMData, whole: Bool[np.ndarray, "V"], what: str) -> None:

@@ -25,12 +25,14 @@ class CraniumSettings:
         min_area_cm2: hidden patches of the cranium that are smaller stay as they are registered.
         band_mm: width of the band inside the hidden skin in which the registered skin passes into the predicted head.
         length_mm: over which a step between both is spread.
+        expression_mm: displacement by the expression at which skin says half as much of the person.
     """
 
     min_confidence: float = 0.1
     min_area_cm2: float = 20.0
     band_mm: float = 35.0
     length_mm: float = 15.0
+    expression_mm: float = 1.0
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -77,19 +79,29 @@ class CraniumCompletion:
         area = np.bincount(patch, self._patches * (low & self._cranium))
         return low & (area >= self._settings.min_area_cm2)[patch]
 
-    def __call__(self, head: Float[np.ndarray, "V 3"], confidence: Float[np.ndarray, "V"]) -> CompletedCranium | None:
+    def __call__(
+        self,
+        head: Float[np.ndarray, "V 3"],
+        confidence: Float[np.ndarray, "V"],
+        expression_m: Float[np.ndarray, "V"] | None = None,
+    ) -> CompletedCranium | None:
         """Complete a head, or return None if enough of its cranium is observed.
 
         Args:
-            head: registered, at rest, neutral, of metric size; metres.
+            head: registered, in any pose, of metric size; metres.
             confidence: of its vertices.
+            expression_m: how far an expression displaces each vertex, metres: such skin says less of the person.
+                None: the face is neutral.
         """
         hidden = self.hidden(confidence)
         if not hidden.any():
             return None
         settings = self._settings
         seen = self._exterior & ~self._neck & (confidence >= settings.min_confidence)
-        predicted = predict(self._model, head, np.where(seen, self._patches, 0.0))
+        patches = np.where(seen, self._patches, 0.0)
+        if expression_m is not None:
+            patches = patches / (1 + np.square(1000 * expression_m / settings.expression_mm))
+        predicted = predict(self._model, head, patches)
         weights = band_weights(predicted.vertices, self._triangles, hidden, settings.band_mm / 1000)
         displacement = head - predicted.vertices
         displacement[hidden & self._cranium] = 0.0

@@ -43,7 +43,7 @@ def predict(model: CraniumModel, head: Float[np.ndarray, "V 3"], patches: Float[
 
     Args:
         model: the auxiliary model.
-        head: neutral, metric size, any pose; metres.
+        head: of metric size, in any pose of the whole head; metres.
         patches: weight O of each vertex, `patch_areas` where observed; 0: hidden.
     """
     T_model_head = rigid.align(head[None], model.mean, patches[None])[0]

@@ -15,6 +15,7 @@ from registration.model.gnm_npz import GNMData
 from registration.model.regions import cranium
 
 VERTEX_FILE = "cranium.npz"  # in the registration's folder
+NEUTRAL = "neutral"  # label of a capture whose face shows no expression
 _NOTED_SHARE = 0.1  # of the cranium's area: less is always hidden, as behind the ears
 
 

@@ -153,17 +153,20 @@ class Variables:
         return self.model.bind(identity, torch.zeros_like(self.tensors["expression"]))
 
     @torch.no_grad()
-    def neutral_vertices(self) -> Float[Tensor, "V 3"]:
-        """Return the head with a neutral expression and the free offsets, model frame, metric size, metres."""
-        offsets = torch.zeros_like(self.fixed_offsets).index_add(0, self._skin, self.skin_offsets())
-        return self.tensors["scale"].exp() * (self.bind_pose_vertices() + offsets)
+    def expression_vertices(self) -> Float[Tensor, "V 3"]:
+        """Return the displacements that the expression alone gives the head at rest, metric size, metres."""
+        bind, _ = self._bind_pose(self.tensors)
+        return self.tensors["scale"].exp() * (bind - self.bind_pose_vertices())
 
     @torch.no_grad()
     def move_skin(self, displacement: Float[np.ndarray, "V 3"]) -> None:
-        """Displace the skin of `neutral_vertices`, and with it the mesh, between two stages; metres."""
+        """Displace the skin of the posed mesh, between two stages; world, metres. Its offsets take up the motion."""
         assert self.latent is None
+        posed, unit = self.vertices(self._offsets), torch.eye(3, device=self._offsets.device)
+        # Posing is linear in the offsets of each vertex.
+        axes = torch.stack([self.vertices(self._offsets + axis)[self._skin] - posed[self._skin] for axis in unit], -1)
         moved = torch.as_tensor(displacement[self.skin], dtype=self._offsets.dtype, device=self._offsets.device)
-        self._offsets = self._offsets + moved / self.tensors["scale"].exp()
+        self._offsets = self._offsets + torch.linalg.solve(axes, moved)
 
     @torch.no_grad()
     def parameters(self) -> tuple[Parameters, Float[Tensor, "V 3"]]:
