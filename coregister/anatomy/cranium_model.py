@@ -130,7 +130,7 @@ class _Products:
         cls,
         data: GNMData,
         mean: Float[np.ndarray, "V 3"],
-        deviations: Float[np.ndarray, "2*N E 3"],
+        deviations: Float[np.ndarray, "M E 3"],
         rows: Int[np.ndarray, "E"],
         rank: int,
     ) -> "_Products":

@@ -31,4 +31,4 @@ def smooth_heads(count: int, seed: int) -> Float[np.ndarray, "N V 3"]:
 
 @cache
 def auxiliary_model() -> CraniumModel:
-    return build_cranium_model(tiny(), smooth_heads(40, 0), seed=0, source="waves", ranks=(3, 6), noises_mm=(0.1, 3.0))
+    return build_cranium_model(tiny(), smooth_heads(40, 0), seed=0, source="waves", ranks=(3, 12), noises_mm=(0.1, 3.0))
