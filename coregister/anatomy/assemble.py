@@ -15,7 +15,7 @@ from jaxtyping import Bool, Float, Int
 from coregister.anatomy.eyes import EyeSettings, eye_basis, pupils_basis
 from coregister.anatomy.part_basis import PartBasis, PartName
 from coregister.anatomy.teeth import TeethSettings, teeth_basis
-from coregister.anatomy.tongue import TongueSettings, tongue_basis
+from coregister.anatomy.tongue import TongueSettings, TongueSources, tongue_basis
 from registration.errors import InputError, check_seed
 from registration.model import gnm_npz, regions
 from registration.model.gnm_npz import GNMData
@@ -56,13 +56,16 @@ class AnatomySettings:
             )
 
 
-Builder = Callable[[GNMData, AnatomySettings], PartBasis]
-# In the order in which they are built: pupils put the iris in place before the eyes' components move it.
+Builder = Callable[[GNMData, AnatomySettings, TongueSources], PartBasis]
+# In the order in which they are built: pupils put the iris in place before the eyes' components move it, and the tongue
+# is posed among the new teeth.
 BUILDERS: Mapping[PartName, Builder] = {
-    "pupils": lambda data, settings: pupils_basis(data),
-    "eyes": lambda data, settings: eye_basis(data, replace(settings.eyes, seed=settings.seed)),
-    "teeth": lambda data, settings: teeth_basis(data, replace(settings.teeth, seed=settings.seed)),
-    "tongue": lambda data, settings: tongue_basis(data, replace(settings.tongue, seed=settings.seed)),
+    "pupils": lambda data, settings, tongues: pupils_basis(data),
+    "eyes": lambda data, settings, tongues: eye_basis(data, replace(settings.eyes, seed=settings.seed)),
+    "teeth": lambda data, settings, tongues: teeth_basis(data, replace(settings.teeth, seed=settings.seed)),
+    "tongue": lambda data, settings, tongues: tongue_basis(
+        data, replace(settings.tongue, seed=settings.seed), sources=tongues
+    ),
 }
 
 
@@ -74,7 +77,11 @@ class RegeneratedModel:
     anatomy: dict[str, Any]  # JSON values; docs/formats.md
 
 
-def regenerate(data: GNMData, settings: AnatomySettings = AnatomySettings()) -> RegeneratedModel:  # noqa: B008  frozen
+def regenerate(
+    data: GNMData,
+    settings: AnatomySettings = AnatomySettings(),  # noqa: B008  frozen
+    tongues: TongueSources | None = None,
+) -> RegeneratedModel:
     """Replace the components of some parts of a model, and their template where a part has a new one.
 
     Joints and joint regressor stay; the bases are float32, whatever they were, as half precision would move vertices by
@@ -83,6 +90,7 @@ def regenerate(data: GNMData, settings: AnatomySettings = AnatomySettings()) -> 
     Args:
         data: any model of the official schema.
         settings: parts and seed.
+        tongues: registrations and recordings of tongues; None: none.
 
     Raises:
         InputError: as the parts' builders; nothing is returned then.
@@ -91,7 +99,7 @@ def regenerate(data: GNMData, settings: AnatomySettings = AnatomySettings()) -> 
     bases: list[PartBasis] = []
     for part, build in BUILDERS.items():
         if part in settings.parts:
-            basis = build(data, settings)
+            basis = build(data, settings, tongues or TongueSources())
             data = _with_template(data, basis)
             bases.append(basis)
     removed = _removed(data, settings.parts)
@@ -106,9 +114,21 @@ def regenerate(data: GNMData, settings: AnatomySettings = AnatomySettings()) -> 
     return RegeneratedModel(data=result, anatomy=hashing.to_jsonable(anatomy))
 
 
-def manifest(regenerated: RegeneratedModel, previous: GNMData, settings: AnatomySettings) -> dict[str, Any]:
-    """Return the manifest of a model whose parts were regenerated, as JSON values (docs/formats.md)."""
-    inputs = {"previous": gnm_npz.content_hash(previous)}
+def manifest(
+    regenerated: RegeneratedModel,
+    previous: GNMData,
+    settings: AnatomySettings,
+    digests: Mapping[str, str] | None = None,
+) -> dict[str, Any]:
+    """Return the manifest of a model whose parts were regenerated, as JSON values (docs/formats.md).
+
+    Args:
+        regenerated: the new model.
+        previous: the model that it was.
+        settings: parts and seed.
+        digests: of the files of real tongues, by name.
+    """
+    inputs = {"previous": gnm_npz.content_hash(previous), **(digests or {})}
     content: dict[str, Any] = hashing.to_jsonable(
         {
             "kind": KIND,

@@ -8,6 +8,9 @@ import numpy as np
 from jaxtyping import Float
 
 from coregister.anatomy.part_basis import PartBasis
+from coregister.anatomy.tongue_fit import FittedTongues, KeyPointFit
+from coregister.anatomy.tongue_keypoints import TongueRecording
+from coregister.anatomy.tongue_mouth import JawOpening
 from coregister.anatomy.tongue_poses import PoseSettings, draw_poses, model_expressions
 from coregister.anatomy.tongue_rig import TongueRig
 from coregister.region_masks import FLIP
@@ -18,6 +21,7 @@ from registration.geometry import pca
 from registration.model.gnm_npz import GNMData
 
 _LEAST_SAMPLES = 40
+_LEAST_GAP = 12e-3  # metres between the incisors, beyond the template's: an open mouth
 _STATED = 0.99  # the number of components for this fraction of the variance is told too
 
 
@@ -39,12 +43,25 @@ class TongueSettings:
     poses: PoseSettings = field(default_factory=PoseSettings)
 
 
+@dataclass(frozen=True, kw_only=True, eq=False)
+class TongueSources:
+    """Data of real tongues.
+
+    Attributes:
+        expressions: displacements of registered expressions from their neutrals, in the model's frame, metres; of
+            these, only the outer skin counts.
+        recordings: key points; poses fitted to them are up to a quarter of the samples.
+    """
+
+    expressions: Sequence[Float[np.ndarray, "V 3"]] = ()
+    recordings: Sequence[TongueRecording] = ()
+
+
 def tongue_basis(
     data: GNMData,
     settings: TongueSettings | None = None,
     *,
-    expressions: Sequence[Float[np.ndarray, "V 3"]] = (),
-    articulation: Sequence[Float[np.ndarray, "T 3"]] = (),
+    sources: TongueSources | None = None,
 ) -> PartBasis:
     """Build the expression components of the tongue; the template stays, so that zero is the tongue at rest.
 
@@ -54,15 +71,13 @@ def tongue_basis(
     Args:
         data: a model with the official components and groups.
         settings: of the samples; None: the defaults.
-        expressions: displacements of all vertices in expressive registrations, the tongue carried by the jaw, metres;
-            none: expressions of the model itself.
-        articulation: further samples, displacements of the tongue fitted to key points, metres; each is used with its
-            mirror image, and they take the place of as many poses drawn.
+        sources: registrations and recordings; None: expressions of the model itself.
 
     Raises:
-        InputError: too few samples, or the model's tongue has no tip.
+        InputError: too few samples, registrations with an open mouth or poses that fit, or the model's tongue has no
+            tip.
     """
-    settings = settings or TongueSettings()
+    settings, sources = settings or TongueSettings(), sources or TongueSources()
     check_seed(settings.seed)
     if settings.samples < _LEAST_SAMPLES:
         raise InputError(
@@ -74,11 +89,12 @@ def tongue_basis(
         )
     rig = TongueRig(structure=find_tongue(data))
     rng = np.random.default_rng(settings.seed)
-    fitted = list(articulation)[: settings.samples // 4]  # at least three quarters of the samples are drawn
-    count = (settings.samples + 1) // 2 - len(fitted)
-    mouths = list(expressions) or list(model_expressions(data, settings.poses, rng))
+    mouths = _open_mouths(sources, data) if sources.expressions else []
+    fits = _fitted(sources, rig, data, settings)
+    count = (settings.samples + 1) // 2 - sum(len(fit.times) for fit in fits)
+    mouths = mouths or list(model_expressions(data, settings.poses, rng))
     poses = draw_poses(rig, data, mouths, count, settings.poses, rng)
-    halves = np.concatenate([poses.displacements, *(sample[None] for sample in fitted)])
+    halves = np.concatenate([poses.displacements, *(fit.displacements for fit in fits)])
     samples = np.stack([halves, halves[:, rig.structure.mirror] * FLIP], 1).reshape(-1, *halves.shape[1:])
     samples = samples[: settings.samples]
     principal = pca.principal_components(
@@ -89,10 +105,19 @@ def tongue_basis(
     record: dict[str, Any] = {
         "seed": settings.seed,
         "samples": len(samples),
-        "of_key_points": 2 * len(fitted),
         "mouths": len(mouths),
-        "mouths_of": "registrations" if len(expressions) else "the model's expressions",
-        "rejected": poses.rejected,
+        "mouths_of": "registrations" if sources.expressions else "the model's expressions",
+        "mouths_too_tight": poses.tight,
+        "rejected": sum(poses.rejected.values()),
+        "rejected_for": poses.rejected,
+        "recordings": [
+            {
+                "times": len(fit.times),
+                "residual_mm": float(np.sqrt(np.mean(fit.residual_mm**2))),
+                "limited": int(fit.limited.sum()),
+            }
+            for fit in fits
+        ],
         "components_beside_the_mean": len(principal.variance),
         "variance_kept": principal.variance_ratio,
         f"components_for_{_STATED}": int(np.searchsorted(cumulative, _STATED)) + 1,
@@ -107,3 +132,26 @@ def tongue_basis(
         names=("tongue_mean", *(f"tongue_{k:03d}" for k in range(len(principal.variance)))),
         record=record,
     )
+
+
+def _open_mouths(sources: TongueSources, data: GNMData) -> list[Float[np.ndarray, "V 3"]]:
+    jaw = JawOpening.of(data)
+    expressions = [jaw.of_skin(np.asarray(moved, np.float64), data) for moved in sources.expressions]
+    gaps = [jaw.gap(moved, data) for moved in expressions]
+    opened = [moved for moved, gap in zip(expressions, gaps, strict=True) if gap >= _LEAST_GAP]
+    if not opened:
+        raise InputError(
+            "No registration has an open mouth",
+            where="registrations",
+            expected=f"incisors at least {_LEAST_GAP * MM_PER_M:.0f} mm farther apart than in the neutral",
+            got=f"{len(gaps)} expressions, at most {max(gaps) * MM_PER_M:.1f} mm",
+            fix="give registrations of people who open their mouths, or none",
+        )
+    return opened
+
+
+def _fitted(sources: TongueSources, rig: TongueRig, data: GNMData, settings: TongueSettings) -> list[FittedTongues]:
+    """Poses of all recordings, each with its mirror image up to a quarter of the samples together."""
+    fit = KeyPointFit(data=data, rig=rig)
+    most = max(settings.samples // 8 // max(len(sources.recordings), 1), 1)
+    return [fit.fit(recording, most) for recording in sources.recordings]

@@ -1,4 +1,4 @@
-"""Fit of the tongue's rig to recorded points, with limits on curvature and volume [GNM, Tongue Modeling]."""
+"""Fit of the rig to recorded points, within limits on curvature and volume [GNM, Tongue Modeling and Articulation]."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass

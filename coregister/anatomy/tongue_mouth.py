@@ -10,6 +10,7 @@ from functools import cached_property
 import numpy as np
 from jaxtyping import Float, Int
 
+from registration.errors import InputError
 from registration.frames import MM_PER_M
 from registration.geometry.closest_point import ClosestPointQuery
 from registration.geometry.topology import connected_parts
@@ -19,6 +20,7 @@ from registration.model.gnm_npz import GNMData
 
 _INCISORS = 6e-3, 8e-3  # metres behind the foremost tooth, and to each side of the median plane
 _INSIDE = 0.5  # winding number
+_LEAST_LOWERING_MM = 0.1
 OBSTACLES = ("teeth and gums", "skin")
 
 
@@ -31,9 +33,22 @@ class JawOpening:
 
     @classmethod
     def of(cls, data: GNMData) -> "JawOpening":
-        """Find it: of the expressions that lower the incisors so far, the one with the smallest coefficients."""
-        basis = data.expression_basis[regions.expression_modes(data)["lower_face"]].astype(np.float64)
+        """Find it: of the expressions that lower the incisors so far, the one with the smallest coefficients.
+
+        Raises:
+            InputError: no component of the lower face moves the lower incisors down.
+        """
+        rows = regions.expression_modes(data).get("lower_face", np.empty(0, np.int64))
+        basis = data.expression_basis[rows].astype(np.float64)
         lowering = -basis[:, incisors(data, upper=False), 1].mean(1)
+        if len(lowering) == 0 or np.linalg.norm(lowering) * MM_PER_M < _LEAST_LOWERING_MM:
+            raise InputError(
+                "The model's expressions do not open the jaw",
+                where="expression_basis",
+                expected="lower-face components that move the lower incisors down",
+                got=f"{len(lowering)} components, {np.linalg.norm(lowering) * MM_PER_M:.3f} mm at one deviation of all",
+                fix="use a model with expressions of the lower face, or place its teeth first (gnmreg model place)",
+            )
         return cls(basis=basis, direction=lowering / (lowering @ lowering))
 
     def coefficients(self, gap: float, rng: np.random.Generator | None = None, spread: float = 0.0) -> np.ndarray:
@@ -49,6 +64,29 @@ class JawOpening:
         other = rng.normal(0, spread, len(self.direction))
         unit = self.direction / np.linalg.norm(self.direction)
         return gap * self.direction + other - (other @ unit) * unit
+
+    def of_skin(self, displacement: Float[np.ndarray, "V 3"], data: GNMData) -> Float[np.ndarray, "V 3"]:
+        """Return an expression of which only the outer skin counts, teeth and tongue where the jaw carries them.
+
+        The lower-face coefficients are fitted to the outer skin by least squares, with a unit prior at a noise of a
+        millimetre; the outer skin itself keeps its displacement.
+
+        Args:
+            displacement: of a registered expression from its neutral, in the model's frame, metres.
+            data: the model.
+        """
+        skin = regions.exterior(data)
+        rows = np.flatnonzero(skin & (np.abs(self.basis).max((0, 2)) > 1e-6))
+        flat = self.basis[:, rows].reshape(len(self.basis), -1) * MM_PER_M
+        right = flat @ (displacement[rows].ravel() * MM_PER_M)
+        result = self.displacement(np.linalg.solve(flat @ flat.T + np.eye(len(flat)), right))
+        result[skin] = displacement[skin]
+        return result
+
+    def gap(self, displacement: Float[np.ndarray, "V 3"], data: GNMData) -> float:
+        """Return how much farther an expression holds the incisors apart than the template, metres."""
+        upper, lower = (displacement[incisors(data, upper=side), 1].mean() for side in (True, False))
+        return float(upper - lower)
 
     def displacement(self, coefficients: Float[np.ndarray, "K"]) -> Float[np.ndarray, "V 3"]:
         """Return the displacements of all vertices, the tongue carried by the jaw."""

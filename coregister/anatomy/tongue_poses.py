@@ -1,4 +1,4 @@
-"""Poses of the tongue that fit a mouth as it is open in an expression, drawn with a rig [GNM, Tongue Modeling]."""
+"""Poses of the tongue that fit an open mouth, drawn with a rig [GNM, Tongue Modeling and Articulation]."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -8,6 +8,7 @@ from jaxtyping import Float
 
 from coregister.anatomy.tongue_mouth import JawOpening, Mouth
 from coregister.anatomy.tongue_rig import CONTROLS, TongueRig
+from registration.errors import InputError
 from registration.model.gnm_npz import GNMData
 
 # Mean and standard deviation of the controls of a tongue in an open mouth, body and tip; units of the rig. It is lifted
@@ -24,6 +25,7 @@ _DRAWN: dict[str, tuple[tuple[float, float], tuple[float, float]]] = {
     "width": ((-0.04, 0.06), (-0.04, 0.10)),
 }
 _LIMIT = 2.5  # standard deviations
+_TRIES = 60  # for one pose, on average, before a mouth counts as too tight
 _HINGE = -0.08, 0.12  # range of the border between body and tip
 
 
@@ -54,8 +56,8 @@ class DrawnPoses:
     """N accepted poses, and how many were rejected for what."""
 
     displacements: Float[np.ndarray, "N T 3"]  # of the tongue's vertices, metres
-    controls: Float[np.ndarray, "N C"]
     rejected: dict[str, int]
+    tight: int  # mouths in which fewer poses fitted than were wanted
 
 
 def model_expressions(
@@ -76,7 +78,7 @@ def draw_poses(
     settings: PoseSettings,
     rng: np.random.Generator,
 ) -> DrawnPoses:
-    """Draw poses until as many fit, equally many in each expression.
+    """Draw poses until as many fit, equally many in each expression where they do.
 
     Args:
         rig: of the model's tongue.
@@ -85,25 +87,36 @@ def draw_poses(
         count: N.
         settings: of the draws.
         rng: of the draws.
+
+    Raises:
+        InputError: too few poses fit.
     """
     template = data.template_vertex_positions.astype(np.float64)
     rejected = {"volume": 0, "teeth and gums": 0, "skin": 0}
-    kept, used = [], []
-    share = np.diff(np.linspace(0, count, len(expressions) + 1).round().astype(int))
-    for expression, wanted in zip(expressions, share, strict=True):
+    kept: list[Float[np.ndarray, "N 3"]] = []
+    tight = 0
+    for number, expression in enumerate(expressions):
         mouth = Mouth(data, template + expression)
-        have = 0
-        while have < wanted:
-            controls = draw_controls(rng, settings.pose_spread)
-            posed = rig.pose(controls, hinge=rng.uniform(*_HINGE))
-            reason = _reason_against(rig, mouth, posed, settings)
-            if reason is not None:
+        # What earlier mouths were too tight for is drawn in later ones.
+        wanted, tries = -(-(count - len(kept)) // (len(expressions) - number)), 0
+        before = len(kept)
+        while len(kept) < before + wanted and tries < _TRIES * (1 + len(kept) - before):
+            posed = rig.pose(draw_controls(rng, settings.pose_spread), hinge=rng.uniform(*_HINGE))
+            tries += 1
+            if (reason := _reason_against(rig, mouth, posed, settings)) is not None:
                 rejected[reason] += 1
-                continue
-            kept.append(posed - rig.structure.rest)
-            used.append(controls)
-            have += 1
-    return DrawnPoses(displacements=np.stack(kept), controls=np.stack(used), rejected=rejected)
+            else:
+                kept.append(posed - rig.structure.rest)
+        tight += len(kept) < before + wanted
+    if len(kept) < count:
+        raise InputError(
+            "Too few poses of the tongue fit the open mouths",
+            where="expressions, registrations",
+            expected=f"{count} poses in {len(expressions)} mouths",
+            got=f"{len(kept)}; {tight} mouths were too tight; rejected for {rejected}",
+            fix="give registrations with the mouth open, or none: then the model's own expressions are used",
+        )
+    return DrawnPoses(displacements=np.stack(kept), rejected=rejected, tight=tight)
 
 
 def draw_controls(rng: np.random.Generator, spread: float = 1.0) -> Float[np.ndarray, "C"]:

@@ -7,10 +7,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float, Int
 
+from coregister.anatomy import placement
 from coregister.next_model.shrinkage import ShrunkCovariance
 from coregister.region_masks import FLIP, REGIONS, mirrored, regional_masks
 from registration.geometry import pca
-from registration.geometry.rigid import fit_twists, motion_fields
 from registration.geometry.topology import vertex_areas
 from registration.model import regions
 from registration.model.gnm_npz import GNMData
@@ -106,10 +106,7 @@ def jaw_motion(basis: Float[np.ndarray, "K V 3"], data: GNMData) -> Float[np.nda
     own motion is unknown; that is inaccurate: MakeHuman's open jaw moves the lower teeth by 22 mm, and the motion of
     the chin differs by 4 mm.
     """
-    points = data.template_vertex_positions.astype(np.float64)
-    area = vertex_areas(points, data.triangles) * regions.lower_teeth(data)
-    points = points - area @ points / area.sum()
-    return np.tensordot(fit_twists(basis, points, area), motion_fields(points), 1)
+    return placement.rigid_motion(basis, data, regions.lower_teeth(data))
 
 
 def transfer_components(data: GNMData) -> Int[np.ndarray, "_"]:

@@ -81,7 +81,7 @@ def fit_twists(
     fields = motion_fields(points)
     weighted = (fields * weights[:, None]).reshape(6, -1)
     gram = weighted @ fields.reshape(6, -1).T
-    right = displacements.reshape(len(displacements), -1) @ weighted.T
+    right = displacements.reshape(len(displacements), weighted.shape[1]) @ weighted.T
     return np.asarray(right @ np.linalg.pinv(gram, rcond=1e-10, hermitian=True))
 
 

@@ -210,6 +210,19 @@ def blush(data: GNMData) -> Float[np.ndarray, "V"]:
     return np.clip(np.max(groups, axis=0), 0, 1)
 
 
+def inner_lip_vertices(data: GNMData) -> tuple[Bool[np.ndarray, "V"], Bool[np.ndarray, "V"]]:
+    """The inner part of the upper and of the lower lip, as `inner_lips`; vertices of both lips are in neither."""
+    upper, lower = (group(data, name) > _INSIDE for name in ("upper_lip", "lower_lip"))
+    inner = inner_lips(data) > _INSIDE
+    return upper & ~lower & inner, lower & ~upper & inner
+
+
+def lower_lip_and_chin(data: GNMData) -> Bool[np.ndarray, "V"]:
+    """The outer skin that is nearest to the jaw: lower lip and chin, without the corners of the mouth."""
+    jaw = _any(data, ("lower_lip", "lower_lip_region", "chin_region"))
+    return jaw & ~_any(data, ("upper_lip", "upper_lip_region")) & exterior(data)
+
+
 def nostrils(data: GNMData) -> Bool[np.ndarray, "V"]:
     """The inner surface of the nostrils: skin that is neither exterior nor in the mouth or the eye sockets."""
     other = (group(data, "mouth_sock") > _INSIDE) | (group(data, "eye_sockets") > _INSIDE)

@@ -77,6 +77,7 @@ GROUPS: Mapping[str, Mapping[str, Command]] = {
         "model bootstrap": model.bootstrap,
         "model cranium": model.cranium,
         "model anatomy": model.anatomy,
+        "model place": model.place,
         "model landmarks": model.landmarks,
         "model fetch": model.fetch,
         "model info": model.info,

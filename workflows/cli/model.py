@@ -158,6 +158,8 @@ def anatomy(
     out: Annotated[Path, arg(metavar="NPZ")],
     parts: Annotated[tuple[PartName, ...], arg(metavar="PART", help_behavior_hint="(default: all)")] = (),
     keep_eyes: bool = False,
+    tongue_keypoints: Annotated[tuple[Path, ...], arg(metavar="FILE", help_behavior_hint="(default: none)")] = (),
+    tongue_registrations: Annotated[Path | None, arg(metavar="RUN|NPZ")] = None,
     seed: Seed = 0,
 ) -> int:
     """Regenerate eyes, teeth, tongue and pupils of a model from data of their own.
@@ -170,17 +172,41 @@ def anatomy(
         out: The model file to write, with its manifest and landmark schemes beside it.
         parts: The parts to regenerate.
         keep_eyes: Keep the shape of the template's eyes, instead of the mean of the sampled ones.
+        tongue_keypoints: Recordings of points on the tongue, CSV or NPZ files.
+        tongue_registrations: Registrations in whose open mouths the tongue is posed, as of gnmreg model evaluate
+            --held-out; without them, expressions of the model.
         seed: Seed of everything random.
     """
     from coregister.anatomy.assemble import BUILDERS, AnatomySettings
     from coregister.anatomy.eyes import EyeSettings
     from registration.progress import console_progress
-    from workflows.steps.anatomy import write_anatomy
+    from workflows.steps.anatomy import TongueFiles, write_anatomy
 
     settings = AnatomySettings(parts=parts or tuple(BUILDERS), seed=seed, eyes=EyeSettings(mean_template=not keep_eyes))
     with console_progress() as progress:
-        lines = write_anatomy(model, out, settings, progress)
+        files = TongueFiles(keypoints=tongue_keypoints, registrations=tongue_registrations)
+        lines = write_anatomy(model, out, settings, progress, files)
     print("\n".join((*lines, str(out))))
+    return 0
+
+
+def place(
+    model: Positional[Annotated[Path, arg(metavar="MODEL")]],
+    /,
+    out: Annotated[Path, arg(metavar="NPZ")],
+) -> int:
+    """Place teeth and tongue of a model by the motion of lips and chin.
+
+    For a model whose teeth and tongue came from elsewhere. In the identity they move with the mean of the inner lips,
+    in expressions the lower teeth and the tongue with the rigid motion of lower lip and chin. Nothing else changes.
+
+    Args:
+        model: The head model, a GNM NPZ file.
+        out: The model file to write, with its manifest and landmark schemes beside it.
+    """
+    from workflows.steps.anatomy import write_placed
+
+    print("\n".join((*write_placed(model, out), str(out))))
     return 0
 
 

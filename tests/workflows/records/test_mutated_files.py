@@ -19,6 +19,7 @@ import trimesh
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from coregister.anatomy.tongue_keypoints import read_recording
 from registration.capture import pixels
 from registration.capture.colmap import read_cameras, read_points
 from registration.capture.landmark_files import read_landmarks
@@ -131,6 +132,8 @@ READERS: dict[str, tuple[str, Reader]] = {  # name -> the file that is mutated, 
     "plan": ("plan.json", CoregistrationPlan.read),
     "state": ("coregistration.json", CoregistrationState.read),
     "held out": ("held_out.npz", read_held_out),
+    "tongue": ("tongue.csv", read_recording),
+    "tongue arrays": ("tongue.npz", read_recording),
     "artifact": ("store/run/a/b/artifact.json", lambda file: Store(file.parents[3]).find("run/a/b")),
 }
 place = st.floats(0, 1, exclude_max=True)
@@ -231,7 +234,7 @@ def test_other_values_in_json_are_read_or_refused(valid, name, where, new):
 DTYPES = ("<f4", ">f8", "<f2", "<i8", "|u1", "|b1", "<U3", "<c8", "<M8[s]")
 
 
-@pytest.mark.parametrize("name", ["truth", "arrays", "held out", "model"])
+@pytest.mark.parametrize("name", ["truth", "arrays", "held out", "model", "tongue arrays"])
 @given(
     where=place, dtype=st.sampled_from(DTYPES), shape=st.lists(st.integers(0, 5), max_size=4), fill=st.integers(0, 9)
 )
