@@ -56,7 +56,8 @@ class KeyPointFit:
         found = {}
         for name, behind in _BEHIND_TIP.items():
             side = {"tongue_left": 0.75, "tongue_right": -0.75}.get(name, 0.0)
-            edge = np.abs(structure.lateral[np.abs(structure.share - (1 - behind)) < 0.05]).max()
+            away = np.abs(structure.share - (1 - behind))
+            edge = np.abs(structure.lateral[away <= max(0.05, away.min())]).max()
             miss = np.hypot(structure.arc - (1 - behind) * structure.length, structure.lateral - side * edge)
             found[name] = int(np.where(structure.dorsum, miss, np.inf).argmin())
         return found
