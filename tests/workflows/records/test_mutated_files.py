@@ -25,6 +25,7 @@ from registration.capture.colmap import read_cameras, read_points
 from registration.capture.landmark_files import read_landmarks
 from registration.capture.scan import read_scan, read_truth
 from registration.capture.settings import read_settings
+from registration.cranium import auxiliary_model
 from registration.errors import InputError
 from registration.model import gnm_npz, gnmw
 from registration.model.landmarks import read_scheme
@@ -32,6 +33,8 @@ from registration.storage.registration_folder import load_registration, read_man
 from registration.types import Camera, View
 from tests.conftest import FIXTURES
 from tests.fixtures.malformed.sandbox import make_templates
+from tests.registration.cranium.smooth_heads import auxiliary_model as auxiliary
+from tests.registration.cranium.smooth_heads import tiny
 from tests.workflows.records.plan import PLAN
 from workflows.records.coregistration import CoregistrationPlan, CoregistrationState, initial_state
 from workflows.records.dataset import DatasetRecord
@@ -75,6 +78,7 @@ def valid(tmp_path_factory: pytest.TempPathFactory) -> Path:
     header = "ply\nformat ascii 1.0\nelement vertex 20\nproperty float x\nproperty float y\nproperty float z\n"
     faces = "element face 2\nproperty list uchar int vertex_indices\nend_header\n"
     gnmw.write(gnmw.web_model(gnm_npz.read(folder / "tiny_gnm.npz")), folder / "tiny_gnm.gnmw")
+    auxiliary_model.write(auxiliary(), folder / "head_cranium.npz")
     (folder / "text.ply").write_text(header + faces + rows + "3 0 1 2\n4 3 4 5 6\n")
     ball = trimesh.creation.icosphere(subdivisions=1)
     for suffix in ("obj", "glb"):
@@ -120,6 +124,7 @@ READERS: dict[str, tuple[str, Reader]] = {  # name -> the file that is mutated, 
     "truth": ("capture/ground_truth.npz", read_truth),
     "model": ("tiny_gnm.npz", gnm_npz.read),
     "model for the web": ("tiny_gnm.gnmw", gnmw.read),
+    "auxiliary model": ("head_cranium.npz", lambda file: auxiliary_model.read(file, tiny())),
     "scheme": ("head_sparse_68.txt", lambda file: read_scheme(file, np.zeros((3000, 3)))),
     "manifest": ("registration/manifest.json", lambda file: read_manifest(file.parent)),
     "history": ("registration/history.json", lambda file: load_registration(file.parent)),
