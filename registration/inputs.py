@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from registration.anatomy.own_parts import FIGURE, OwnParts, found_alone
 from registration.capture.jaw_order import has_reversed_jaw, with_corrected_jaw
 from registration.capture.native import read_capture
 from registration.capture.origin import capture_origin
@@ -100,14 +101,16 @@ def read_inputs(
         _check_topology(start, data, neutral, model_path)
         _check_subject(start, neutral, capture)
     every = read_schemes(model_path, data, options.landmark_files)
+    cranium = None if start is not None else used_cranium(model_path, data, options)
+    digests, config = _deciding(capture, data, every, start, options, cranium)
+    if start is not None:  # all expressions start from the same teeth, whether or not they were shared since
+        start = found_alone(start, data, OwnParts.of(data), every)
     plan = completion_plan(selected, every, options)
     schemes = used_schemes(every, capture, detected=load_provider(options.detector).scheme if plan.landmarks else None)
     landmarks = triangulated_landmarks(selected, schemes)
     if not plan.landmarks:
         _check_head_can_be_found(selected, landmarks)
     scan = _scan_of_the_fit(selected, options)
-    cranium = None if start is not None else used_cranium(model_path, data, options)
-    digests, config = _deciding(capture, data, every, start, options, cranium)
     return RegistrationInputs(
         capture=selected,
         ledger=ledger,
@@ -231,7 +234,7 @@ def _deciding(
     if cranium is not None:
         digests["cranium"] = hashing.hash_fields(cranium)
     if neutral is not None:
-        digests["neutral"] = hashing.hash_fields(neutral)
+        digests["neutral"] = neutral.figures.get(FIGURE, {}).get("digest") or hashing.hash_fields(neutral)
         recipe = expression_recipe(recipe)
     chosen = replace(options, recipe=recipe)
     config = {name: hashing.to_jsonable(value) for name, value in hashing.hashed_fields(chosen, NOT_HASHED).items()}

@@ -108,7 +108,9 @@ class FitProblem:
         return FitTrace(history=history, seconds=seconds, motion_mm=motion_mm, failure=failure)
 
     def _run_stage(self, stage: Stage, on_step: OnStep) -> _StageTrace:
-        names = [name for name, _ in stage.free if name != "scale" or self.context.recipe.scale]
+        recipe = self.context.recipe
+        fixed = {name for name, free in (("scale", recipe.scale), ("parts", self.variables.has_parts)) if not free}
+        names = [name for name, _ in stage.free if name not in fixed]
         lengths = stage.lengths if "offsets" in names else None
         regularizer, steps = (None, None) if lengths is None else self._prepare_regularizer(lengths)
         self.variables.set_free(names, steps)

@@ -43,6 +43,7 @@ class Weights:
     identity: float = 2e-3
     expression: float = 2e-3
     rotations: float = 0.1  # joints other than the root, per rad^2
+    parts: float = 1e-3  # mean square of the identity coefficients that move no skin, where they alone are free
     eyes: float = 1.0  # translation of the eyeballs relative to the model, per m^2
     eye_scale: float = 2e-3
     offsets: float = 2e4  # per m^2: the assumed strength of the image losses, against which `Lengths` are balanced
@@ -122,6 +123,9 @@ _COARSE_MM = 10.0  # smoothing beyond which the head's shape is still unknown, a
 
 def _rates(*pairs: tuple[str, float], end: float = 0.05) -> tuple[tuple[str, Rate], ...]:
     return tuple((name, Rate(start=rate, end=rate * end, hold=0.5)) for name, rate in pairs)
+
+
+_PARTS = _rates(("parts", 0.05), end=0.2)
 
 
 def _model(steps: int) -> Stage:
@@ -217,10 +221,13 @@ def rigid_stage(level: int) -> Stage:
 
 
 def expression_recipe(recipe: Recipe) -> Recipe:
-    """Return the recipe for an expression that starts from its subject's neutral: identity and size are fixed."""
+    """Return the recipe for an expression that starts from its subject's neutral: identity and size are fixed.
+
+    Identity components that move no skin, of teeth and eyes, are free: the neutral may not have shown them.
+    """
     fixed = ("identity", "scale")
     stages = tuple(
-        replace(stage, free=tuple((name, rate) for name, rate in stage.free if name not in fixed))
+        replace(stage, free=(*((name, rate) for name, rate in stage.free if name not in fixed), *_PARTS))
         for stage in recipe.stages
     )
     return replace(recipe, stages=stages)

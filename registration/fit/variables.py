@@ -9,6 +9,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from registration.anatomy.own_parts import still_components
 from registration.frames import axis_angle_to_matrix, matrix_to_axis_angle
 from registration.geometry.large_steps import LargeSteps
 from registration.model.gnm import GNM
@@ -55,7 +56,8 @@ class Variables:
 
     The names: identity (I) and expression (E) coefficients; root (3), joints (C 3), axis-angle rotations; position (3),
     of the pivot in the world, metres; scale, its logarithm; eyes (2 4), of each eyeball a translation in the bind pose,
-    metres, and the logarithm of a scale about its centre.
+    metres, and the logarithm of a scale about its centre; parts (S), added to the identity coefficients that move no
+    skin: teeth and eyes, which an expression may show better than the neutral that its identity comes from.
 
     The root rotates by a small rotation times a constant one, and the position is that of the pivot: in these
     coordinates rotation and translation are independent, and no rotation is near the singularity of the axis-angle
@@ -85,6 +87,12 @@ class Variables:
             "scale": tensor(np.log(initial.scale)),
             "eyes": tensor(None, 2, 4),
         }
+        own = still_components(data)
+        self._own_parts = torch.as_tensor(own, device=device)
+        moved = np.flatnonzero((data.vertex_identity_basis[own] != 0).any((0, 2)))
+        self._part_vertices = torch.as_tensor(moved, device=device)
+        self._part_basis = model.identity_basis.unflatten(-1, (-1, 3))[self._own_parts][:, self._part_vertices]
+        self.tensors["parts"] = tensor(None, len(own))
         self.fixed_offsets = tensor(initial.offsets, count, 3)  # of all vertices but the skin's
         self._offsets = self.fixed_offsets[self._skin]  # of the skin, unless there is a latent
         self.fixed_offsets[self._skin] = 0
@@ -149,8 +157,20 @@ class Variables:
     @torch.no_grad()
     def bind_pose_vertices(self) -> Float[Tensor, "V 3"]:
         """Return the model's head of this identity with a neutral expression and no offsets, model frame, metres."""
-        identity = self.tensors["identity"]
-        return self.model.bind(identity, torch.zeros_like(self.tensors["expression"]))
+        return self.model.bind(self.identity(), torch.zeros_like(self.tensors["expression"]))
+
+    def identity(self) -> Float[Tensor, "I"]:
+        """Return the identity coefficients with the own parts'."""
+        return self.tensors["identity"].index_add(0, self._own_parts, self.tensors["parts"])
+
+    @property
+    def has_parts(self) -> bool:
+        """Whether the model has identity components that move no skin."""
+        return len(self.tensors["parts"]) > 0
+
+    def part_coefficients(self) -> Float[Tensor, "S"]:
+        """Return the identity coefficients of the components that move no skin."""
+        return self.tensors["identity"][self._own_parts] + self.tensors["parts"]
 
     @torch.no_grad()
     def expression_vertices(self) -> Float[Tensor, "V 3"]:
@@ -173,12 +193,13 @@ class Variables:
         """Return the model's parameters and offsets (bind pose, metres) that give the same mesh."""
         rotation, scale = self.rotation(), self.tensors["scale"].exp()
         bind, joints = self._bind_pose(self.tensors)
+        bind = self._with_parts(bind, self.tensors["parts"])
         root = matrix_to_axis_angle(rotation.double().cpu().numpy())
         rotations = torch.cat([torch.tensor(root, dtype=torch.float32, device=rotation.device)[None], self["joints"]])
         # The model rotates about its root joint, the variables about the pivot.
         translation = self["position"] - scale * (rotation @ (self.pivot - joints[0]) + joints[0])
         parameters = Parameters(
-            identity=self["identity"].detach().clone(),
+            identity=self.identity().detach().clone(),
             expression=self["expression"].detach().clone(),
             rotations=rotations,
             translation=translation,
@@ -187,9 +208,12 @@ class Variables:
         return parameters, self._all_offsets(self.skin_offsets(), bind, self["eyes"])
 
     def _bind_pose(self, tensors: Mapping[str, Tensor]) -> tuple[Float[Tensor, "V 3"], Float[Tensor, "J 3"]]:
-        """Vertices without offsets, and joints."""
+        """Vertices without offsets and without the own parts, and joints."""
         identity = tensors["identity"]
         return self.model.bind(identity, tensors["expression"]), self.model.joints(identity)
+
+    def _with_parts(self, bind: Float[Tensor, "V 3"], parts: Float[Tensor, "S"]) -> Float[Tensor, "V 3"]:
+        return bind.index_add(0, self._part_vertices, torch.tensordot(parts, self._part_basis, 1))
 
     def _all_offsets(self, skin_offsets: Tensor, bind: Tensor, eyes: Tensor) -> Float[Tensor, "V 3"]:
         """Offsets of all vertices in the bind pose: the skin's, and the motion of the eyeballs."""
@@ -202,6 +226,7 @@ class Variables:
 
     def _posed(self, skin_offsets: Tensor, tensors: Mapping[str, Tensor]) -> Float[Tensor, "V 3"]:
         bind, joints = self._fixed_bind_pose or self._bind_pose(tensors)
+        bind = self._with_parts(bind, tensors["parts"])
         bind = bind + self._all_offsets(skin_offsets, bind, tensors["eyes"])
         root = axis_angle_to_matrix(tensors["root"]) @ self.base_rotation
         local = torch.cat([root[None], axis_angle_to_matrix(tensors["joints"])])

@@ -38,6 +38,7 @@ from workflows.records.subject import (
 )
 from workflows.steps.coregistration_page import shown_on_page
 from workflows.steps.job_options import from_job
+from workflows.steps.own_parts import share_own_parts
 from workflows.steps.products import Product
 
 
@@ -79,7 +80,10 @@ def register_subject(
     subject_dir, model, out = Path(subject_dir), Path(model), Path(out)
     captures, initial = _prepare(subject_dir, model, out, options, neutral)
     register_one = partial(register, model=model, options=options, force=force)
-    return _register_captures(captures.captures, register_one, _SubjectWriter(initial, out), leave or {}, progress)
+    writer = _SubjectWriter(initial, out)
+    _register_captures(captures.captures, register_one, writer, leave or {}, progress)
+    _share_own_parts(captures.captures, model, options, writer, progress)
+    return writer.subject
 
 
 @shown_on_page(often=True)
@@ -209,7 +213,7 @@ def _register_captures(
     writer: _SubjectWriter,
     leave: Mapping[str, str],
     progress: Progress,
-) -> SubjectRecord:
+) -> None:
     """Register the first capture, the neutral, then every other one from it; `register_one` has model and options."""
     neutral: _Neutral | None = None
     for number, capture in enumerate(captures, 1):
@@ -229,7 +233,35 @@ def _register_captures(
         named.message(f"{row.status}: {row.reason}")
         if number == 1 and result is not None and row.usable:
             neutral = _Neutral(registration=result, capture=capture, folder=writer.out / row.name)
-    return writer.subject
+
+
+def _share_own_parts(
+    captures: tuple[Capture, ...], model: Path, options: RegisterOptions, writer: _SubjectWriter, progress: Progress
+) -> None:
+    """Give all usable registrations the teeth and eyes that they show together, and measure those again."""
+    data = gnm_npz.read(model)
+    usable = {writer.out / row.name: capture for capture in captures if (row := writer.row(capture)).usable}
+    action = partial(share_own_parts, usable, data, read_schemes(model, data, options.landmark_files))
+    shared, failure = _attempt(action, progress)
+    changed = shared or {}
+    if failure:
+        progress.message(f"teeth and eyes stay those of each capture alone: {failure}")
+    for folder, registration in changed.items():
+        capture = usable[folder]
+        progress.message(f"{folder.name}: teeth and eyes of all captures")
+        if capture.scan is not None and capture is captures[0]:
+            _attempt(partial(_measured_again, registration, capture, folder), progress)
+        elif capture is not captures[0]:
+            first = writer.out / captures[0].root.name
+            neutral = _Neutral(registration=changed[first], capture=captures[0], folder=first)
+            without = replace(registration, figures={k: v for k, v in registration.figures.items() if k != "drift"})
+            _attempt(partial(_with_drift, without, capture, folder, neutral), progress)
+        writer.put(replace(writer.row(capture), figures=brief(read_manifest(folder).figures)))
+
+
+def _measured_again(registration: Registration, capture: Capture, folder: Path) -> None:
+    update_figures(folder, evaluate_registration(registration, capture).metrics)
+    refresh_report(folder)
 
 
 def _register_row(

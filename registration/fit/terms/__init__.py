@@ -16,6 +16,7 @@ TERMS: tuple[TermFactory, ...] = (
     scan.scan,
     depth.depth,
     priors.identity,
+    priors.parts,
     priors.expression,
     priors.joints,
     priors.eyes,

@@ -13,6 +13,16 @@ def identity(context: StageContext) -> Term | None:
     return _coefficients(context, "identity", context.stage.weights.identity)
 
 
+def parts(context: StageContext) -> Term | None:
+    """Gaussian prior on the identity coefficients that move no skin, where they alone are free."""
+    weight, variables = context.stage.weights.parts, context.variables
+
+    def term(state: StepState) -> Mapping[str, Tensor]:
+        return {"parts": weight * gaussian_prior(variables.part_coefficients())}
+
+    return term if context.stage.frees("parts") and len(variables["parts"]) else None
+
+
 def expression(context: StageContext) -> Term | None:
     """Gaussian prior on expression coefficients."""
     return _coefficients(context, "expression", context.stage.weights.expression)

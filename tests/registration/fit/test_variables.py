@@ -6,7 +6,7 @@ import numpy as np
 import torch
 from scipy.spatial.transform import Rotation
 
-from registration.fit.variables import InitialGuess, Variables, initial_guess_from, skin_triangles
+from registration.fit.variables import InitialGuess, Variables, initial_guess_from, skin_triangles, skin_vertices
 from registration.geometry.large_steps import LargeSteps
 from registration.model.gnm import GNM
 from registration.model.regions import exterior
@@ -93,3 +93,32 @@ def test_contact_gradients_reach_only_offsets_and_tongue() -> None:
     moves_skin = np.abs(data.expression_basis[:, exterior(data)]).max((1, 2)) > 0
     assert moves_skin.any() and not moves_skin.all()
     assert not variables["expression"].grad[torch.as_tensor(moves_skin)].any()
+
+
+def test_own_parts_add_to_the_identity_that_is_saved() -> None:
+    data = tiny_model()
+    teeth = np.zeros((2, *data.template_vertex_positions.shape), np.float32)
+    hidden = np.setdiff1d(np.arange(len(data.template_vertex_positions)), skin_vertices(data))
+    teeth[:, hidden] = RNG.normal(0, 1e-3, (2, len(hidden), 3))
+    joints = np.zeros((2, *data.template_joint_positions.shape), np.float32)
+    data = replace(
+        data,
+        vertex_identity_basis=np.concatenate([data.vertex_identity_basis, teeth]),
+        joint_identity_basis=np.concatenate([data.joint_identity_basis, joints]),
+        identity_names=np.array([*data.identity_names, "teeth_000", "teeth_001"]),
+    )
+    model = GNM(data)
+    identity = RNG.normal(size=len(data.vertex_identity_basis))
+    initial = InitialGuess(rotation=np.eye(3), position=np.zeros(3), identity=identity)
+    variables = Variables(model, data, initial)
+    assert variables.has_parts and not _fitted()[0].has_parts
+    variables.set_free(["parts"])
+    with torch.no_grad():
+        variables["parts"].copy_(torch.tensor([0.5, -1.5]))
+    mesh = variables.vertices(variables.skin_offsets())
+    mesh.square().sum().backward()
+    assert variables["parts"].grad is not None and variables["parts"].grad.abs().min() > 0
+    parameters, offsets = variables.parameters()
+    expected = torch.tensor(identity[-2:] + [0.5, -1.5], dtype=torch.float32)
+    torch.testing.assert_close(parameters.identity[-2:], expected)
+    torch.testing.assert_close(model(parameters, offsets), mesh.detach(), rtol=0, atol=2e-6)
