@@ -16,6 +16,9 @@ from coregister.anatomy.eyes import EyeSettings, eye_basis, pupils_basis
 from coregister.anatomy.part_basis import PartBasis, PartName
 from coregister.anatomy.teeth import TeethSettings, teeth_basis
 from coregister.anatomy.tongue import TongueSettings, TongueSources, tongue_basis
+from registration.anatomy.eye_structure import find_eyes
+from registration.anatomy.tongue_structure import find_tongue
+from registration.anatomy.tooth_structure import find_teeth
 from registration.errors import InputError, check_seed
 from registration.model import gnm_npz, regions
 from registration.model.gnm_npz import GNMData
@@ -112,6 +115,13 @@ def regenerate(
         "layout": counts,
     }
     return RegeneratedModel(data=result, anatomy=hashing.to_jsonable(anatomy))
+
+
+def check_structures(data: GNMData, parts: Sequence[PartName]) -> None:
+    """Raise InputError if a model lacks the structure that some parts need: a check of a second, without samples."""
+    finders = {"eyes": find_eyes, "pupils": find_eyes, "teeth": find_teeth, "tongue": find_tongue}
+    for find in dict.fromkeys(finders[part] for part in parts):
+        find(data)
 
 
 def manifest(

@@ -5,7 +5,8 @@
 
 Neutrals are validated, completed and aligned; identity basis, joints and regional expression bases are computed from
 them and from the stabilized expressions. Taken from the previous model are the mesh, skinning weights, vertex groups
-and the components that move no skin: shapes of eyes and teeth, motions of tongue and pupils.
+and the components that move no skin: shapes of eyes and teeth, motions of tongue and pupils, which
+`coregister.anatomy.assemble` replaces.
 """
 
 from collections import Counter

@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 from tyro.conf import Positional, arg
 
@@ -23,6 +23,8 @@ class RoundOptions:
         held_out: Subjects to evaluate models on: a fraction such as 0.2, sampled with --seed, or a file with one
             subject folder's name on each line.
         components: Numbers of identity components to evaluate models with; the largest is compared between rounds.
+        anatomy: Eyes, teeth, tongue and pupils of the first round's model. regenerate: from data of their own, as
+            `gnmreg model anatomy` does. keep: as in the first model.
     """
 
     iterations: Annotated[int, arg(metavar="K")] = 3
@@ -33,6 +35,7 @@ class RoundOptions:
         arg(metavar="FRACTION|FILE", help_behavior_hint="(default: neutrals tagged held_out, otherwise 0.2)"),
     ] = None
     components: Annotated[tuple[int, ...], arg(metavar="K", help_behavior_hint="(default: 5 10 20 40)")] = ()
+    anatomy: Literal["regenerate", "keep"] = "regenerate"
 
 
 _FIT, _ROUNDS, _RUN = JobOptions(), RoundOptions(), RunOptions()
@@ -60,6 +63,7 @@ def coregister(
         fit: How captures are registered.
         farm: Where the jobs are executed.
     """
+    from coregister.anatomy.assemble import BUILDERS
     from coregister.stopping_rule import StoppingRule
     from registration.progress import console_progress
     from workflows.engine.process import migrate
@@ -73,6 +77,7 @@ def coregister(
         held_out=_fraction_or_file(rounds.held_out),
         components=rounds.components or None,
         rule=StoppingRule(max_rounds=rounds.iterations, early_stopping=not rounds.all_iterations),
+        anatomy=tuple(BUILDERS) if rounds.anatomy == "regenerate" else (),
     )
     plan = make_plan(dataset, model, out, fit.register_options(), settings)
     folder = farm.farm_folder(out)

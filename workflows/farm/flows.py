@@ -132,6 +132,7 @@ async def coregister(scope: "FlowScope", *, plan: str) -> dict[str, Any]:
                 previous=model,
                 out=f"{folder}/model",
                 recipe=record.model_recipe.to_json(),
+                **({"anatomy": list(record.anatomy), "seed": record.seed} if record.anatomy and number == 0 else {}),
             ),
             where=f"{name}/build",
         )

@@ -4,6 +4,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from coregister.anatomy.assemble import check_structures
+from coregister.anatomy.part_basis import PartName
 from coregister.evaluate.linear_fit import identity_part
 from coregister.next_model.recipes import DEFAULT_MODEL_RECIPE, ModelRecipe, load_model_recipe
 from coregister.stopping_rule import StoppingRule
@@ -30,6 +32,7 @@ class RoundSettings:
             COMPONENTS, as far as models have them.
         samples: random heads of each model, for specificity; 0: none.
         rule: when to stop.
+        anatomy: parts that the first round regenerates in its model, as `coregister.anatomy.assemble` does.
     """
 
     model_recipe: str | ModelRecipe = DEFAULT_MODEL_RECIPE
@@ -37,6 +40,7 @@ class RoundSettings:
     components: Sequence[int] | None = None
     samples: int = 200
     rule: StoppingRule = field(default_factory=StoppingRule)
+    anatomy: tuple[PartName, ...] = ()
 
 
 def make_plan(
@@ -57,12 +61,13 @@ def make_plan(
 
     Raises:
         InputError: `read_dataset`, `split` or `check_out` refuses; there is no such recipe or model; more components
-            than there can be. Nothing is computed or written.
+            than there can be; the model lacks the structure of a part to regenerate. Nothing is computed or written.
     """
     options = to_job(options)
     source = read_dataset(dataset)
     division = split(source, rounds.held_out, options.seed)
     data = gnm_npz.read(Path(model))
+    check_structures(data, rounds.anatomy)
     names = (*division.training, *division.held_out)
     plan = CoregistrationPlan(
         dataset=Path(dataset).resolve(),
@@ -76,6 +81,7 @@ def make_plan(
         split=division,
         captures={name: tuple(capture.root.name for capture in source.subjects[name].captures) for name in names},
         without_truth=tuple(name for name in division.held_out if not has_truths(source.subjects[name], data)),
+        anatomy=rounds.anatomy,
     )
     _check(plan, data, requested=rounds.components is not None)
     check_out(plan.out)

@@ -4,6 +4,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from coregister.anatomy.part_basis import PartName
 from coregister.next_model.recipes import ModelRecipe
 from coregister.stopping_rule import RoundMetrics, StoppingRule, StoppingVerdict
 from registration.options import RegisterOptions
@@ -46,6 +47,7 @@ class CoregistrationPlan(
     split: Split
     captures: Mapping[str, tuple[str, ...]]  # subject -> folders of captures, the neutral's first
     without_truth: tuple[str, ...]  # held-out subjects whose captures have no true meshes
+    anatomy: tuple[PartName, ...] = ()  # parts that the first round regenerates in its model
 
     @property
     def seed(self) -> int:

@@ -5,8 +5,10 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from coregister.anatomy.assemble import AnatomySettings, regenerate
+from coregister.anatomy.part_basis import PartName
 from coregister.next_model import provenance
-from coregister.next_model.build import build_model
+from coregister.next_model.build import BuiltModel, build_model
 from coregister.next_model.recipes import ModelRecipe
 from registration.cranium import auxiliary_model
 from registration.errors import InputError
@@ -34,6 +36,8 @@ def build_next_model(
     previous: str,
     out: str,
     recipe: Mapping[str, Any],
+    anatomy: Sequence[PartName] = (),
+    seed: int = 0,
     progress: Progress | None = None,
 ) -> dict[str, Any]:
     """Build the next model from registrations, stabilized expressions and the previous model.
@@ -46,6 +50,8 @@ def build_next_model(
         previous: file of the previous model.
         out: folder of the model.
         recipe: a `ModelRecipe` as JSON.
+        anatomy: parts of the built model that are regenerated.
+        seed: of these.
         progress: where to report to.
 
     Returns:
@@ -64,12 +70,17 @@ def build_next_model(
     if cranium is not None:
         inputs["cranium"] = hashing.hash_fields(cranium)
     config = {"recipe": hashing.to_jsonable(settings), "categories": source.categories, "tags": tags}
+    if anatomy:
+        config |= {"anatomy": list(anatomy), "seed": seed}
     folder = Path(out)
     product = Product(folder, hashing.input_hash(inputs, config), BuildResult)
     if (existing := product.find()) is not None and _is_model(folder / MODEL, existing.content_id):
         return replace(existing, model=str(folder / MODEL)).to_json()
     (progress or NullProgress()).message(f"building a model from {len(subjects.usable)} subjects")
     built = build_model(subjects, data, settings, categories=source.categories, cranium=cranium)
+    if anatomy:
+        (progress or NullProgress()).message(f"regenerating {', '.join(anatomy)}")
+        built = _with_anatomy(built, AnatomySettings(parts=tuple(anatomy), seed=seed))
     result = BuildResult(
         input_hash=product.input_hash,
         model=str(folder / MODEL),
@@ -84,6 +95,13 @@ def build_next_model(
         (temporary / PAGE).write_text(render_model_page(built.data, built.manifest), encoding="utf-8")
         product.write(result, temporary)
     return result.to_json()
+
+
+def _with_anatomy(built: BuiltModel, settings: AnatomySettings) -> BuiltModel:
+    """The built model with regenerated parts, which its manifest describes in a section of its own."""
+    made = regenerate(built.data, settings)
+    described = {"content_id": gnm_npz.content_hash(made.data), "anatomy": made.anatomy}
+    return replace(built, data=made.data, manifest=built.manifest | described)
 
 
 def _is_model(file: Path, content: str) -> bool:
