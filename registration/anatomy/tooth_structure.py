@@ -76,7 +76,7 @@ def find_teeth(data: GNMData) -> tuple[DentalArch, DentalArch]:
     return _find_arch(data, "upper"), _find_arch(data, "lower")
 
 
-def tooth_labels(arches: tuple[DentalArch, DentalArch]) -> dict[int, Float[np.ndarray, "3"]]:
+def tooth_labels(arches: tuple[DentalArch, ...]) -> dict[int, Float[np.ndarray, "3"]]:
     """Return, for each FDI number, the middle of its biting edge in the template: where a picture names it."""
     return {t.fdi: t.origin + t.size[2] * t.axes[2] for arch in arches for t in arch.teeth}
 

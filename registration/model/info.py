@@ -1,9 +1,12 @@
 """Describe a model file: tables in the terminal and an image of the template."""
 
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from rich.console import Console
 from rich.table import Table
 from rich.text import Text
@@ -28,13 +31,31 @@ COLOURS = {  # of the classes in images, linear
 _VIEWS = {"the subject's right": 75.0, "front": 0.0, "the subject's left": -75.0}  # rotation about +Y, degrees
 
 
-def describe(path: Path, picture: Path | None = None, console: Console | None = None) -> GNMData:
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Panel:
+    """A further panel of the picture: a part of the template, coloured, with lines and names on it."""
+
+    title: str
+    vertices: Bool[np.ndarray, "V"]  # of the part; triangles with all three are drawn
+    colours: Float[np.ndarray, "V 3"]  # linear
+    lines: Sequence[Float[np.ndarray, "P 3"]] = ()  # metres
+    names: Mapping[str, Float[np.ndarray, "3"]] = field(default_factory=dict)  # text -> position, metres
+    rotation: Float[np.ndarray, "3 3"] = field(default_factory=lambda: np.eye(3))  # into a frame seen along -Z
+
+
+Panels = Callable[[GNMData], tuple[Sequence[Panel], Sequence[str]]]
+
+
+def describe(
+    path: Path, picture: Path | None = None, console: Console | None = None, *, panels: Panels | None = None
+) -> GNMData:
     """Print origin, digests, dimensions, parts, joints, regions and landmark schemes of a model file.
 
     Args:
         path: the model's NPZ file.
         picture: PNG file for an image of the template; None: none is drawn.
         console: to print to; None: the terminal.
+        panels: gives further panels of the picture, and notes to print.
 
     Raises:
         InputError: the file is not a GNM model.
@@ -54,8 +75,11 @@ def describe(path: Path, picture: Path | None = None, console: Console | None = 
         console.print(f"shipped landmark maps of this topology: {', '.join(map(_scheme, others))}")
     for remark in data.remarks:
         console.print(Text(f"note: {remark}"))
+    found, notes = panels(data) if panels is not None else ((), ())
+    for note in notes:
+        console.print(Text(note))
     if picture is not None:
-        draw(data, picture, schemes)
+        draw(data, picture, schemes, found)
         console.print(f"picture: {picture}")
     return data
 
@@ -85,8 +109,8 @@ def _step(scales: Float[np.ndarray, "K"]) -> str:
     return f"8 bits a value; the largest step is {MM_PER_M * scales.max():.4f} mm"
 
 
-def draw(data: GNMData, path: Path, schemes: dict[str, landmarks.LandmarkScheme]) -> None:
-    """Draw the template from three sides, coloured by class, with the landmarks of every scheme."""
+def draw(data: GNMData, path: Path, schemes: dict[str, landmarks.LandmarkScheme], panels: Sequence[Panel] = ()) -> None:
+    """Draw the template from three sides, coloured by class, with the landmarks of every scheme, and further panels."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.collections import PolyCollection
     from matplotlib.figure import Figure
@@ -97,16 +121,22 @@ def draw(data: GNMData, path: Path, schemes: dict[str, landmarks.LandmarkScheme]
     colours = membership @ np.array([COLOURS[name] for name in names])
     centre = (vertices.min(0) + vertices.max(0)) / 2
     half = 0.52 * np.ptp(vertices, axis=0).max()
-    figure = Figure(figsize=(13, 5.2), dpi=110, layout="constrained")
+    figure = Figure(figsize=(13, 9.4 if panels else 5.2), dpi=110, layout="constrained")
     FigureCanvasAgg(figure)
-    for axes, (title, angle) in zip(figure.subplots(1, 3), _VIEWS.items(), strict=True):
+    grid = figure.add_gridspec(2 if panels else 1, 12)
+    for column, panel in enumerate(panels):
+        width = 12 // len(panels)
+        _draw_panel(figure.add_subplot(grid[1, width * column : width * (column + 1)]), panel, vertices, data.triangles)
+    for column, (title, angle) in enumerate(_VIEWS.items()):
+        axes = figure.add_subplot(grid[0, 4 * column : 4 * column + 4])
         rotation = rotation_y(angle)
         rotated = (vertices - centre) @ rotation.T
         polygons, shades = shaded(rotated, data.triangles, colours)
         axes.add_collection(PolyCollection(list(polygons), facecolors=shades, edgecolors=shades, linewidths=0.3))
         for scheme in schemes.values():
             points, outward = landmarks_in_view(scheme, rotated, data.triangles)
-            axes.scatter(*points[outward].T[:2], s=5, color="black", linewidths=0)
+            x, y = points[outward].T[:2]
+            axes.scatter(x, y, s=5, color="black", linewidths=0)
         axes.set(xlim=(-half, half), ylim=(-half, half), aspect="equal", title=title)
         axes.set_axis_off()
     patches = [Patch(color=COLOURS[name], label=name) for name in names]
@@ -115,6 +145,21 @@ def draw(data: GNMData, path: Path, schemes: dict[str, landmarks.LandmarkScheme]
     figure.suptitle(f"GNM {data.variant} {data.version}: {size_mm[0]:.0f} x {size_mm[1]:.0f} x {size_mm[2]:.0f} mm")
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path)
+
+
+def _draw_panel(axes: Any, panel: Panel, vertices: Float[np.ndarray, "V 3"], triangles: Int[np.ndarray, "F 3"]) -> None:
+    from matplotlib.collections import PolyCollection
+
+    turned = vertices @ panel.rotation.T
+    polygons, shades = shaded(turned, triangles[panel.vertices[triangles].all(1)], panel.colours)
+    axes.add_collection(PolyCollection(list(polygons), facecolors=shades, edgecolors=shades, linewidths=0.3))
+    for line in panel.lines:
+        axes.plot(*(line @ panel.rotation.T)[:, :2].T, color="black", linewidth=1.2)
+    for text, position in panel.names.items():
+        axes.text(*(panel.rotation @ position)[:2], text, fontsize=7, ha="center", va="center")
+    axes.set(aspect="equal", title=panel.title)
+    axes.autoscale()
+    axes.set_axis_off()
 
 
 def rotation_y(degrees: float) -> Float[np.ndarray, "3 3"]:

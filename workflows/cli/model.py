@@ -10,17 +10,18 @@ from workflows.cli.options import Folder, ModelFile, OptionalFile, OptionalFolde
 
 
 def info(file: Positional[Annotated[Path, arg(metavar="FILE")]], /, out: OptionalImage = None) -> int:
-    """Describe a model file: origin, digests, dimensions, parts and regions.
+    """Describe a model file: origin, digests, dimensions, parts, regions, and what is found of eyes, teeth and tongue.
 
     Args:
         file: The head model, a GNM NPZ file; or a GNMW file for the web.
         out: Image of the model to draw; not of a GNMW file.
     """
+    from registration.anatomy.panels import anatomy_panels
     from registration.errors import InputError
     from registration.model import gnmw, info
 
     if file.suffix.lower() != gnmw.SUFFIX:
-        info.describe(file, picture=out)
+        info.describe(file, picture=out, panels=anatomy_panels)
     elif out is None:
         info.describe_web(file)
     else:
