@@ -358,18 +358,7 @@ def test_the_command_resumes_and_reports_failures(dataset, true_register, tmp_pa
     """The processes are stand-ins that run the flow here; `make demo-batch` starts real processes."""
     monkeypatch.setattr(workflows.farm.plan, "RoundSettings", partial(RoundSettings, samples=2))
     out, roots = tmp_path / "out", (dataset, MODEL.parent, tmp_path / "out")
-    arguments = [
-        "coregister",
-        str(dataset),
-        "--model",
-        str(MODEL),
-        "--out",
-        str(out),
-        "--anatomy",
-        "keep",
-        "--components",
-        "2",
-    ]
+    arguments = f"coregister {dataset} --model {MODEL} --out {out} --anatomy keep --components 2".split()
     assert main([*arguments, "--folder", str(tmp_path)]) == 2
     assert "There is no queue" in capsys.readouterr().err and not out.exists()
 

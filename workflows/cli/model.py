@@ -5,12 +5,13 @@ from typing import Annotated, Literal
 
 from tyro.conf import Positional, arg
 
-from coregister.anatomy.part_basis import PartName
 from workflows.cli.options import Folder, ModelFile, OptionalFile, OptionalFolder, OptionalImage, OptionalModel, Seed
+
+Part = Literal["eyes", "teeth", "tongue", "pupils"]
 
 
 def info(file: Positional[Annotated[Path, arg(metavar="FILE")]], /, out: OptionalImage = None) -> int:
-    """Describe a model file: origin, digests, dimensions, parts, regions, and what is found of eyes, teeth and tongue.
+    """Describe a model file: origin, digests, dimensions, parts, regions, anatomy.
 
     Args:
         file: The head model, a GNM NPZ file; or a GNMW file for the web.
@@ -157,7 +158,7 @@ def anatomy(
     model: Positional[Annotated[Path, arg(metavar="MODEL")]],
     /,
     out: Annotated[Path, arg(metavar="NPZ")],
-    parts: Annotated[tuple[PartName, ...], arg(metavar="PART", help_behavior_hint="(default: all)")] = (),
+    parts: Annotated[tuple[Part, ...], arg(metavar="PART", help_behavior_hint="(default: all)")] = (),
     keep_eyes: bool = False,
     tongue_keypoints: Annotated[tuple[Path, ...], arg(metavar="FILE", help_behavior_hint="(default: none)")] = (),
     tongue_registrations: Annotated[Path | None, arg(metavar="RUN|NPZ")] = None,
