@@ -131,8 +131,7 @@ async def coregister(scope: "FlowScope", *, plan: str) -> dict[str, Any]:
                 dataset=str(record.dataset),
                 previous=model,
                 out=f"{folder}/model",
-                recipe=record.model_recipe.to_json(),
-                **({"anatomy": list(record.anatomy), "seed": record.seed} if record.anatomy and number == 0 else {}),
+                recipe=record.model_recipe.to_json() | (_anatomy(record) if number == 0 else {}),
             ),
             where=f"{name}/build",
         )
@@ -174,6 +173,11 @@ async def _end_round(
     value = await _run_step(scope, f"{name}/decide", table.END_ROUND, **arguments)
     verdict: StoppingVerdict = structure(value, StoppingVerdict, where=f"{name}/decide", title="verdict")
     return verdict
+
+
+def _anatomy(record: CoregistrationPlan) -> dict[str, Any]:
+    """What the first round's build regenerates, as an entry of its recipe."""
+    return {"anatomy": {"parts": list(record.anatomy), "seed": record.seed}} if record.anatomy else {}
 
 
 async def _hold_out(scope: "FlowScope", plan: CoregistrationPlan) -> HoldOutResult:

@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import Any
 
 from coregister.anatomy.assemble import AnatomySettings, regenerate
-from coregister.anatomy.part_basis import PartName
 from coregister.next_model import provenance
 from coregister.next_model.build import BuiltModel, build_model
 from coregister.next_model.recipes import ModelRecipe
@@ -36,8 +35,6 @@ def build_next_model(
     previous: str,
     out: str,
     recipe: Mapping[str, Any],
-    anatomy: Sequence[PartName] = (),
-    seed: int = 0,
     progress: Progress | None = None,
 ) -> dict[str, Any]:
     """Build the next model from registrations, stabilized expressions and the previous model.
@@ -49,9 +46,8 @@ def build_next_model(
         dataset: its folder, for tags and categories.
         previous: file of the previous model.
         out: folder of the model.
-        recipe: a `ModelRecipe` as JSON.
-        anatomy: parts of the built model that are regenerated.
-        seed: of these.
+        recipe: a `ModelRecipe` as JSON; and "anatomy", if parts of the built model are regenerated: their names
+            ("parts") and the seed ("seed").
         progress: where to report to.
 
     Returns:
@@ -64,6 +60,8 @@ def build_next_model(
     tags = {name: source.tags(name) for name in names}
     stabilized_set = None if stabilized is None else Path(stabilized)
     subjects = RegisteredSubjects(run=Path(run), names=names, model=data, stabilized_set=stabilized_set, tags=tags)
+    recipe = dict(recipe)
+    anatomy = recipe.pop("anatomy", None)
     settings = ModelRecipe.from_json(recipe, where="the job's recipe")
     inputs = {**subjects.inputs, "previous": gnm_npz.content_hash(data)}
     cranium = auxiliary_model.find(Path(previous), data) if settings.completion.cranium == "model" else None
@@ -71,7 +69,7 @@ def build_next_model(
         inputs["cranium"] = hashing.hash_fields(cranium)
     config = {"recipe": hashing.to_jsonable(settings), "categories": source.categories, "tags": tags}
     if anatomy:
-        config |= {"anatomy": list(anatomy), "seed": seed}
+        config["anatomy"] = anatomy
     folder = Path(out)
     product = Product(folder, hashing.input_hash(inputs, config), BuildResult)
     if (existing := product.find()) is not None and _is_model(folder / MODEL, existing.content_id):
@@ -79,8 +77,9 @@ def build_next_model(
     (progress or NullProgress()).message(f"building a model from {len(subjects.usable)} subjects")
     built = build_model(subjects, data, settings, categories=source.categories, cranium=cranium)
     if anatomy:
-        (progress or NullProgress()).message(f"regenerating {', '.join(anatomy)}")
-        built = _with_anatomy(built, AnatomySettings(parts=tuple(anatomy), seed=seed))
+        regenerated = AnatomySettings(parts=tuple(anatomy["parts"]), seed=anatomy["seed"])
+        (progress or NullProgress()).message(f"regenerating {', '.join(regenerated.parts)}")
+        built = _with_anatomy(built, regenerated)
     result = BuildResult(
         input_hash=product.input_hash,
         model=str(folder / MODEL),

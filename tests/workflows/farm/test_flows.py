@@ -3,6 +3,7 @@
 import asyncio
 import json
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -174,3 +175,16 @@ def test_different_arguments_give_a_different_job_id(plan: Path) -> None:
 def test_a_flow_reads_ordinary_files_only(file: str) -> None:
     with pytest.raises(InputError, match="cannot be read"):
         asyncio.run(read_plan(file))
+
+
+def test_only_the_first_round_regenerates_anatomy(plan: Path) -> None:
+    kept = run_loop(plan, Rounds([True, True, False]))[1]
+    assert not any("anatomy" in job.arguments["recipe"] for job in kept if job.step == "build")
+    changed = replace(CoregistrationPlan.read(plan), anatomy=("eyes", "pupils"))
+    changed.write(plan)
+    builds = [job for job in run_loop(plan, Rounds([True, True, False]))[1] if job.step == "build"]
+    assert [job.arguments["recipe"].get("anatomy") for job in builds] == [
+        {"parts": ["eyes", "pupils"], "seed": changed.seed},
+        None,
+        None,
+    ]
