@@ -175,8 +175,8 @@ def anatomy(
         parts: The parts to regenerate.
         keep_eyes: Keep the shape of the template's eyes, instead of the mean of the sampled ones.
         tongue_keypoints: Recordings of points on the tongue, CSV or NPZ files.
-        tongue_registrations: Registrations in whose open mouths the tongue is posed, as of gnmreg model evaluate
-            --held-out; without them, expressions of the model.
+        tongue_registrations: Registrations in whose open mouths the tongue is posed: a run, or an NPZ file of held-out
+            subjects. Without them, expressions of the model.
         seed: Seed of everything random.
     """
     from coregister.anatomy.assemble import BUILDERS, AnatomySettings
