@@ -101,9 +101,10 @@ def test_each_worker_is_shown_with_its_job_and_stage(queue: Queue) -> None:
     for locks, name in zip(held, ("host-cpu0", "host-cpu1", "host-coordinator0"), strict=True):
         assert locks.take(name)
     queue.submit("r/a/x", "r/b/x")
-    queue.run("r/a/x", "host-cpu0", time.time() - 200)
+    now = time.time()  # `NOW` is that of the import, which can be minutes ago
+    queue.run("r/a/x", "host-cpu0", now - 200)
     (queue.logs / "r" / "a").mkdir(parents=True)
-    lines = [{"time": NOW, "what": "offsets", "done": 41, "total": 90}, {"time": NOW, "note": "hello"}]
+    lines = [{"time": now, "what": "offsets", "done": 41, "total": 90}, {"time": now, "note": "hello"}]
     (queue.logs / "r" / "a" / "x.jsonl").write_text("\n".join(map(json.dumps, lines)))
     text = queue.status()
     assert "host-cpu0: r/a/x, offsets 41 of 90, for 3 min" in text
