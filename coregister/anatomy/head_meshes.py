@@ -43,7 +43,11 @@ def read_heads(folder: Path, data: GNMData) -> Float[np.ndarray, "N V 3"]:
     if not heads:
         names = ", ".join(path.name for path in entries[:5]) or "an empty folder"
         raise _error(
-            "There is no head in the folder", folder, f"meshes ({', '.join(SUFFIXES)}) or registrations", names
+            "There is no head in the folder",
+            folder,
+            f"meshes ({', '.join(SUFFIXES)}) or registrations",
+            names,
+            fix="name the folder that contains them",
         )
     return np.stack(heads)
 
@@ -110,5 +114,7 @@ def _checked(vertices: Float[np.ndarray, "V 3"], path: Path, data: GNMData) -> F
     return vertices.astype(np.float64)
 
 
-def _error(what: str, where: object, expected: object, got: object) -> InputError:
-    return InputError(what, where=where, expected=expected, got=got, fix="replace or remove this head")
+def _error(
+    what: str, where: object, expected: object, got: object, fix: str = "replace or remove this head"
+) -> InputError:
+    return InputError(what, where=where, expected=expected, got=got, fix=fix)

@@ -4,7 +4,7 @@ Nine random dentitions of the teeth's components, and the first six components a
 """
 
 import argparse
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import cv2
@@ -70,20 +70,30 @@ def grid(pictures: Sequence[Picture], columns: int) -> Picture:
     return np.concatenate(rows)
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+def pictures_command(description: str | None, samples: int) -> argparse.Namespace:
+    """Read the arguments of a command that draws the components of a part."""
+    parser = argparse.ArgumentParser(description=description, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("model", type=Path)
     parser.add_argument("out", type=Path)
     parser.add_argument("--name", default="first", help="of the model, in the files' names")
-    parser.add_argument("--samples", type=int, default=TeethSettings().samples)
+    parser.add_argument("--samples", type=int, default=samples)
     parser.add_argument("--seed", type=int, default=0)
-    options = parser.parse_args()
-    data = gnm_npz.read(options.model)
-    painter = _Painter(data, teeth_basis(data, TeethSettings(samples=options.samples)))
+    return parser.parse_args()
+
+
+def write_pictures(pictures: Mapping[str, Picture], options: argparse.Namespace) -> None:
+    """Write the pictures of a model's part as NAME_MODEL.jpg."""
     options.out.mkdir(parents=True, exist_ok=True)
-    for name, picture in (("dentitions", dentitions(painter, options.seed)), ("teeth_components", components(painter))):
+    for name, picture in pictures.items():
         path = options.out / f"{name}_{options.name}.jpg"
         cv2.imwrite(str(path), picture[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, QUALITY])
+
+
+def main() -> None:
+    options = pictures_command(__doc__, TeethSettings().samples)
+    data = gnm_npz.read(options.model)
+    painter = _Painter(data, teeth_basis(data, TeethSettings(samples=options.samples)))
+    write_pictures({"dentitions": dentitions(painter, options.seed), "teeth_components": components(painter)}, options)
 
 
 if __name__ == "__main__":

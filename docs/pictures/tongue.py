@@ -4,17 +4,13 @@ Nine random tongues about the mean one, from the side over the lower teeth and f
 first six components at two standard deviations. The jaw is closed: the tongue is as the components move it alone.
 """
 
-import argparse
-from pathlib import Path
-
-import cv2
 import numpy as np
 from jaxtyping import Float
 
 from coregister.anatomy.part_basis import PartBasis
 from coregister.anatomy.tongue import TongueSettings, tongue_basis
-from docs.pictures.model import QUALITY, Picture, Shot, captioned, colours_of, draw
-from docs.pictures.teeth import grid
+from docs.pictures.model import Picture, Shot, captioned, colours_of, draw
+from docs.pictures.teeth import grid, pictures_command, write_pictures
 from registration.model import gnm_npz, regions
 from registration.model.gnm_npz import GNMData
 
@@ -63,19 +59,10 @@ def components(painter: _Painter) -> Picture:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("model", type=Path)
-    parser.add_argument("out", type=Path)
-    parser.add_argument("--name", default="first", help="of the model, in the files' names")
-    parser.add_argument("--samples", type=int, default=TongueSettings().samples)
-    parser.add_argument("--seed", type=int, default=0)
-    options = parser.parse_args()
+    options = pictures_command(__doc__, TongueSettings().samples)
     data = gnm_npz.read(options.model)
     painter = _Painter(data, tongue_basis(data, TongueSettings(samples=options.samples)))
-    options.out.mkdir(parents=True, exist_ok=True)
-    for name, picture in (("tongues", tongues(painter, options.seed)), ("tongue_components", components(painter))):
-        path = options.out / f"{name}_{options.name}.jpg"
-        cv2.imwrite(str(path), picture[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, QUALITY])
+    write_pictures({"tongues": tongues(painter, options.seed), "tongue_components": components(painter)}, options)
 
 
 if __name__ == "__main__":

@@ -94,6 +94,7 @@ def _find_arch(data: GNMData, name: str) -> DentalArch:
     centres = np.array([vertices[np.unique(piece)].mean(0) for piece in pieces])
     order = _along_arch(centres)
     _check_sides(name, centres[order])
+    _check_groups(name, component & ~of_tooth & ~(regions.group(data, "gums") > 0.5), vertices)
     pieces, count = [pieces[k] for k in order], len(pieces)
     gum_triangles = triangles[~on_tooth]
     necks = [_neck(name, piece, gum_triangles, vertices) for piece in pieces]
@@ -198,6 +199,19 @@ def _along_arch(centres: Float[np.ndarray, "T 3"]) -> Int[np.ndarray, "T"]:
 def _widths(pieces: list[Int[np.ndarray, "_ 3"]], vertices: Float[np.ndarray, "V 3"]) -> Float[np.ndarray, "T"]:
     """The largest extent of each piece in plan view."""
     return np.array([np.ptp(vertices[np.unique(piece)][:, [0, 2]], axis=0).max() for piece in pieces])
+
+
+def _check_groups(name: str, stray: Bool[np.ndarray, "V"], vertices: Float[np.ndarray, "V 3"]) -> None:
+    """Each vertex of an arch is of a tooth or of the gums: others would count as skin in the layout of a model."""
+    if stray.any():
+        first = int(np.flatnonzero(stray)[0])
+        raise InputError(
+            f"Vertices of the {name} arch are neither teeth nor gums",
+            where="vertex_groups: teeth, gums",
+            expected=f"each vertex of {name}_teeth_and_gums in one of them",
+            got=f"{int(stray.sum())} in neither, as {first} at {np.round(1e3 * vertices[first]).astype(int)} mm",
+            fix="use a model with the official vertex groups",
+        )
 
 
 def _check_count(name: str, pieces: list[Int[np.ndarray, "_ 3"]], vertices: Float[np.ndarray, "V 3"]) -> None:

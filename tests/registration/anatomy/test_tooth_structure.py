@@ -80,6 +80,14 @@ def test_a_missing_piece_is_refused(first):
     assert "13 pieces" in error.value.got and "mm wide" in error.value.got
 
 
+def test_a_part_of_a_tooth_outside_the_groups_is_refused(first):
+    edge = find_teeth(first)[0].teeth[4]
+    gone = edge.vertices[np.argsort(first.template_vertex_positions[edge.vertices, 1])[:3]]
+    with pytest.raises(InputError, match="neither teeth nor gums") as error:
+        find_teeth(_without(first, "teeth", gone))
+    assert "3 in neither" in error.value.got
+
+
 def test_teeth_of_one_side_alone_are_refused(first):
     arch = find_teeth(first)[1]
     gone = np.concatenate([tooth.vertices for tooth in arch.teeth[:2]])
