@@ -34,15 +34,7 @@ def export_model(model: Path, out: Path, *, extra_fields: bool = False) -> list[
             got=out.suffix or "no suffix",
             fix="choose another name",
         )
-    check_output_file(out)
-    if out.exists() and model.exists() and out.samefile(model):
-        raise InputError(
-            "The model would be replaced by its own copy",
-            where=out,
-            expected="another file than the model",
-            got=str(model),
-            fix="choose another name",
-        )
+    check_new_model(model, out)
     data = gnm_npz.read(model)
     if suffix == _NPZ:
         gnm_npz.write(data, out, extra_inside=extra_fields)
@@ -57,3 +49,24 @@ def export_model(model: Path, out: Path, *, extra_fields: bool = False) -> list[
             f"{name}: rounded by at most {error.worst_mm:.4f} mm, {error.rms_mm:.4f} mm rms, for a coefficient of 1"
         )
     return [*lines, "left out: joints, skinning, names, vertex groups, texture coordinates, landmarks"]
+
+
+def check_new_model(model: Path, out: Path) -> None:
+    """Refuse a file for a new model that cannot be written or is the model itself.
+
+    Args:
+        model: the model that is read.
+        out: the file to write.
+
+    Raises:
+        InputError: as said.
+    """
+    check_output_file(out)
+    if out.exists() and model.exists() and out.samefile(model):
+        raise InputError(
+            "The model would be replaced by its own copy",
+            where=out,
+            expected="another file than the model",
+            got=str(model),
+            fix="choose another name",
+        )

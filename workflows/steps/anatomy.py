@@ -13,11 +13,11 @@ from coregister.anatomy.tongue_keypoints import read_recording
 from coregister.next_model import provenance
 from registration.errors import InputError
 from registration.geometry.rigid import align
-from registration.model import gnm_npz
+from registration.model import export, gnm_npz
 from registration.model.gnm_npz import GNMData, topology_hash
 from registration.progress import Progress
 from registration.stabilize.subject_meshes import SkullSkin
-from registration.storage.files import atomic_file, check_output_file
+from registration.storage.files import atomic_file
 from registration.storage.hashing import hash_file
 from workflows.records.held_out import read_held_out
 
@@ -128,15 +128,7 @@ def check_new_model(model: Path, out: Path) -> None:
     """Refuse a file name for a new model: no NPZ file, not writable, or the previous model. Raises InputError."""
     if out.suffix.lower() != ".npz":
         raise InputError("The new model has no NPZ file's name", where=out, expected="NAME.npz", got=out.name)
-    check_output_file(out)
-    if out.exists() and model.exists() and out.samefile(model):
-        raise InputError(
-            "The model would be replaced by its own copy",
-            where=out,
-            expected="another file than the model",
-            got=str(model),
-            fix="choose another name",
-        )
+    export.check_new_model(model, out)
 
 
 def _copy_statistics(model: Path, out: Path) -> None:
