@@ -9,6 +9,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from registration.frames import axis_angle_to_matrix
+from registration.model import skinning
 from registration.model.gnm_npz import GNMData
 from registration.types import Parameters
 
@@ -101,13 +102,4 @@ class GNM(torch.nn.Module):
         self, bind: Float[Tensor, "*B V 3"], joints: Float[Tensor, "*C J 3"], rotations: Float[Tensor, "*D J 3 3"]
     ) -> Float[Tensor, "*E V 3"]:
         """Apply linear blend skinning along the kinematic chain; batch axes broadcast."""
-        chained, positions = [rotations[..., 0, :, :]], [joints[..., 0, :]]
-        for j, parent in enumerate(self.parents[1:], start=1):
-            bone = joints[..., j, :] - joints[..., parent, :]
-            positions.append(positions[parent] + (chained[parent] @ bone[..., None])[..., 0])
-            chained.append(chained[parent] @ rotations[..., j, :, :])
-        rotation = torch.stack(chained, -3)
-        shift = torch.stack(positions, -2) - (rotation @ joints[..., None])[..., 0]
-        affine = self.weights @ torch.cat([rotation, shift[..., None]], -1).flatten(-2)
-        affine = affine.unflatten(-1, (3, 4))
-        return (affine[..., :3] @ bind[..., None])[..., 0] + affine[..., 3]
+        return skinning.skin(bind, joints, rotations, weights=self.weights, parents=self.parents)

@@ -209,7 +209,7 @@ def _scheme(scheme: landmarks.LandmarkScheme) -> str:
 def _file(path: Path, data: GNMData) -> Table:
     table = _table("file", "name", "field")
     digest = hash_file(path)
-    source, licence = _origin(path, digest)
+    source, licence = origin(path, digest)
     inside = [name for name in data.extra if name in gnm_npz.SCHEMA.names(path)]
     for name, value in (
         ("version", f"{data.version}, variant {data.variant}"),
@@ -227,8 +227,8 @@ def _file(path: Path, data: GNMData) -> Table:
     return table
 
 
-def _origin(path: Path, digest: str) -> tuple[str, str]:
-    """Where a model file comes from, and its licence, as far as that is known."""
+def origin(path: Path, digest: str) -> tuple[str, str]:
+    """Return where a GNM file of this sha256 comes from, and its licence, as far as that is known."""
     if (record := fetch.source_record(path)) is not None:
         return f"{record.get('source')}: {record.get('address')}", str(record.get("licence"))
     if digest == fetch.SHA256:

@@ -1,0 +1,47 @@
+"""The formats of linear models, told apart by what is in a file, and the reader of any of them."""
+
+from pathlib import Path
+
+from registration.errors import InputError
+from registration.linear_models import gnm, plain_npz
+from registration.linear_models.data import LinearModelData
+from registration.linear_models.options import ModelFormat, ReadOptions
+from registration.model.wrong_files import describe_wrong_file
+
+FORMATS: dict[str, ModelFormat] = {known.name: known for known in (gnm.FORMAT, plain_npz.FORMAT)}
+
+
+def read(path: Path, options: ReadOptions | None = None) -> LinearModelData:
+    """Read a linear model of heads, of any format of `FORMATS`, into metres, +Y up, +Z out of the face.
+
+    No code of the file is run: pickles are interpreted for arrays only.
+
+    Args:
+        path: the file, or the folder of ICT FaceKit.
+        options: what the file does not state; None: defaults.
+
+    Raises:
+        InputError: it is missing, none of the formats, damaged, or its arrays do not belong together.
+    """
+    path = Path(path)
+    return detect_format(path).read(path, options or ReadOptions())
+
+
+def detect_format(path: Path) -> ModelFormat:
+    """Return the format of a model's file or folder by its content.
+
+    Raises:
+        InputError: it cannot be read, or is none of them.
+    """
+    path = Path(path)
+    for known in FORMATS.values():
+        if known.detect(path):
+            return known
+    what = describe_wrong_file(path) if path.is_file() else "a folder without a model's files"
+    raise InputError(
+        "The linear model cannot be read",
+        where=path,
+        expected=", ".join(known.title for known in FORMATS.values()),
+        got=what or "a file of another kind",
+        fix="give a model's file as it was published, or write its arrays as a plain NPZ (docs/other_models.md)",
+    )
