@@ -21,7 +21,8 @@ _SAMPLED = 2000  # vertices
 class Frame:
     """A format's convention."""
 
-    unit_m: float | None = None  # None: told from the size
+    unit_m: float | None = None  # stated by the file
+    usual_m: float | None = None  # of the format's files, unless the template's size says another
     up: str = "+y"  # an Axis; `turn` refuses others
     front: str = "+z"
 
@@ -42,9 +43,9 @@ def normalized(data: LinearModelData, where: object, convention: Frame, options:
     remarks = list(data.remarks)
     if unit is None:
         unit, name = _unit_of_size(data.template, where)
-        remarks.append(
-            f"the unit is taken as {name}: the template is {_longest(data.template) * unit * 1e3:.0f} mm long"
-        )
+        if unit != convention.usual_m:
+            long = _longest(data.template) * unit * 1e3
+            remarks.append(f"the unit is taken as {name}: the template is {long:.0f} mm long")
     elif not 0 < unit < np.inf:
         raise InputError(
             "The model's unit cannot be used",

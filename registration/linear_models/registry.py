@@ -3,12 +3,12 @@
 from pathlib import Path
 
 from registration.errors import InputError
-from registration.linear_models import gnm, plain_npz
+from registration.linear_models import flame, gnm, plain_npz
 from registration.linear_models.data import LinearModelData
 from registration.linear_models.options import ModelFormat, ReadOptions
 from registration.model.wrong_files import describe_wrong_file
 
-FORMATS: dict[str, ModelFormat] = {known.name: known for known in (gnm.FORMAT, plain_npz.FORMAT)}
+FORMATS: dict[str, ModelFormat] = {known.name: known for known in (gnm.FORMAT, flame.FORMAT, plain_npz.FORMAT)}
 
 
 def read(path: Path, options: ReadOptions | None = None) -> LinearModelData:
