@@ -77,6 +77,16 @@ class RayCaster:
             barycentric[top + line, column] = _on_ray(ray[line, column], corners)
         return face, barycentric
 
+    def blocked(
+        self, points: Float[np.ndarray, "P 3"], directions: Float[np.ndarray, "P 3"], near: float, far: float
+    ) -> Bool[np.ndarray, "P"]:
+        """Test which rays hit the mesh between two distances, metres; directions are unit vectors."""
+        if self._caster is None or not len(points):
+            return np.zeros(len(points), bool)
+        origins = (np.asarray(points, np.float64) - self._centre).astype(np.float32)
+        limits = (np.full(len(points), limit, np.float32) for limit in (near, far))
+        return np.asarray(self._caster.occluded(origins, directions.astype(np.float32), *limits))
+
     def _cast(self, camera: Camera, ray: Float[np.ndarray, "N 3"]) -> lagrange.raycasting.RayHits:
         assert self._caster is not None
         hits = self._caster.cast(self._origins(camera, len(ray)), ray.astype(np.float32), NEAR, np.inf)

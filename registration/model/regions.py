@@ -229,6 +229,13 @@ def nostrils(data: GNMData) -> Bool[np.ndarray, "V"]:
     return (group(data, "skin") > _INSIDE) & ~exterior(data) & ~other
 
 
+def outer_surface(data: GNMData) -> Bool[np.ndarray, "V"]:
+    """The exterior without ears, nostrils and hidden lips, and without the rims of mouth and lids."""
+    linings = _any(data, ("mouth_sock", "eye_sockets")) & ~exterior(data)
+    hidden = ears(data) | (inner_lips(data) > _INSIDE) | (_nearness(data, linings, 1e-3, 3e-3) > _INSIDE)
+    return exterior(data) & ~hidden & ~nostrils(data)
+
+
 def offset_regions(data: GNMData) -> dict[str, Bool[np.ndarray, "V"]]:
     """Regions of the skin for which a recipe may have settings of its own, by name."""
     lips = (group(data, "upper_lip") > _INSIDE) | (group(data, "lower_lip") > _INSIDE)

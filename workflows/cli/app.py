@@ -79,6 +79,7 @@ GROUPS: Mapping[str, Mapping[str, Command]] = {
         "model anatomy": model.anatomy,
         "model place": model.place,
         "model landmarks": model.landmarks,
+        "model map": model.map_,
         "model fetch": model.fetch,
         "model info": model.info,
         "model export": model.export,

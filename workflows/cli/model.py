@@ -243,3 +243,32 @@ def landmarks(
         path, lines = make_landmark_map(model, provider, out, settings, picture, progress)
     print("\n".join((*lines, str(path))))
     return 0
+
+
+def map_(
+    source: Positional[Annotated[Path, arg(metavar="A")]],
+    target: Positional[Annotated[Path, arg(metavar="B")]],
+    /,
+    out: Annotated[Path, arg(metavar="MAP")],
+    picture: OptionalImage = None,
+) -> int:
+    """Map the topology of one head to that of another.
+
+    B is bent onto A. The map says of every vertex of B where on A's surface it lies, and back, so that vertices,
+    landmarks, groups and bases can be carried over. It is accepted if the bent vertices are nearer than 0.02 mm in the
+    mean, no face is flipped, and vertices that are carried there and back return to 0.2 mm. A refused map is written
+    with its reasons and a picture; the exit status is then 1.
+
+    Args:
+        source: A head model, or a mesh (OBJ, PLY, GLB; metres) with landmarks beside it, as head_sparse_NAME.txt.
+        target: Another one; a mesh may have any unit and frame.
+        out: The map to write, an NPZ file.
+        picture: Picture of the distances; by default one beside a refused map.
+    """
+    from registration.progress import console_progress
+    from workflows.steps.topology_map import lines, make_topology_map
+
+    with console_progress() as progress:
+        mapped = make_topology_map(source, target, out, picture, progress)
+    print("\n".join((*lines(mapped), str(out))))
+    return 0 if mapped.accepted else 1
