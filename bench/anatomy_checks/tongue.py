@@ -23,6 +23,10 @@ from registration.model.gnm_npz import GNMData
 _GAP_M = 30e-3  # between the incisors of the open mouth, beyond the template's
 _RANDOM, _POSES = 200, 20
 _DEEP_MM = 0.5
+_FITTED_MM = 0.2  # the same of poses fitted to key points
+_GAPS_M = 4e-3, 20e-3  # between the incisors of these
+_REST = 8
+_MOVES, _STEP_S = 8, 0.15  # poses of the movement, and from one to the next: four syllables a second
 _COMPONENTS, _MORE = 31, 8  # of the paper
 
 
@@ -73,29 +77,65 @@ def _penetrations(data: GNMData, components: Float[np.ndarray, "K N 3"]) -> tupl
 
 
 def _recovered(data: GNMData) -> Iterator[Figure]:
-    """Fit key points of known poses, exact and with noise of 1 mm rms in all three coordinates together."""
+    """Fit key points of known poses: single ones, and a movement of 100 times a second."""
     fit, rng = KeyPointFit(data=data, rig=TongueRig(structure=find_tongue(data))), np.random.default_rng(0)
-    posed: list[np.ndarray] = []
-    while len(posed) < _POSES:
-        tongue = fit.rig.pose(draw_controls(rng, PoseSettings().pose_spread))
-        if abs(fit.rig.volume_ratio(tongue) - 1) < PoseSettings().volume_change:
-            posed.append(tongue)
-    gaps = np.r_[0.0, rng.uniform(0, 0.02, _POSES - 1)]
+    gaps = rng.uniform(*_GAPS_M, _POSES)
+    controls = np.stack([_fitting(fit, gap, rng) for gap in gaps])
+    single = np.arange(_POSES, dtype=float), controls, gaps
+    times = np.arange(0, _STEP_S * (_MOVES - 1), 0.01)
+    step, share = np.divmod(times / _STEP_S, 1)
+    first, share = step.astype(int), (1 - np.cos(np.pi * share)) / 2
+    moving = [values[first] + (share * (values[first + 1] - values[first]).T).T for values in (controls, gaps)]
+    # Noise is told as its root mean square in all three coordinates together.
+    for title, poses, noise, most in (
+        ("single poses, exact", single, 0.0, 0.5),
+        ("single poses, noise of 1 mm", single, 1.0, 1.0),
+        ("single poses, noise of 1 mm in each coordinate", single, np.sqrt(3), None),
+        ("a movement, exact", (times, *moving), 0.0, 0.5),
+        ("a movement, noise of 1 mm in each coordinate", (times, *moving), np.sqrt(3), 1.0),
+    ):
+        points, whole, deep = _fit_again(fit, poses, noise / np.sqrt(3))
+        yield Figure(name=f"three key points, {title}: error, rms", value=points, unit="mm", most=most)
+        yield Figure(name=f"three key points, {title}: whole tongue, mean", value=whole, unit="mm")
+        yield Figure(name=f"three key points, {title}: deeper than {_FITTED_MM} mm", value=deep, unit="poses", most=0)
+
+
+def _fitting(fit: KeyPointFit, gap: float, rng: np.random.Generator) -> Float[np.ndarray, "C"]:
+    """Draw a pose that fits a mouth."""
+    while True:
+        controls = draw_controls(rng, PoseSettings().pose_spread)
+        tongue, mouth = fit.rig.pose(controls), fit.mouth(gap)
+        inside = max(mouth.excess_mm(mouth.carried + tongue - fit.rig.structure.rest).values())
+        if abs(fit.rig.volume_ratio(tongue) - 1) < PoseSettings().volume_change and inside <= _FITTED_MM:
+            return controls
+
+
+def _fit_again(
+    fit: KeyPointFit,
+    poses: tuple[Float[np.ndarray, "T"], Float[np.ndarray, "T C"], Float[np.ndarray, "T"]],
+    noise_mm: float,
+) -> tuple[float, float, int]:
+    """Errors of key points and of the whole tongue, mm, and how many fits lie in teeth, palate, lips or cheeks.
+
+    Before the poses the tongue is at rest for a while, with the jaw closed: the gap is measured from there.
+    """
+    rest, rng = fit.rig.structure.rest, np.random.default_rng(5)
+    times, controls, gaps = (np.concatenate([np.zeros((_REST, *part.shape[1:])), part]) for part in poses)
+    times[:_REST] = np.arange(_REST) - 100
+    posed = [fit.rig.pose(values) for values in controls]
     true = [fit.points_of(tongue, gap) for tongue, gap in zip(posed, gaps, strict=True)]
-    for noise, most in ((0.0, 0.5), (1.0, 1.0)):
-        points = {
-            name: np.array([moment[name] for moment in true]) + rng.normal(0, noise / np.sqrt(3), (_POSES, 3))
-            for name in TONGUE_POINTS[:3]
-        }
-        points["upper_incisors"] = np.zeros((_POSES, 3))
-        points["lower_incisors"] = np.stack([0 * gaps, -MM_PER_M * gaps, 0 * gaps], 1)
-        times = np.arange(_POSES) / 100
-        fitted = fit.fit(TongueRecording(time_s=times, points=points), _POSES)
-        error, whole = [], []
-        for k, displacement in enumerate(fitted.displacements):
-            found = fit.points_of(fit.rig.structure.rest + displacement, float(gaps[k]))
+    points = {
+        name: np.array([moment[name] for moment in true]) + rng.normal(0, noise_mm, (len(true), 3))
+        for name in TONGUE_POINTS[:3]
+    }
+    points["upper_incisors"] = np.zeros((len(true), 3))
+    points["lower_incisors"] = np.stack([0 * gaps, -MM_PER_M * gaps, 0 * gaps], 1)
+    fitted = fit.fit(TongueRecording(time_s=times, points=points), _POSES + _REST)
+    error, whole, deep = [], [], 0
+    for k, displacement in zip(fitted.times.tolist(), fitted.displacements, strict=True):
+        if k >= _REST:
+            found, mouth = fit.points_of(rest + displacement, float(gaps[k])), fit.mouth(gaps[k])
             error.append(np.mean([((found[name] - true[k][name]) ** 2).sum() for name in TONGUE_POINTS[:3]]))
-            whole.append(np.linalg.norm(fit.rig.structure.rest + displacement - posed[k], axis=1).mean() * MM_PER_M)
-        name = f"with {noise:g} mm of noise" if noise else "exact"
-        yield Figure(name=f"three key points, {name}: error, rms", value=np.sqrt(np.mean(error)), unit="mm", most=most)
-        yield Figure(name=f"three key points, {name}: whole tongue, mean", value=np.mean(whole), unit="mm")
+            whole.append(np.linalg.norm(rest + displacement - posed[k], axis=1).mean() * MM_PER_M)
+            deep += max(mouth.excess_mm(mouth.carried + displacement).values()) > _FITTED_MM
+    return float(np.sqrt(np.mean(error))), float(np.mean(whole)), deep

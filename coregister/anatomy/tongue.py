@@ -1,5 +1,6 @@
 """The tongue's expression basis, from poses of a rig [GNM, Tongue Modeling and Articulation]."""
 
+import itertools
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
 from typing import Any
@@ -51,10 +52,13 @@ class TongueSources:
         expressions: displacements of registered expressions from their neutrals, in the model's frame, metres; of
             these, only the outer skin counts.
         recordings: key points; poses fitted to them are up to a quarter of the samples.
+        fill: whether expressions of the model fill up what open mouths there are, to `PoseSettings.mouths`; otherwise
+            expressions without an open mouth are refused.
     """
 
     expressions: Sequence[Float[np.ndarray, "V 3"]] = ()
     recordings: Sequence[TongueRecording] = ()
+    fill: bool = False
 
 
 def tongue_basis(
@@ -89,10 +93,12 @@ def tongue_basis(
         )
     rig = TongueRig(structure=find_tongue(data))
     rng = np.random.default_rng(settings.seed)
-    mouths = _open_mouths(sources, data) if sources.expressions else []
+    mouths = _open_mouths(sources, data, settings.poses.mouths) if sources.expressions else []
+    registered = len(mouths)
     fits = _fitted(sources, rig, data, settings)
     count = (settings.samples + 1) // 2 - sum(len(fit.times) for fit in fits)
-    mouths = mouths or list(model_expressions(data, settings.poses, rng))
+    if sources.fill or not mouths:
+        mouths += itertools.islice(model_expressions(data, settings.poses, rng), settings.poses.mouths - registered)
     poses = draw_poses(rig, data, mouths, count, settings.poses, rng)
     halves = np.concatenate([poses.displacements, *(fit.displacements for fit in fits)])
     samples = np.stack([halves, halves[:, rig.structure.mirror] * FLIP], 1).reshape(-1, *halves.shape[1:])
@@ -106,7 +112,7 @@ def tongue_basis(
         "seed": settings.seed,
         "samples": len(samples),
         "mouths": len(mouths),
-        "mouths_of": "registrations" if sources.expressions else "the model's expressions",
+        "mouths_registered": registered,
         "mouths_too_tight": poses.tight,
         "rejected": sum(poses.rejected.values()),
         "rejected_for": poses.rejected,
@@ -134,12 +140,15 @@ def tongue_basis(
     )
 
 
-def _open_mouths(sources: TongueSources, data: GNMData) -> list[Float[np.ndarray, "V 3"]]:
+def _open_mouths(sources: TongueSources, data: GNMData, most: int) -> list[Float[np.ndarray, "V 3"]]:
+    """Expressions with an open mouth, of which only the outer skin counts; at most so many to fill up."""
     jaw = JawOpening.of(data)
     expressions = [jaw.of_skin(np.asarray(moved, np.float64), data) for moved in sources.expressions]
     gaps = [jaw.gap(moved, data) for moved in expressions]
     opened = [moved for moved, gap in zip(expressions, gaps, strict=True) if gap >= _LEAST_GAP]
-    if not opened:
+    if sources.fill and len(opened) > most:
+        return [opened[k] for k in np.linspace(0, len(opened) - 1, most).round().astype(int)]
+    if not opened and not sources.fill:
         raise InputError(
             "No registration has an open mouth",
             where="registrations",

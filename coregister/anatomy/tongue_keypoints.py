@@ -10,7 +10,7 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 
 from registration.errors import InputError
 from registration.geometry.rigid import align
@@ -34,6 +34,7 @@ _SCHEMA = NpzSchema(
 )
 _MAX_ROWS = 2_000_000
 _MAX_COORDINATE_MM = 1e5
+_REACH = 3.0  # standard deviations that smoothing in time looks back and ahead
 _TIP_DISTANCE_MM = 3.0, 120.0  # plausible median distance of the tip from the upper incisors
 
 
@@ -48,6 +49,24 @@ class TongueRecording:
     def complete(self) -> Bool[np.ndarray, "T"]:
         """Times at which all required points were measured."""
         return np.all([np.isfinite(self.points[name]).all(1) for name in REQUIRED], axis=0)
+
+    def smoothed(self, times: Int[np.ndarray, "N"], deviation_s: float) -> "TongueRecording":
+        """Return some times, each a weighted mean of those around it; a point that was not measured then stays so.
+
+        Args:
+            times: indices.
+            deviation_s: standard deviation of the Gaussian weights, seconds. A time without others as near is kept.
+        """
+        points = {name: np.array(place[times]) for name, place in self.points.items()}
+        for row, time in enumerate(self.time_s[times].tolist()):
+            away = (self.time_s - time) / deviation_s
+            near = np.flatnonzero(np.abs(away) <= _REACH)
+            weights = np.exp(-0.5 * away[near] ** 2)
+            for name, place in self.points.items():
+                known = np.isfinite(place[near]).all(1)
+                if np.isfinite(points[name][row]).all():
+                    points[name][row] = weights[known] @ place[near][known] / weights[known].sum()
+        return TongueRecording(time_s=self.time_s[times], points=points)
 
 
 def read_recording(file: Path) -> TongueRecording:

@@ -4,7 +4,7 @@ The tongue and the lower teeth are carried by the jaw, as the model's lower-face
 tongue is relative to that.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -12,7 +12,7 @@ from jaxtyping import Float, Int
 
 from registration.errors import InputError
 from registration.frames import MM_PER_M
-from registration.geometry.closest_point import ClosestPointQuery
+from registration.geometry.closest_point import ClosestPointQuery, barycentric_points
 from registration.geometry.topology import connected_parts
 from registration.geometry.winding import Winding, closed
 from registration.model import regions
@@ -102,6 +102,32 @@ def incisors(data: GNMData, *, upper: bool) -> Int[np.ndarray, "M"]:
     return teeth[(points[:, 2] > points[:, 2].max() - depth) & (np.abs(points[:, 0]) < side)]
 
 
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Contacts:
+    """Planes behind which N vertices of a tongue ought not to lie: normal . x >= level. Metres."""
+
+    rows: Int[np.ndarray, "N"]  # of the tongue's vertices
+    normals: Float[np.ndarray, "N 3"]  # out of the obstacle, unit length
+    levels: Float[np.ndarray, "N"]
+
+    @classmethod
+    def none(cls) -> "Contacts":
+        """No planes."""
+        return cls(rows=np.empty(0, np.int64), normals=np.empty((0, 3)), levels=np.empty(0))
+
+    def shifted(self, moves: Float[np.ndarray, "T 3"]) -> "Contacts":
+        """Return the planes moved by the displacement of each one's vertex, of the tongue's T."""
+        return replace(self, levels=self.levels + np.einsum("nc,nc->n", self.normals, moves[self.rows]))
+
+    def with_more(self, other: "Contacts") -> "Contacts":
+        """Return the planes of both."""
+        return Contacts(
+            rows=np.concatenate([self.rows, other.rows]),
+            normals=np.concatenate([self.normals, other.normals]),
+            levels=np.concatenate([self.levels, other.levels]),
+        )
+
+
 class Mouth:
     """What surrounds the tongue in one expression, prepared for many tongues. Metres, the model's frame."""
 
@@ -148,6 +174,26 @@ class Mouth:
         """The depths of the tongue as carried by the jaw, which no pose can avoid."""
         return self.depths_mm(self.carried)
 
+    def deepest(self, tongue: Float[np.ndarray, "N 3"], more_than_mm: float) -> "Contacts":
+        """Return the vertices of a tongue that lie deeper than as carried by the jaw, and the way out of the obstacle.
+
+        Args:
+            tongue: the tongue's vertices in this mouth.
+            more_than_mm: deeper by this.
+        """
+        found = []
+        for name, surfaces in ((OBSTACLES[0], self._shells), (OBSTACLES[1], [self._skin])):
+            for surface in surfaces:
+                rows, outlets = surface.outlets(tongue)
+                out = outlets - tongue[rows]
+                depth = np.linalg.norm(out, axis=1)
+                allowed = self.resting[name][rows] / MM_PER_M
+                deep = depth > allowed + more_than_mm / MM_PER_M
+                normals = out[deep] / depth[deep, None]
+                found.append((rows[deep], normals, np.einsum("nc,nc->n", normals, outlets[deep]) - allowed[deep]))
+        rows, normals, levels = (np.concatenate(parts) for parts in zip(*found, strict=True))
+        return Contacts(rows=rows, normals=normals, levels=levels)
+
     def excess_mm(self, tongue: Float[np.ndarray, "N 3"], *, skin: bool = True) -> dict[str, float]:
         """Return by obstacle how much deeper than as carried by the jaw the deepest vertex lies, millimetres."""
         depths = self.depths_mm(tongue, skin=skin)
@@ -166,12 +212,23 @@ class _Surface:
         corners = vertices[triangles].reshape(-1, 3)
         self._low, self._high = corners.min(0), corners.max(0)
         self._winding = Winding(*closed(vertices, triangles))
-        self._query = ClosestPointQuery(vertices, triangles if measured is None else measured)
+        self._vertices, self._measured = vertices, triangles if measured is None else measured
+        self._query = ClosestPointQuery(vertices, self._measured)
 
     def depth_mm(self, points: Float[np.ndarray, "N 3"]) -> Float[np.ndarray, "N"]:
-        depth = np.zeros(len(points))
-        boxed = np.flatnonzero(((points > self._low) & (points < self._high)).all(1))
-        inside = boxed[self._winding.numbers(points[boxed]) > _INSIDE]
+        depth, inside = np.zeros(len(points)), self._inside(points)
         if len(inside):
             depth[inside] = self._query.closest(points[inside])[0] * MM_PER_M
         return depth
+
+    def outlets(self, points: Float[np.ndarray, "N 3"]) -> tuple[Int[np.ndarray, "M"], Float[np.ndarray, "M 3"]]:
+        """Return which points lie inside, and the closest point of the surface for each of these."""
+        inside = self._inside(points)
+        if not len(inside):
+            return inside, np.empty((0, 3))
+        _, face, barycentric = self._query.closest(points[inside])
+        return inside, barycentric_points(self._vertices, self._measured, face, barycentric)
+
+    def _inside(self, points: Float[np.ndarray, "N 3"]) -> Int[np.ndarray, "M"]:
+        boxed = np.flatnonzero(((points > self._low) & (points < self._high)).all(1))
+        return boxed[self._winding.numbers(points[boxed]) > _INSIDE]

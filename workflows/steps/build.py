@@ -1,14 +1,19 @@
 """The step that builds a round's model from its registrations."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+from jaxtyping import Float
+
 from coregister.anatomy.assemble import AnatomySettings, regenerate
+from coregister.anatomy.tongue import TongueSources
 from coregister.next_model import provenance
 from coregister.next_model.build import BuiltModel, build_model
 from coregister.next_model.recipes import ModelRecipe
+from coregister.next_model.training_data import TrainingSubject
 from registration.cranium import auxiliary_model
 from registration.errors import InputError
 from registration.model import gnm_npz
@@ -79,7 +84,7 @@ def build_next_model(
     if anatomy:
         regenerated = AnatomySettings(parts=tuple(anatomy["parts"]), seed=anatomy["seed"])
         (progress or NullProgress()).message(f"regenerating {', '.join(regenerated.parts)}")
-        built = _with_anatomy(built, regenerated)
+        built = _with_anatomy(built, regenerated, subjects)
     result = BuildResult(
         input_hash=product.input_hash,
         model=str(folder / MODEL),
@@ -96,11 +101,27 @@ def build_next_model(
     return result.to_json()
 
 
-def _with_anatomy(built: BuiltModel, settings: AnatomySettings) -> BuiltModel:
-    """The built model with regenerated parts, which its manifest describes in a section of its own."""
-    made = regenerate(built.data, settings)
+def _with_anatomy(built: BuiltModel, settings: AnatomySettings, subjects: Iterable[TrainingSubject]) -> BuiltModel:
+    """The built model with regenerated parts, which its manifest describes in a section of its own.
+
+    The tongue is posed in the open mouths of the registrations, and where there are few of these, in the model's own.
+    """
+    rejected = {entry["name"] for entry in built.manifest["rejected"]}
+    tongues = None
+    if "tongue" in settings.parts:
+        tongues = TongueSources(expressions=list(_expressions(subjects, rejected)), fill=True)
+    made = regenerate(built.data, settings, tongues)
     described = {"content_id": gnm_npz.content_hash(made.data), "anatomy": made.anatomy}
     return replace(built, data=made.data, manifest=built.manifest | described)
+
+
+def _expressions(subjects: Iterable[TrainingSubject], rejected: Collection[str]) -> Iterator[Float[np.ndarray, "V 3"]]:
+    """Displacements of expressions from their neutrals, without registrations that are not in the model; metres."""
+    for subject in subjects:
+        if subject.neutral is not None and subject.name not in rejected:
+            for mesh in subject.expressions:
+                if f"{subject.name}, {mesh.name}" not in rejected:
+                    yield mesh.vertices - subject.neutral.vertices
 
 
 def _is_model(file: Path, content: str) -> bool:

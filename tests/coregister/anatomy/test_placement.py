@@ -13,8 +13,11 @@ from tests.fixtures.make_fixtures import HERE
 
 @pytest.fixture(scope="module")
 def tiny():
+    return with_lips_inside(gnm_npz.read(HERE / "tiny_gnm.npz"))
+
+
+def with_lips_inside(data):
     """The small model, of which a part of the skin at the lips counts as the mouth's lining."""
-    data = gnm_npz.read(HERE / "tiny_gnm.npz")
     names = data.vertex_group_names.tolist()
     groups = data.vertex_groups.copy()
     lips = np.maximum(groups[names.index("upper_lip")], groups[names.index("lower_lip")]) > 0.5

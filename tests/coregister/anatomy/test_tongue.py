@@ -1,7 +1,9 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
-from coregister.anatomy.tongue import TongueSettings, tongue_basis
+from coregister.anatomy.tongue import TongueSettings, TongueSources, tongue_basis
 from coregister.anatomy.tongue_mouth import JawOpening, Mouth
 from coregister.anatomy.tongue_poses import PoseSettings, draw_poses, model_expressions
 from coregister.anatomy.tongue_rig import TongueRig
@@ -75,3 +77,14 @@ def test_the_basis_is_symmetric_deterministic_and_starts_with_its_mean(gnm):
 def test_too_few_samples_are_refused(gnm):
     with pytest.raises(InputError, match="too few samples"):
         tongue_basis(gnm, TongueSettings(samples=20))
+
+
+@needs_shared
+def test_open_mouths_of_registrations_come_first_and_the_models_fill_them_up(gnm):
+    jaw = JawOpening.of(gnm)
+    opened, closed = (jaw.displacement(jaw.coefficients(gap)) for gap in (0.03, 0.005))
+    two = replace(SETTINGS, poses=PoseSettings(mouths=2))
+    record = tongue_basis(gnm, two, sources=TongueSources(expressions=[closed, opened], fill=True)).record
+    assert (record["mouths_registered"], record["mouths"]) == (1, 2)
+    with pytest.raises(InputError, match="open mouth"):
+        tongue_basis(gnm, SETTINGS, sources=TongueSources(expressions=[closed]))

@@ -115,20 +115,57 @@ def fit():
     return KeyPointFit(data=data, rig=TongueRig(structure=find_tongue(data)))
 
 
+def in_mouth(fit, gap, rng):
+    """A pose that penetrates nothing."""
+    mouth = fit.mouth(gap)
+    while True:
+        tongue = fit.rig.pose(draw_controls(rng, 0.8))
+        if max(mouth.excess_mm(mouth.carried + tongue - fit.rig.structure.rest).values()) <= 0.2:
+            return tongue
+
+
 @needs_shared
 def test_points_of_known_poses_are_recovered(fit):
     rng = np.random.default_rng(1)
-    gaps = np.array([0.0, 0.004, 0.012])
-    posed = [fit.rig.pose(draw_controls(rng, 0.8)) for _ in gaps]
+    gaps = np.array([0.0, 0.01, 0.016])
+    posed = [fit.rig.structure.rest, *(in_mouth(fit, gap, rng) for gap in gaps[1:])]
     true = [fit.points_of(tongue, gap) for tongue, gap in zip(posed, gaps, strict=True)]
     points = {name: np.array([moment[name] for moment in true]) for name in TONGUE_POINTS[:3]}
     points["upper_incisors"] = np.zeros((3, 3))
     points["lower_incisors"] = np.stack([0 * gaps, -3 - 1e3 * gaps, 0 * gaps], 1)
     fitted = fit.fit(TongueRecording(time_s=np.arange(3.0), points=points), most=3)
-    assert fitted.residual_mm.max() < 0.5
+    assert fitted.residual_mm.max() < 0.5 and not fitted.limited.any()
     for displacement, moment, gap in zip(fitted.displacements, true, gaps, strict=True):
         found = fit.points_of(fit.rig.structure.rest + displacement, gap)
         assert max(np.linalg.norm(found[name] - moment[name]) for name in TONGUE_POINTS[:3]) < 0.5
+
+
+@needs_shared
+def test_points_in_the_palate_leave_the_tongue_before_it(fit):
+    rest = fit.points_of(fit.rig.structure.rest)
+    points = {name: rest[name][None] + (0, 8, 0) for name in TONGUE_POINTS[:3]} | {"upper_incisors": np.zeros((1, 3))}
+    fitted = fit.fit(TongueRecording(time_s=np.zeros(1), points=points), most=1)
+    mouth = fit.mouth(0.0)
+    forced = fit.rig.structure.rest + (0, 8e-3, 0)
+    assert max(mouth.excess_mm(forced).values()) > 2
+    assert max(mouth.excess_mm(mouth.carried + fitted.displacements[0]).values()) <= 0.2
+    assert fitted.residual_mm[0] > 1
+
+
+def test_points_are_smoothed_in_time_where_they_were_measured():
+    time, rng = np.arange(200) / 200, np.random.default_rng(0)
+    true = np.stack([3 * np.sin(2 * np.pi * 4 * time), 0 * time, -20 + time], 1)
+    noisy = true + rng.normal(0, 1, true.shape)
+    noisy[50] = np.nan
+    recording = TongueRecording(time_s=time, points={"tongue_tip": noisy})
+    smooth = recording.smoothed(np.arange(200), 0.01).points["tongue_tip"]
+    assert np.isnan(smooth[50]).all() and np.isfinite(np.delete(smooth, 50, 0)).all()
+    assert np.sqrt(np.nanmean((smooth - true) ** 2)) < 0.5
+    # Alone in time, and equal to its neighbours, a point stays.
+    apart = TongueRecording(time_s=time * 1000, points={"tongue_tip": noisy}).smoothed(np.array([7]), 0.01)
+    assert np.array_equal(apart.points["tongue_tip"], noisy[[7]]) and apart.time_s.tolist() == [35.0]
+    level = TongueRecording(time_s=time, points={"tongue_tip": np.ones((200, 3))}).smoothed(np.array([0, 9]), 0.01)
+    assert np.abs(level.points["tongue_tip"] - 1).max() < 1e-12
 
 
 @needs_shared
