@@ -25,6 +25,7 @@ from workflows.cli import (
     calibration,
     capture,
     coregister,
+    dataset,
     export,
     farm,
     fit,
@@ -61,6 +62,7 @@ GROUPS: Mapping[str, Mapping[str, Command]] = {
         "stereo": stereo.stereo,
         "dataset synth": capture.synth_dataset,
         "dataset import": importing.import_dataset,
+        "dataset describe": dataset.describe,
     },
     "Register": {
         "fit": fit.fit,
