@@ -157,10 +157,15 @@ def solve_normal_equations(
         matrix: J'J, possibly singular.
         right: S right-hand sides J'r.
     """
+    return np.asarray(pseudo_inverse(matrix) @ right)
+
+
+def pseudo_inverse(matrix: Float[np.ndarray, "N N"]) -> Float[np.ndarray, "N N"]:
+    """Return the inverse of J'J that gives the solution with the least norm, columns scaled to one."""
     squares = np.diag(matrix)
     scale = np.sqrt(np.where(squares > _EPSILON * squares.max(initial=0), squares, np.inf))[:, None]
     inverse = np.linalg.pinv(matrix / (scale * scale.T), rcond=_MIN_EIGENVALUE, hermitian=True)
-    return np.asarray(inverse @ (right / scale) / scale)
+    return np.asarray(inverse / (scale * scale.T))
 
 
 def twist_to_matrix(twist: Float[np.ndarray, "6"]) -> Float[np.ndarray, "4 4"]:

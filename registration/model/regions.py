@@ -282,6 +282,26 @@ def head_regions(data: GNMData) -> dict[str, Bool[np.ndarray, "V"]]:
     return {name: members & head_skin(data) for name, members in regions.items()}
 
 
+_CHEEK = ("cheek", "infraorbital", "zygomatic")
+_COMMON_AREAS = {  # of [GNM, Quantitative evaluation] -> official vertex groups
+    "nose": ("nose_region",),
+    "mouth": ("upper_lip", "lower_lip", "upper_lip_region", "lower_lip_region"),
+    "eyes": ("left_orbital_region", "right_orbital_region"),
+    "cheeks": tuple(f"{side}_{name}_region" for side in ("left", "right") for name in _CHEEK),
+    "chin": ("chin_region",),
+    "forehead": ("forehead_region", "middle_brow_region", "left_brow_region", "right_brow_region"),
+}
+
+
+def common_face(data: GNMData) -> dict[str, Bool[np.ndarray, "V"]]:
+    """Return the face on which models of different topology are compared, "face", and its areas.
+
+    Only exterior skin: no ears, eyeballs, nostrils, or inside of the mouth. The areas do not cover all of the face.
+    """
+    face = (group(data, "hockey_mask") > _INSIDE) & exterior(data)
+    return {"face": face} | {name: _any(data, groups) & face for name, groups in _COMMON_AREAS.items()}
+
+
 _FACE_AREAS = ("upper_lip", "lower_lip", "upper_lip_region", "lower_lip_region", "chin_region", "nose_region")
 _LEFT_AREAS = ("brow", "cheek", "infraorbital", "zygomatic")
 

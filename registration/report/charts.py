@@ -46,7 +46,7 @@ def loss_curves(history: Mapping[str, Mapping[str, Sequence[float]]]) -> str:
     names = list(dict.fromkeys(term for terms in stages.values() for term in terms))
     colours = {term: LINE_COLOURS[k % len(LINE_COLOURS)] for k, term in enumerate(names)}
     rows, columns = math.ceil(len(stages) / _COLUMNS), min(len(stages), _COLUMNS)
-    with _style():
+    with chart_style():
         figure = Figure(figsize=(11.4, 2.9 * rows + 0.5), layout="constrained")
         panels = figure.subplots(rows, columns, squeeze=False).ravel()
         for panel, (stage, terms) in zip(panels, stages.items(), strict=False):
@@ -54,10 +54,10 @@ def loss_curves(history: Mapping[str, Mapping[str, Sequence[float]]]) -> str:
                 valid = [v if v is not None and math.isfinite(v) and v > 0 else math.nan for v in values]
                 panel.plot(range(1, len(valid) + 1), valid, color=colours[term], lw=1.4, label=term)
             _set_log_scale(panel)
-            _style_axes(panel, stage, "step")
+            style_axes(panel, stage, "step")
         for panel in panels[len(stages) :]:
             panel.set_visible(False)
-        return _to_svg(figure, colours)
+        return to_svg(figure, colours)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -90,7 +90,7 @@ def line_charts(panels: Mapping[str, Sequence[ChartLine]], x_label: str, *, from
     names = list(dict.fromkeys(line.name for lines in panels.values() for line in lines))
     colours = {name: LINE_COLOURS[k % len(LINE_COLOURS)] for k, name in enumerate(names)}
     rows, columns = math.ceil(len(panels) / _COLUMNS), min(len(panels), _COLUMNS)
-    with _style():
+    with chart_style():
         figure = Figure(figsize=(11.4, 2.9 * rows + 0.5), layout="constrained")
         axes = figure.subplots(rows, columns, squeeze=False).ravel()
         for panel, (title, lines) in zip(axes, panels.items(), strict=False):
@@ -103,17 +103,18 @@ def line_charts(panels: Mapping[str, Sequence[ChartLine]], x_label: str, *, from
                 panel.fill_between(band_x, low, high, color=colours[line.name], alpha=0.15, lw=0)
             if from_zero:
                 panel.set_ylim(bottom=0)
-            _style_axes(panel, title, x_label)
+            style_axes(panel, title, x_label)
         for panel in axes[len(panels) :]:
             panel.set_visible(False)
-        return _to_svg(figure, colours)
+        return to_svg(figure, colours)
 
 
-def _style() -> AbstractContextManager[None]:
+def chart_style() -> AbstractContextManager[None]:
+    """Return the context in which charts are drawn: the same bytes in every run, text as text."""
     return matplotlib.rc_context({"svg.fonttype": "none", "svg.hashsalt": "report", "font.family": "sans-serif"})
 
 
-def _to_svg(figure: Figure, colours: Mapping[str, str]) -> str:
+def to_svg(figure: Figure, colours: Mapping[str, str]) -> str:
     """Return the figure with its legend below it, as an SVG element."""
     handles = [Line2D([], [], color=colour, lw=2.4) for colour in colours.values()]
     columns = min(len(colours), 8)
@@ -133,7 +134,8 @@ def _set_log_scale(panel: Axes) -> None:
         panel.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
 
 
-def _style_axes(panel: Axes, title: str, x_label: str) -> None:
+def style_axes(panel: Axes, title: str, x_label: str) -> None:
+    """Give a panel its title, the label of its horizontal axis and the report's plain look."""
     panel.set_title(title, loc="left", fontsize=10.5, color=TEXT_COLOUR, fontweight="bold")
     panel.set_xlabel(x_label, fontsize=9, color=TEXT_COLOUR)
     panel.tick_params(labelsize=8.5, colors=TEXT_COLOUR, which="both", length=0)

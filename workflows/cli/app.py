@@ -86,6 +86,7 @@ GROUPS: Mapping[str, Mapping[str, Command]] = {
         "model info": model.info,
         "model export": model.export,
         "model evaluate": model.evaluate,
+        "model compare": model.compare,
     },
     "Farm": {
         "worker": farm.worker,

@@ -5,7 +5,16 @@ from typing import Annotated, Literal
 
 from tyro.conf import Positional, arg
 
-from workflows.cli.options import Folder, ModelFile, OptionalFile, OptionalFolder, OptionalImage, OptionalModel, Seed
+from workflows.cli.options import (
+    FaceSettings,
+    Folder,
+    ModelFile,
+    OptionalFile,
+    OptionalFolder,
+    OptionalImage,
+    OptionalModel,
+    Seed,
+)
 
 Part = Literal["eyes", "teeth", "tongue", "pupils"]
 
@@ -88,6 +97,40 @@ def evaluate(
             models, held_out=held_out, out=out, captures=captures, settings=settings, force=force, progress=progress
         )
     print("\n".join((*lines(manifest), str(out / PAGE))))
+    return 0
+
+
+def compare(
+    models: Positional[Annotated[tuple[Path, ...], arg(metavar="MODEL", help_behavior_hint="(required)")]],
+    /,
+    samples: Annotated[Path, arg(metavar="RUN|NPZ")],
+    out: Folder,
+    captures: OptionalFolder = None,
+    maps: Annotated[tuple[Path, ...], arg(metavar="MAP", help_behavior_hint="(optional)")] = (),
+    settings: FaceSettings = FaceSettings(),  # noqa: B008
+    jobs: Annotated[int, arg(metavar="N")] = 1,
+) -> int:
+    """Compare models of any topology on the face of registered scans, by the paper's protocol.
+
+    Models are fitted to each registered mesh, then to the scan, without regularization. A folder holds the page, all
+    numbers as CSV and a result per scan; the same command resumes.
+
+    Args:
+        models: Head models, of any format that can be read; the first is a GNM file of the registrations' topology.
+        samples: A folder of subject folders that `gnmreg subject` wrote, or an NPZ file of registered scans.
+        out: The folder to write; results in it are kept where their input is the same.
+        captures: The folder of the subjects' captures, which hold the scans; with a folder of registrations.
+        maps: Maps from the first model's topology to those of the others, of `gnmreg model map`.
+        settings: How models are compared.
+        jobs: Number of processes.
+    """
+    from registration.progress import console_progress
+    from workflows.steps.compare import NUMBERS, PAGE, ComparisonInput, compare_models, lines
+
+    given = ComparisonInput(models=models, samples=samples, captures=captures, maps=maps)
+    with console_progress() as progress:
+        comparison = compare_models(given, out=out, settings=settings.protocol(), jobs=jobs, progress=progress)
+    print("\n".join((*lines(comparison), str(out / PAGE), str(out / NUMBERS))))
     return 0
 
 

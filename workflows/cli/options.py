@@ -17,6 +17,7 @@ from registration.errors import InputError
 from registration.options import RegisterOptions
 
 if TYPE_CHECKING:
+    from coregister.evaluate.face_protocol import ProtocolSettings
     from coregister.synthetic.capture import Studio
 
 NOT_SET = "(optional)"
@@ -48,6 +49,42 @@ class JobOptions(RegisterOptions):
     def register_options(self) -> RegisterOptions:
         """Return the library's options, whose type is part of input hashes."""
         return RegisterOptions(**{item.name: getattr(self, item.name) for item in fields(RegisterOptions)})
+
+
+@dataclass(frozen=True, kw_only=True)
+class FaceSettings:
+    """How models are compared on the face.
+
+    Attributes:
+        points: Points of each scan to fit, and as many others to measure at.
+        components: Numbers of components of the generalization curves, besides all.
+        curve_samples: Neutrals, and expressions, of these curves.
+        adam_steps: Steps of Adam in each stage, as a check of the least squares; 0: none.
+        adam_rate: Learning rate of Adam.
+        adam_samples: Scans that Adam fits; it fits the registered meshes of all.
+        random_heads: Random heads of each model, for specificity; 0: no specificity.
+        seed: Seed of points and random heads.
+    """
+
+    points: Annotated[int, arg(metavar="N")] = 3000
+    components: Annotated[tuple[int, ...], arg(metavar="K")] = (5, 10, 20, 40)
+    curve_samples: Annotated[int, arg(metavar="N")] = 40
+    adam_steps: Annotated[int, arg(metavar="N")] = 5000
+    adam_rate: Annotated[float, arg(metavar="R")] = 1e-3
+    adam_samples: Annotated[int, arg(metavar="N")] = 15
+    random_heads: Annotated[int, arg(metavar="N")] = 2000
+    seed: Seed = 0
+
+    def protocol(self) -> "ProtocolSettings":
+        """Return the settings of the protocol. Raises InputError for numbers out of range."""
+        from coregister.evaluate.face_adam import AdamSettings
+        from coregister.evaluate.face_protocol import ProtocolSettings
+
+        adam = AdamSettings(steps=self.adam_steps, rate=self.adam_rate)
+        own = {item.name: getattr(self, item.name) for item in fields(self) if not item.name.startswith("adam_")}
+        settings = ProtocolSettings(adam=adam, adam_samples=self.adam_samples, **own)
+        settings.check()
+        return settings
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -20,6 +20,8 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from coregister.anatomy.tongue_keypoints import read_recording
+from coregister.evaluate.face_data import FaceSample
+from coregister.evaluate.face_protocol import SampleResult
 from registration.capture import pixels
 from registration.capture.colmap import read_cameras, read_points
 from registration.capture.landmark_files import read_landmarks
@@ -40,6 +42,8 @@ from workflows.records.coregistration import CoregistrationPlan, CoregistrationS
 from workflows.records.dataset import DatasetRecord
 from workflows.records.dataset_import import DatasetImportRecord, ImportRow
 from workflows.records.decisions import read_decisions
+from workflows.records.face_results import read_result, write_result
+from workflows.records.face_samples import read_samples, write_samples
 from workflows.records.held_out import read_held_out
 from workflows.records.store import Store
 from workflows.records.subject import SubjectRecord
@@ -71,6 +75,7 @@ def valid(tmp_path_factory: pytest.TempPathFactory) -> Path:
     depths = np.full((SIZE[1], SIZE[0]), 0.5, np.float32)
     (folder / "cam1.geometric.bin").write_bytes(f"{SIZE[0]}&{SIZE[1]}&1&".encode("ascii") + depths.tobytes())
     np.save(folder / "cam1.npy", depths)
+    write_face_files(folder)
     header_exr = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
     OpenEXR.File(header_exr, {"Z": depths}).write(str(folder / "cam1.exr"))
     rng = np.random.default_rng(1)
@@ -84,6 +89,26 @@ def valid(tmp_path_factory: pytest.TempPathFactory) -> Path:
     for suffix in ("obj", "glb"):
         ball.export(folder / f"ball.{suffix}")
     return folder
+
+
+def write_face_files(folder: Path) -> None:
+    """A registered scan, and the result of comparing a model with it."""
+    vertices = np.random.default_rng(2).normal(size=(6, 3))
+    triangles = np.array([[0, 1, 2], [3, 4, 5]])
+    meshes = {"vertices": vertices, "scan": vertices + 1, "scan_triangles": triangles}
+    sample = FaceSample(name="a", subject="b", category="neutral", tags={"age": 3}, **meshes)
+    write_samples((sample,), triangles, folder / "registered_scans.npz")
+    result = SampleResult(
+        distances_mm={"stage1": np.ones(4, np.float32)},
+        rms_mm={"stage1": 1.0},
+        members=np.ones((2, 4), bool),
+        nearest=np.arange(4),
+        curves_mm={"identity": np.ones(2)},
+        converged={"stage1": True},
+        largest=1.0,
+        left_out=0,
+    )
+    write_result(result, "key", folder / "face_result.npz")
 
 
 def _camera() -> Camera:
@@ -137,6 +162,8 @@ READERS: dict[str, tuple[str, Reader]] = {  # name -> the file that is mutated, 
     "plan": ("plan.json", CoregistrationPlan.read),
     "state": ("coregistration.json", CoregistrationState.read),
     "held out": ("held_out.npz", read_held_out),
+    "registered scans": ("registered_scans.npz", read_samples),
+    "result of a sample": ("face_result.npz", lambda file: read_result(file, "key")),
     "tongue": ("tongue.csv", read_recording),
     "tongue arrays": ("tongue.npz", read_recording),
     "artifact": ("store/run/a/b/artifact.json", lambda file: Store(file.parents[3]).find("run/a/b")),
