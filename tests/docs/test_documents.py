@@ -206,6 +206,16 @@ def test_every_page_can_be_reached_from_the_readme():
     assert [relative(document) for document in DOCUMENTS if document not in seen] == []
 
 
+def test_every_statement_of_the_paper_has_a_status_and_a_place():
+    text = (ROOT / "docs" / "paper.md").read_text("utf-8")
+    statements = text[text.index("\n## ") :]
+    rows = [line.strip("| ").split(" | ") for line in statements.splitlines() if line.startswith("| ")]
+    assert len(rows) > 60 and {len(row) for row in rows} == {3}
+    assert {row[1] for row in rows} <= {"status", "implemented", "otherwise", "partly", "missing", "added"}
+    there = [row for row in rows if row[1] not in ("status", "missing")]
+    assert [row[0] for row in there if not re.search(r"`\w+/[\w/]+|\]\(", row[2])] == []
+
+
 def test_glossary_is_alphabetic_and_says_each_term_once():
     text = (ROOT / "docs" / "glossary.md").read_text("utf-8")
     terms = [row.split("|")[1].strip().lower() for row in text.splitlines() if row.startswith("| ")][1:]
