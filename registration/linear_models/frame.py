@@ -4,7 +4,7 @@ from dataclasses import dataclass, replace
 from typing import get_args
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from registration.errors import InputError
 from registration.linear_models.data import LinearModelData
@@ -71,9 +71,14 @@ def normalized(data: LinearModelData, where: object, convention: Frame, options:
         correctives = correctives.reshape(-1, correctives.shape[-1])
     if correctives is not None:
         correctives = moved(correctives.reshape(len(correctives), -1, 3)).reshape(len(correctives), -1)
+    template, triangles = moved(data.template), data.triangles
+    if _volume(template, triangles) < 0:
+        triangles = triangles[:, ::-1]
+        remarks.append("the triangles are turned round: they faced inwards")
     return replace(
         data,
-        template=moved(data.template),
+        triangles=triangles,
+        template=template,
         identity_basis=moved(data.identity_basis),
         expression_basis=moved(data.expression_basis),
         joints=replace(
@@ -109,6 +114,12 @@ def _axes_error(got: str) -> InputError:
     return InputError(
         "The model's axes cannot be used", where="axes", expected=expected, got=got, fix="name two of them"
     )
+
+
+def _volume(template: Float[np.ndarray, "V 3"], triangles: Int[np.ndarray, "F 3"]) -> float:
+    """Between the surface and its centre: positive if triangles face outwards, of closed heads and open faces alike."""
+    corners = (template - template.mean(0)).astype(np.float64)[triangles]
+    return float(np.einsum("fi,fi->", corners[:, 0], np.cross(corners[:, 1], corners[:, 2])))
 
 
 def _longest(template: Float[np.ndarray, "V 3"]) -> float:

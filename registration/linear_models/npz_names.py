@@ -1,4 +1,4 @@
-"""Which arrays an NPZ file has, to tell formats apart."""
+"""The first bytes of a file and the arrays of an NPZ file, to tell formats apart."""
 
 from functools import partial
 from pathlib import Path
@@ -9,6 +9,7 @@ from registration.storage.reading import open_file
 
 _ANY = NpzSchema(title="linear model", fix="give a model's file", fields={}, max_bytes=MAX_BYTES)
 START_BYTES = 512
+MATLAB_7_3 = b"MATLAB 7.3 MAT-file"  # then HDF5 from byte 512
 
 
 def first_bytes(path: Path) -> bytes:
@@ -17,7 +18,7 @@ def first_bytes(path: Path) -> bytes:
         return b""
     refuse = partial(InputError.unreadable, "linear model", where=path, fix="give a model's file, as it was published")
     with open_file(path, refuse) as stream:
-        return stream.read(START_BYTES + 8)
+        return stream.read(START_BYTES)
 
 
 def array_names(path: Path) -> frozenset[str]:

@@ -2,13 +2,18 @@
 
 from pathlib import Path
 
+import numpy as np
+
 from registration.errors import InputError
-from registration.linear_models import flame, gnm, plain_npz
-from registration.linear_models.data import LinearModelData
+from registration.linear_models import basel, flame, gnm, ict, mat_models, plain_npz
+from registration.linear_models.data import LinearModelData, check
 from registration.linear_models.options import ModelFormat, ReadOptions
 from registration.model.wrong_files import describe_wrong_file
 
-FORMATS: dict[str, ModelFormat] = {known.name: known for known in (gnm.FORMAT, flame.FORMAT, plain_npz.FORMAT)}
+FORMATS: dict[str, ModelFormat] = {
+    known.name: known
+    for known in (gnm.FORMAT, flame.FORMAT, basel.FORMAT, mat_models.FORMAT, ict.FORMAT, plain_npz.FORMAT)
+}
 
 
 def read(path: Path, options: ReadOptions | None = None) -> LinearModelData:
@@ -24,7 +29,11 @@ def read(path: Path, options: ReadOptions | None = None) -> LinearModelData:
         InputError: it is missing, none of the formats, damaged, or its arrays do not belong together.
     """
     path = Path(path)
-    return detect_format(path).read(path, options or ReadOptions())
+    known = detect_format(path)
+    with np.errstate(over="ignore", invalid="ignore"):  # what is not finite is refused below
+        model = known.read(path, options or ReadOptions())
+    check(model, path)
+    return model
 
 
 def detect_format(path: Path) -> ModelFormat:
@@ -45,3 +54,12 @@ def detect_format(path: Path) -> ModelFormat:
         got=what or "a file of another kind",
         fix="give a model's file as it was published, or write its arrays as a plain NPZ (docs/other_models.md)",
     )
+
+
+def other_format(path: Path) -> ModelFormat | None:
+    """Return the format of a model that is not GNM's; None of GNM files and of what cannot be told."""
+    try:
+        found = detect_format(path)
+    except InputError:
+        return None
+    return None if found is gnm.FORMAT else found

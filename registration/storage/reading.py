@@ -20,6 +20,7 @@ from typing import Any, Protocol, runtime_checkable
 from registration.errors import InputError
 
 MAX_TEXT_BYTES = 64 * 2**20  # of a JSON, TOML or text file: many times the largest that this project writes
+_CHUNK_BYTES = 2**20  # read at once of a file that is longer than it said
 MAX_LINE_BYTES = 16 * 2**20  # of a line in a file of any size
 MAX_DEPTH = 64  # of lists and objects within one another
 MAX_ITEMS = 2**22  # values in a JSON file, which take up to 100 bytes each in memory
@@ -103,7 +104,10 @@ def read_bytes(file: Path, refuse: Refuse, *, max_bytes: int = MAX_TEXT_BYTES) -
     """Read a whole regular file of at most `max_bytes`. Raises InputError as `open_file`."""
     with open_file(file, refuse, max_bytes=max_bytes) as stream:
         try:
-            content = stream.read(max_bytes + 1)
+            # Asked for as much as the file has: the buffer is allocated before it is filled.
+            content = stream.read(min(os.fstat(stream.fileno()).st_size, max_bytes) + 1)
+            while len(content) <= max_bytes and (more := stream.read(min(_CHUNK_BYTES, max_bytes + 1 - len(content)))):
+                content += more
         except OSError as error:
             raise refuse(expected="a readable file", got=system_reason(error)) from None
     if len(content) > max_bytes:  # it grew meanwhile, or has no size, as the files in /proc

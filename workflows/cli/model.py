@@ -23,20 +23,28 @@ def info(file: Positional[Annotated[Path, arg(metavar="FILE")]], /, out: Optiona
     """Describe a model file: origin, digests, dimensions, parts, regions, anatomy.
 
     Args:
-        file: The head model, a GNM NPZ file; or a GNMW file for the web.
-        out: Image of the model to draw; not of a GNMW file.
+        file: The head model, a GNM NPZ file; a GNMW file for the web; or a model of others, such as FLAME's
+            (docs/other_models.md).
+        out: Image of the model to draw; of a GNM NPZ file only.
     """
     from registration.anatomy.panels import anatomy_panels
     from registration.errors import InputError
+    from registration.linear_models import describe
+    from registration.linear_models.registry import other_format
     from registration.model import gnmw, info
 
-    if file.suffix.lower() != gnmw.SUFFIX:
+    web = file.suffix.lower() == gnmw.SUFFIX
+    other = None if web else other_format(file)
+    if not web and other is None:
         info.describe(file, picture=out, panels=anatomy_panels)
-    elif out is None:
+    elif out is not None:
+        what = "A GNMW file" if other is None else "A model of another format"
+        fix = "omit --out, or give the model's NPZ file"
+        raise InputError(f"{what} cannot be drawn", where=file, expected="a GNM NPZ file", got=file.name, fix=fix)
+    elif web:
         info.describe_web(file)
     else:
-        fix = "omit --out, or give the model's NPZ file"
-        raise InputError("A GNMW file cannot be drawn", where=file, expected="a GNM NPZ file", got=file.name, fix=fix)
+        describe.describe(file)
     return 0
 
 

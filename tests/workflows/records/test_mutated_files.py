@@ -29,6 +29,7 @@ from registration.capture.scan import read_scan, read_truth
 from registration.capture.settings import read_settings
 from registration.cranium import auxiliary_model
 from registration.errors import InputError
+from registration.linear_models import registry as linear_models
 from registration.model import gnm_npz, gnmw
 from registration.model.landmarks import read_scheme
 from registration.storage.registration_folder import load_registration, read_manifest
@@ -150,6 +151,11 @@ READERS: dict[str, tuple[str, Reader]] = {  # name -> the file that is mutated, 
     "model": ("tiny_gnm.npz", gnm_npz.read),
     "model for the web": ("tiny_gnm.gnmw", gnmw.read),
     "auxiliary model": ("head_cranium.npz", lambda file: auxiliary_model.read(file, tiny())),
+    **{
+        f"model {name}": (f"others/{name}", linear_models.read)
+        for name in ("plain.npz", "flame.pkl", "flame.npz", "basel.h5", "lsfm.mat", "lsfm_7_3.mat")
+    },
+    "model ict": ("others/ict/identity001.obj", lambda file: linear_models.read(file.parent)),
     "scheme": ("head_sparse_68.txt", lambda file: read_scheme(file, np.zeros((3000, 3)))),
     "manifest": ("registration/manifest.json", lambda file: read_manifest(file.parent)),
     "history": ("registration/history.json", lambda file: load_registration(file.parent)),
