@@ -52,14 +52,12 @@ class EvaluationSettings:
     Attributes:
         components: numbers of components, increasing.
         samples: number of random heads for specificity; 0: no specificity.
-        shortlist: real heads that each random one is compared with exactly.
         draws: resamples of the subjects for confidence intervals.
         seed: of random heads, points and resamples.
     """
 
     components: tuple[int, ...] = (5, 10, 20, 40)
     samples: int = 200
-    shortlist: int = 3
     draws: int = DRAWS
     seed: int = 0
 
@@ -206,8 +204,8 @@ def check(
         raise _input_error(
             "The numbers of components are out of order", "components", "such as 5 10 20", components, fix
         )
-    if settings.samples < 0 or settings.shortlist < 1 or settings.draws < 100:
-        expected = "samples from 0, a shortlist from 1, draws from 100"
+    if settings.samples < 0 or settings.draws < 100:
+        expected = "samples from 0, draws from 100"
         raise _input_error("The settings are out of range", "settings", expected, settings, "change them")
     topology = gnm_npz.topology_hash(triangles)
     for name, data in models.items():
@@ -268,7 +266,6 @@ def _model_metrics(
             np.stack([subject.neutral[part.rows] for subject in held_out]),
             counts,
             samples=settings.samples,
-            shortlist=settings.shortlist,
             seed=settings.seed,
         )
         specificity = _curve(counts, values, settings)

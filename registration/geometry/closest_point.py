@@ -24,8 +24,8 @@ class ClosestPointQuery:
         """
         if not len(triangles):
             raise ValueError("a mesh without triangles has no closest point")
-        self._corners = np.asarray(vertices, np.float64)[triangles]
-        _require_finite(self._corners)
+        self._vertices, self._triangles = np.asarray(vertices, np.float64), triangles
+        _require_finite(self._vertices[triangles])
         self._tree = lagrange.bvh.TriangleAABBTree3D(surface_mesh(vertices, triangles))
 
     def closest(
@@ -46,8 +46,15 @@ class ClosestPointQuery:
         _require_finite(points)
         closest = self._tree.get_closest_point
         face = np.fromiter((closest(point)[0] for point in points), np.int64, len(points))
-        distance, barycentric = on_triangles(points, self._corners[face])
+        distance, barycentric = on_triangles(points, self._vertices[self._triangles[face]])
         return distance, face, barycentric
+
+    def distance(self, points: Float[np.ndarray, "P 3"]) -> Float[np.ndarray, "P"]:
+        """Find the unsigned distance of each point alone, in half the time of `closest`; errors as there."""
+        points = np.ascontiguousarray(points, np.float64)
+        _require_finite(points)
+        closest = self._tree.get_closest_point
+        return np.sqrt(np.fromiter((closest(point)[2] for point in points), np.float64, len(points)))
 
 
 def closest_points(

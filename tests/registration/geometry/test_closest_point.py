@@ -70,6 +70,16 @@ def test_a_prepared_query_equals_single_queries():
             np.testing.assert_array_equal(a, b)
 
 
+def test_distances_alone_are_those_of_the_closest_points():
+    rng = np.random.default_rng(4)
+    vertices = np.concatenate([soup(rng, 100, 0.1), [[0.2, 0.2, 0.2], [0.6, 0.6, 0.6], [0.4, 0.4, 0.4 + 1e-9]]])
+    query = ClosestPointQuery(vertices, np.arange(303).reshape(-1, 3))
+    points = np.concatenate([rng.random((40, 3)), vertices[:5], [[50.0, 0, 0]]])
+    np.testing.assert_allclose(query.distance(points), query.closest(points)[0], atol=2e-8)
+    with pytest.raises(ValueError, match="finite"):
+        query.distance(np.full((1, 3), np.nan))
+
+
 def test_vertices_that_no_triangle_uses_are_ignored():
     vertices = np.concatenate([np.eye(3), [[np.nan] * 3, [0, 0, 0]]])
     assert closest_points(np.zeros((1, 3)), vertices, np.array([[0, 1, 2]]))[0] == pytest.approx(1 / np.sqrt(3))
