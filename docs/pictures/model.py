@@ -121,11 +121,12 @@ def dots(picture: Picture, points: Float[np.ndarray, "L 3"], shot: Shot, *, numb
     return cv2.resize(drawn, shot.size, interpolation=cv2.INTER_AREA)
 
 
-def captioned(picture: Picture, text: str) -> Picture:
-    """Add a line of text below an image."""
-    strip = np.full((24, picture.shape[1], 3), 255, np.uint8)
-    left = (picture.shape[1] - cv2.getTextSize(text, cv2.FONT_HERSHEY_SIMPLEX, 0.42, 1)[0][0]) // 2
-    cv2.putText(strip, text, (left, 16), cv2.FONT_HERSHEY_SIMPLEX, 0.42, (60, 60, 60), 1, cv2.LINE_AA)
+def captioned(picture: Picture, text: str, size: float = 1.0) -> Picture:
+    """Add a line of text below an image; size 1 is for pictures shown in full, 3 for a third of their width."""
+    strip, scale, width = np.full((round(24 * size), picture.shape[1], 3), 255, np.uint8), 0.42 * size, round(size)
+    left = (picture.shape[1] - cv2.getTextSize(text, cv2.FONT_HERSHEY_SIMPLEX, scale, width)[0][0]) // 2
+    base = round(16 * size)
+    cv2.putText(strip, text, (left, base), cv2.FONT_HERSHEY_SIMPLEX, scale, (60, 60, 60), width, cv2.LINE_AA)
     return np.concatenate([picture, strip])
 
 

@@ -54,7 +54,7 @@ def components(painter: _Painter) -> Picture:
         for sign in (-2, 2):
             coefficients = np.zeros(len(painter.basis.names))
             coefficients[0], coefficients[k] = 1, sign
-            pictures.append(captioned(painter(coefficients), f"{painter.basis.names[k]} at {sign:+d}"))
+            pictures.append(captioned(painter(coefficients), f"{painter.basis.names[k][-3:]} at {sign:+d}", 2.5))
     return grid(pictures, 4)
 
 
