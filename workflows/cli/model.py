@@ -115,6 +115,7 @@ def compare(
     out: Folder,
     captures: OptionalFolder = None,
     maps: Annotated[tuple[Path, ...], arg(metavar="MAP", help_behavior_hint="(optional)")] = (),
+    without_jaw: Annotated[tuple[Path, ...], arg(metavar="MODEL", help_behavior_hint="(optional)")] = (),
     settings: FaceSettings = FaceSettings(),  # noqa: B008
     jobs: Annotated[int, arg(metavar="N")] = 1,
 ) -> int:
@@ -129,13 +130,14 @@ def compare(
         out: The folder to write; results in it are kept where their input is the same.
         captures: The folder of the subjects' captures, which hold the scans; with a folder of registrations.
         maps: Maps from the first model's topology to those of the others, of `gnmreg model map`.
+        without_jaw: Further models, compared without their jaw joint: FLAME's file without the jaw, or FLAME's again.
         settings: How models are compared.
         jobs: Number of processes.
     """
     from registration.progress import console_progress
     from workflows.steps.compare import NUMBERS, PAGE, ComparisonInput, compare_models, lines
 
-    given = ComparisonInput(models=models, samples=samples, captures=captures, maps=maps)
+    given = ComparisonInput(models=models, samples=samples, captures=captures, maps=maps, without_jaw=without_jaw)
     with console_progress() as progress:
         comparison = compare_models(given, out=out, settings=settings.protocol(), jobs=jobs, progress=progress)
     print("\n".join((*lines(comparison), str(out / PAGE), str(out / NUMBERS))))

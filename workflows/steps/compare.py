@@ -26,6 +26,7 @@ from coregister.evaluate.linear_fit import LinearPart
 from coregister.evaluate.specificity import specificity_mm
 from registration.errors import InputError, check_seed
 from registration.linear_models import registry
+from registration.linear_models.options import ReadOptions
 from registration.model import gnm_npz
 from registration.model.gnm_npz import topology_hash
 from registration.progress import NullProgress, Progress
@@ -69,6 +70,7 @@ class ComparisonInput:
     samples: Path
     captures: Path | None = None
     maps: tuple[Path, ...] = ()  # from the first model's topology to the others'
+    without_jaw: tuple[Path, ...] = ()  # models that are compared without their jaw joint, besides `models`
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -171,16 +173,24 @@ def _load(given: ComparisonInput) -> _Loaded:
     reference = FaceReference.of_model(first)
     maps = {path: map_file.read(path) for path in given.maps}
     models: dict[str, ComparedModel] = {}
-    for path in given.models:
-        name = path.stem if path.stem not in models else str(path)
-        models[name] = _read_model(path, name, reference, topology, maps)
+    compared_files = [(path, ReadOptions()) for path in given.models]
+    compared_files += [(path, ReadOptions(without_jaw=True)) for path in given.without_jaw]
+    for path, options in compared_files:
+        jaw = " without jaw" if options.without_jaw else ""
+        name = f"{path.stem}{jaw}" if f"{path.stem}{jaw}" not in models else f"{path}{jaw}"
+        models[name] = _read_model(path, options, name, reference, topology, maps)
     return _Loaded(models=models, reference=reference, samples=samples)
 
 
 def _read_model(
-    path: Path, name: str, reference: FaceReference, topology: str, maps: Mapping[Path, TopologyMap]
+    path: Path,
+    options: ReadOptions,
+    name: str,
+    reference: FaceReference,
+    topology: str,
+    maps: Mapping[Path, TopologyMap],
 ) -> ComparedModel:
-    data = registry.read(path)
+    data = registry.read(path, options)
     own = topology_hash(data.triangles)
     carried = None
     if own != topology:
