@@ -3,7 +3,9 @@
 from dataclasses import replace
 
 import numpy as np
+import torch
 
+import workflows.steps.compare
 from coregister.evaluate.face_adam import AdamSettings
 from coregister.evaluate.face_data import FaceSample
 from coregister.evaluate.face_protocol import ProtocolSettings
@@ -42,13 +44,12 @@ def with_jaw(model: LinearModelData, share: np.ndarray) -> LinearModelData:
     return replace(model, joints=jaw)
 
 
-def test_a_model_is_compared_with_and_without_its_jaw(tmp_path):
+def test_a_model_is_compared_with_and_without_its_jaw(tmp_path, monkeypatch):
+    monkeypatch.setattr(workflows.steps.compare, "render_comparison_page", lambda *_: "")  # seconds of rendering
     model = spectrum_model()
     gnm_npz.write(model, tmp_path / "own.npz")
     share = regions.lower_lip_and_chin(model).astype(np.float64)
     plain_npz.write(with_jaw(from_gnm(model), share), tmp_path / "other.npz")
-    import torch
-
     R = axis_angle_to_matrix(torch.tensor([0.15, 0.0, 0.0])).numpy()
     shapes = heads(model, np.random.default_rng(0).standard_normal((2, 12)))
     pivot = np.array([0, 0.27, 0.02])
