@@ -1,6 +1,6 @@
 """Compare head models by the paper's protocol: its table, figures and every number.
 
-    python -m bench.model_table [MODEL ...] --out DIR [--captures DIR] [--people 200] [--jobs 2]
+    python -m bench.model_table [MODEL ...] --out DIR [--captures DIR] [--flame] [--people 200] [--jobs 2]
 
 The first model is compared with the others on synthetic people that no model has seen, each with the true mesh as
 registration and scan, half of them neutral; and on captures of one other topology (`--captures`: the folder of their
@@ -15,6 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
+from bench.support.flame_shaped import flame_shaped, write_flame_pickle
 from coregister.evaluate.face_adam import AdamSettings
 from coregister.evaluate.face_data import FaceSample
 from coregister.evaluate.face_protocol import NEUTRAL, ProtocolSettings
@@ -26,8 +27,9 @@ from registration.capture.native import read_capture
 from registration.capture.scan import Scan, read_scan
 from registration.capture.triangulation import triangulate
 from registration.geometry.closest_point import closest_points
+from registration.linear_models import registry
 from registration.model import gnm_npz
-from registration.model.landmarks import LandmarkScheme
+from registration.model.landmarks import LandmarkScheme, schemes_beside
 from registration.progress import console_progress
 from registration.topology_map import file as map_file
 from registration.topology_map import landmarked
@@ -105,6 +107,26 @@ def marked_scan(capture: Capture, scan: Scan) -> LandmarkedMesh:
     return landmarked.of_mesh(scan.vertices, scan.triangles, {_SCHEME: scheme}, str(capture.root))
 
 
+def marked_model(path: Path) -> LandmarkedMesh:
+    """Return a model's template with the landmarks beside its file."""
+    data = registry.read(path)
+    if data.format == "gnm":
+        return landmarked.read(path)
+    return landmarked.of_mesh(data.template, data.triangles, schemes_beside(path, data.template), path.name)
+
+
+def write_flame_shaped(out: Path) -> Path:
+    """Write a model of FLAME's shape, with a jaw joint, and return its path."""
+    path = out / "flame_shaped.pkl"
+    if not path.is_file():
+        first = build.bootstrap()
+        data = gnm_npz.read(first)
+        scheme = schemes_beside(first, data.template_vertex_positions)[_SCHEME]
+        arrays, marks = flame_shaped(data, scheme)
+        write_flame_pickle(arrays, path, marks)
+    return path
+
+
 def kept_map(source: LandmarkedMesh, target: LandmarkedMesh, file: Path) -> TopologyMap:
     """Return the map between two heads, made once."""
     if not file.is_file():
@@ -119,6 +141,7 @@ def main() -> None:
     parser.add_argument("models", nargs="*", type=Path)
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--captures", type=Path)
+    parser.add_argument("--flame", action="store_true", help="and a model of FLAME's shape, made from the first")
     parser.add_argument("--people", type=int, default=200)
     parser.add_argument("--points", type=int, default=3000)
     parser.add_argument("--adam-steps", type=int, default=5000)
@@ -132,9 +155,10 @@ def main() -> None:
     start = time.perf_counter()
     first = build.bootstrap()
     maps = []
-    for number, path in enumerate(options.models):
-        maps.append(options.out / f"map_{number}.npz")
-        kept_map(landmarked.read(first), landmarked.read(path), maps[-1])
+    models = [*options.models, *([write_flame_shaped(options.out)] if options.flame else [])]
+    for path in models:
+        maps.append(options.out / f"map_{path.stem}.npz")
+        kept_map(landmarked.read(first), marked_model(path), maps[-1])
     captured = list(captured_samples(options.captures, first, options.out)) if options.captures else []
     samples = (*captured, *synthetic_samples(options.people))
     file = options.out / "samples.npz"
@@ -147,7 +171,7 @@ def main() -> None:
         curve_samples=options.curve_samples,
         random_heads=options.random_heads,
     )
-    given = ComparisonInput(models=(first, *options.models), samples=file, maps=tuple(maps))
+    given = ComparisonInput(models=(first, *models), samples=file, maps=tuple(maps))
     with console_progress() as progress:
         comparison = compare_models(
             given, out=options.out / "comparison", settings=settings, jobs=options.jobs, progress=progress

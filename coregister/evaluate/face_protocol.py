@@ -37,7 +37,7 @@ class ProtocolSettings:
     Attributes:
         points: points of each scan to fit, and as many others to measure at.
         adam: the paper's optimizer.
-        adam_samples: samples, the first ones, of which Adam fits the scan too; it fits the meshes of all.
+        adam_samples: samples, the first ones, that Adam fits too, both stages.
         components: numbers of components of the generalization curves; all are added.
         curve_samples: neutrals, and expressions, the first ones, of these curves.
         random_heads: for specificity.
@@ -70,9 +70,9 @@ class ProtocolSettings:
 
 @dataclass(frozen=True, kw_only=True)
 class SampleTasks:
-    """What is computed of a sample besides least squares and stage 1 by Adam."""
+    """What is computed of a sample besides both stages by least squares."""
 
-    adam_scan: bool = False
+    adam: bool = False
     curve: bool = False
 
 
@@ -130,10 +130,9 @@ def evaluate_sample(
     mesh, scan = RegisteredStage(model=face, rows=face.face, target=target), ScanStage(model=face, points=points.fit)
     first = fit_registered(mesh)
     fits = {"stage1": first, "stage2": least_squares(scan, first)}
-    if settings.adam.steps:
+    if settings.adam.steps and tasks.adam:
         fits["adam_stage1"] = adam(mesh, mesh.start(), settings.adam)
-        if tasks.adam_scan:
-            fits["adam_stage2"] = adam(scan, fits["adam_stage1"], settings.adam)
+        fits["adam_stage2"] = adam(scan, fits["adam_stage1"], settings.adam)
     curves = _curves(sample.category, face, target, points, reference, settings) if tasks.curve else {}
     stages = {name: mesh if name.endswith("1") else scan for name in fits}
     return SampleResult(
@@ -186,5 +185,5 @@ def planned_tasks(samples: list[FaceSample], settings: ProtocolSettings) -> list
         neutral = sample.category == NEUTRAL
         curve = seen[neutral] < settings.curve_samples
         seen[neutral] += 1
-        tasks.append(SampleTasks(adam_scan=number < settings.adam_samples, curve=curve))
+        tasks.append(SampleTasks(adam=number < settings.adam_samples, curve=curve))
     return tasks

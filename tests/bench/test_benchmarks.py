@@ -54,6 +54,13 @@ def test_a_tiny_case_runs_to_its_figures(name, arguments, figure):
     assert figure in done.stdout
 
 
+def test_model_table_compares_the_first_model(tmp_path):
+    sizes = ("--people", "2", "--points", "300", "--adam-steps", "20", "--random-heads", "2", "--jobs", "1")
+    done = run("model_table", "--out", str(tmp_path), *sizes, "--curve-samples", "0")
+    assert done.returncode == 0, done.stderr[-2000:]
+    assert "gnm_head_first, stage2: mean" in done.stdout and "region nose" in done.stdout
+
+
 @needs_shared
 def test_without_identity_writes_a_model(tmp_path):
     out = tmp_path / "model.npz"

@@ -61,7 +61,7 @@ class FaceSettings:
         curve_samples: Neutrals, and expressions, of these curves.
         adam_steps: Steps of Adam in each stage, as a check of the least squares; 0: none.
         adam_rate: Learning rate of Adam.
-        adam_samples: Scans that Adam fits; it fits the registered meshes of all.
+        adam_samples: Registered scans that Adam fits too.
         random_heads: Random heads of each model, for specificity; 0: no specificity.
         seed: Seed of points and random heads.
     """

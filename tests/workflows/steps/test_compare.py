@@ -8,11 +8,17 @@ import numpy as np
 import pytest
 
 import workflows.steps.compare
+from bench.support.flame_shaped import flame_shaped, write_flame_npz
 from coregister.evaluate.face_adam import AdamSettings
 from coregister.evaluate.face_data import FaceSample
 from coregister.evaluate.face_protocol import ProtocolSettings
 from registration.errors import InputError
+from registration.geometry.closest_point import closest_points
 from registration.model import gnm_npz
+from registration.model.landmarks import read_scheme
+from registration.topology_map import file as map_file
+from registration.topology_map.topology_map import SurfacePoints, TopologyMap
+from tests.conftest import FIXTURES
 from tests.coregister.spectrum import heads, spectrum_model, with_identity
 from workflows.cli.app import main
 from workflows.records.face_samples import read_samples, write_samples
@@ -96,6 +102,38 @@ def test_refusals_come_before_the_work(given, tmp_path):
         compare_models(given, out=tmp_path / "mine")
     with pytest.raises(InputError, match="no registered scans"):
         read_samples(tmp_path)
+
+
+def nearest_map(source, target) -> TopologyMap:
+    """The map between two meshes that lie on one another."""
+
+    def points(a, b) -> SurfacePoints:
+        distance, face, share = closest_points(a[0], *b)
+        known, zeros = np.ones(len(face), bool), np.zeros((len(face), 3))
+        return SurfacePoints(triangle=face, barycentric=share, distance_m=distance, mask=known, offset=zeros)
+
+    still = {"scale": 1.0, "rotation": np.eye(3), "translation": np.zeros(3), "figures": {}}
+    topologies = {"source_triangles": source[1], "target_triangles": target[1]}
+    return TopologyMap(**topologies, points=points(target, source), back=points(source, target), **still)
+
+
+@pytest.mark.slow
+def test_a_model_of_flames_shape_goes_through(given, tmp_path):
+    model = spectrum_model()
+    template = model.template_vertex_positions.astype(np.float64)
+    marks = read_scheme(FIXTURES / "head_sparse_68.txt", template)
+    arrays, scheme = flame_shaped(model, marks)
+    write_flame_npz(arrays, tmp_path / "flame.npz", scheme)
+    own = template, model.triangles.astype(np.int64)
+    map_file.write(nearest_map(own, (arrays["v_template"], arrays["f"].astype(np.int64))), tmp_path / "map.npz")
+    with_flame = replace(given, models=(given.models[0], tmp_path / "flame.npz"), maps=(tmp_path / "map.npz",))
+    settings = replace(SETTINGS, curve_samples=1, adam=AdamSettings(steps=0))
+    comparison = compare_models(with_flame, out=tmp_path / "out", settings=settings)
+    assert comparison.models == ("own", "flame")
+    first, second = (comparison.row("flame", stage).mean.mean for stage in ("stage1", "stage2"))
+    assert comparison.row("own", "stage2").mean.mean < second < 1.1 * first < 2
+    assert {curve.part for curve in comparison.curves if curve.model == "flame"} >= {"identity"}
+    assert (tmp_path / "out" / PAGE).is_file()
 
 
 def test_the_command(given, tmp_path, capsys):
