@@ -1,12 +1,13 @@
 """Non-rigid ICP [Amberg 2007] in displacements: a mesh is bent onto another surface, from stiff to soft.
 
 Amberg gives each vertex an affine map and penalises differences of neighbours'; affine motions of the whole are free.
-Here the bi-Laplacian of the displacement is penalised, with the same free motions and a quarter of the unknowns: a
-factorization of 11,460 vertices takes 0.6 s instead of 7.7. Stiffness is a length: what is smaller keeps its shape.
+Here the bi-Laplacian of the displacement is penalised, from step to step, with the same free motions and a quarter of
+the unknowns: a factorization of 11,460 vertices takes 0.6 s instead of 7.7. Stiffness is a length: what is smaller
+keeps its shape.
 See docs/algorithms.md, "Maps between topologies".
 """
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
@@ -20,7 +21,8 @@ from registration.geometry.large_steps import normalised_laplacian, spacing
 from registration.geometry.topology import boundary_vertices, vertex_areas, vertex_normals
 
 _ON_EDGE = 1e-4  # a barycentric weight below it: the closest point lies on the opposite edge
-_TOLERANCE = 1e-4  # relative, of the linear systems
+_OUTLIER = 2.0  # times the median residual: landmarks that are farther away count little
+_TOLERANCE = 1e-3  # relative, of the linear systems
 _MAX_ITERATIONS = 200  # of a linear system
 _FLOOR = 1e-6  # pull of every vertex to where it is, of the weight of data: parts without data have a solution
 
@@ -33,17 +35,16 @@ class Rung:
     landmarks: float  # weight of a landmark, in square centimetres of skin
     reach_m: float  # closest points that are farther away are rejected
     facing: float  # least cosine between the normals
+    whole: bool = False  # also with what is left out later, as ears: a stiff mesh cannot fold there, and they anchor it
 
 
 LADDER = (
-    Rung(length_m=0.150, landmarks=20.0, reach_m=0.050, facing=0.3),
-    Rung(length_m=0.080, landmarks=10.0, reach_m=0.030, facing=0.4),
-    Rung(length_m=0.050, landmarks=5.0, reach_m=0.020, facing=0.5),
-    Rung(length_m=0.030, landmarks=2.0, reach_m=0.015, facing=0.5),
-    Rung(length_m=0.020, landmarks=1.0, reach_m=0.010, facing=0.6),
-    Rung(length_m=0.012, landmarks=0.5, reach_m=0.010, facing=0.6),
-    Rung(length_m=0.008, landmarks=0.2, reach_m=0.008, facing=0.6),
-    Rung(length_m=0.005, landmarks=0.0, reach_m=0.008, facing=0.6),
+    Rung(length_m=0.150, landmarks=30.0, reach_m=0.050, facing=0.3, whole=True),
+    Rung(length_m=0.080, landmarks=20.0, reach_m=0.032, facing=0.5, whole=True),
+    Rung(length_m=0.050, landmarks=10.0, reach_m=0.020, facing=0.5, whole=True),
+    Rung(length_m=0.030, landmarks=5.0, reach_m=0.012, facing=0.5, whole=True),
+    Rung(length_m=0.020, landmarks=2.0, reach_m=0.008, facing=0.5, whole=True),
+    Rung(length_m=0.012, landmarks=1.0, reach_m=0.008, facing=0.5),
 )
 
 
@@ -53,9 +54,10 @@ class IcpSettings:
 
     ladder: tuple[Rung, ...] = LADDER
     steps: int = 3  # of each rung
-    tangential: float = 0.1  # weight of distance along the surface; that across it has 1
+    tangential: float = 0.001  # weight of distance along the surface, on the ladder; that across it has 1
     rounds: int = 10  # point to plane, at the end
-    round_length_m: float = 0.004  # over which their displacements may vary
+    round_tangential: float = 0.1
+    round_lengths_m: tuple[float, float] = (0.004, 0.0005)  # of the first and the last; geometric between them
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -67,7 +69,8 @@ class Hits:
     barycentric: Float[np.ndarray, "P 3"]
     points: Float[np.ndarray, "P 3"]
     normals: Float[np.ndarray, "P 3"]  # interpolated, unit or zero
-    usable: Bool[np.ndarray, "P"]  # neither where the surface ends, nor on a face that is left out
+    inside: Bool[np.ndarray, "P"]  # not where the surface ends
+    usable: Bool[np.ndarray, "P"]  # nor on a face that is left out
 
 
 class Surface:
@@ -91,13 +94,15 @@ class Surface:
         distance, face, share = self._query.closest(points)
         across = barycentric_points(self._normals, self.triangles, face, share)
         length = np.linalg.norm(across, axis=1, keepdims=True)
+        inside = ~(self._border[self.triangles[face]] | (share < _ON_EDGE)).all(1)
         return Hits(
             distance=distance,
             face=face,
             barycentric=share,
             points=barycentric_points(self.vertices, self.triangles, face, share),
             normals=across / np.maximum(length, 1e-20),
-            usable=self._members[face] & ~(self._border[self.triangles[face]] | (share < _ON_EDGE)).all(1),
+            inside=inside,
+            usable=self._members[face] & inside,
         )
 
 
@@ -113,9 +118,10 @@ class Bent:
     vertices: Float[np.ndarray, "V 3"]
     triangles: Int[np.ndarray, "F 3"]
     data: Bool[np.ndarray, "V"]  # vertices that are drawn to the surface; the others follow
-    landmarks: csr_matrix = field(default_factory=lambda: csr_matrix((0, 0)))  # (L, V): weights of the vertices
-    marks: Float[np.ndarray, "L 3"] = field(default_factory=lambda: np.zeros((0, 3)))  # where they belong
-    trust: Float[np.ndarray, "L"] = field(default_factory=lambda: np.zeros(0))  # weights relative to one another
+    whole: Bool[np.ndarray, "V"]  # likewise, on rungs for the whole
+    landmarks: csr_matrix  # (L, V): weights of the vertices
+    marks: Float[np.ndarray, "L 3"]  # where they belong
+    trust: Float[np.ndarray, "L"]  # weights relative to one another
 
     @cached_property
     def areas(self) -> Float[np.ndarray, "V"]:
@@ -148,27 +154,31 @@ def bend(mesh: Bent, surface: Surface, settings: IcpSettings) -> Float[np.ndarra
     Returns:
         The bent vertices.
     """
-    moved = np.zeros_like(mesh.vertices)
+    bent = mesh.vertices
     for rung in settings.ladder:
-        system = _System.of(mesh, rung.length_m, rung.landmarks)
+        data = mesh.whole if rung.whole else mesh.data
+        system = _System.of(mesh, rung.length_m, data, rung.landmarks * _trust(mesh, bent))
         for _ in range(settings.steps):
-            now = mesh.vertices + moved
-            hits = surface.closest(now)
-            kept = mesh.data & _kept(hits, normals(now, mesh.triangles), rung)
-            moved = system.solve(hits.points - mesh.vertices, hits.normals, kept, settings.tangential, moved)
-    bent = mesh.vertices + moved
+            bent = bent + system.step(bent, surface, rung, settings.tangential)
     last = settings.ladder[-1]
-    system = _System.of(mesh, settings.round_length_m, 0.0)
-    for _ in range(settings.rounds):  # only what is added is smooth: the distance goes to zero
-        hits = surface.closest(bent)
-        kept = mesh.data & _kept(hits, normals(bent, mesh.triangles), last)
-        bent = bent + system.solve(hits.points - bent, hits.normals, kept, 0.0, np.zeros_like(bent))
+    for length_m in np.geomspace(*settings.round_lengths_m, settings.rounds):
+        system = _System.of(mesh, length_m, mesh.data, 0 * mesh.trust)
+        bent = bent + system.step(bent, surface, last, settings.round_tangential)
     return bent
+
+
+def _trust(mesh: Bent, bent: Float[np.ndarray, "V 3"]) -> Float[np.ndarray, "L"]:
+    """The landmarks' weights by Geman and McClure's function: some mark an outline, and lie elsewhere on each head."""
+    if not len(mesh.trust):
+        return mesh.trust
+    residual = np.linalg.norm(mesh.landmarks @ bent - mesh.marks, axis=1)
+    usual = _OUTLIER * float(np.median(residual)) + 1e-9
+    return mesh.trust / np.square(1 + np.square(residual / usual))
 
 
 def _kept(hits: Hits, direction: Float[np.ndarray, "V 3"], rung: Rung) -> Bool[np.ndarray, "V"]:
     facing = np.einsum("vc,vc->v", hits.normals, direction) > rung.facing
-    return facing & hits.usable & (hits.distance < rung.reach_m)
+    return facing & (hits.inside if rung.whole else hits.usable) & (hits.distance < rung.reach_m)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -176,33 +186,33 @@ class _System:
     """The normal equations of one stiffness. They differ from step to step by which vertices have data."""
 
     mesh: Bent
+    data: Bool[np.ndarray, "V"]
+    marked: csr_matrix  # (V, L): the landmarks' weights, transposed, times those of their squares
     regular: csr_matrix  # (V, V), of each coordinate
-    right: Float[np.ndarray, "V 3"]  # of the landmarks
     factor: SuperLU  # with data at all vertices that may have some: preconditions all steps
 
     @classmethod
-    def of(cls, mesh: Bent, length_m: float, landmarks: float) -> "_System":
+    def of(
+        cls, mesh: Bent, length_m: float, data: Bool[np.ndarray, "V"], landmarks: Float[np.ndarray, "L"]
+    ) -> "_System":
+        marked = (mesh.landmarks.T @ diags(1e-4 * landmarks)).tocsr()
         regular = length_m**4 * mesh.energy + _FLOOR * diags(mesh.areas)
-        right = np.zeros_like(mesh.vertices)
-        if landmarks and len(mesh.trust):
-            weighted = mesh.landmarks.T @ diags(1e-4 * landmarks * mesh.trust)
-            regular = regular + weighted @ mesh.landmarks
-            right = weighted @ (mesh.marks - mesh.landmarks @ mesh.vertices)
-        pulled = (regular + diags(0.4 * mesh.areas * mesh.data)).tocsc()
+        if landmarks.any():
+            regular = regular + marked @ mesh.landmarks
+        pulled = (regular + diags(0.4 * mesh.areas * data)).tocsc()
         factor = splu(pulled, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
-        return cls(mesh=mesh, regular=regular.tocsr(), right=np.asarray(right), factor=factor)
+        return cls(mesh=mesh, data=data, marked=marked, regular=regular.tocsr(), factor=factor)
 
-    def solve(
-        self,
-        target: Float[np.ndarray, "V 3"],
-        across: Float[np.ndarray, "V 3"],
-        kept: Bool[np.ndarray, "V"],
-        tangential: float,
-        start: Float[np.ndarray, "V 3"],
+    def step(
+        self, now: Float[np.ndarray, "V 3"], surface: Surface, rung: Rung, tangential: float
     ) -> Float[np.ndarray, "V 3"]:
-        """Find displacements d: min sum a ((n (d - t))^2 + s |d - t|^2) + the regular part, by conjugate gradients."""
-        weight = (self.mesh.areas * kept)[:, None]
-        shape = target.shape
+        """Find displacements d: min sum a ((n (d - t))^2 + s |d - t|^2) + landmarks + the energy of d.
+
+        Only what is added is smooth, so that distances go to zero from step to step.
+        """
+        hits = surface.closest(now)
+        kept = self.data & _kept(hits, normals(now, self.mesh.triangles), rung)
+        weight, across, shape = (self.mesh.areas * kept)[:, None], hits.normals, now.shape
 
         def data(d: np.ndarray) -> np.ndarray:
             return weight * ((1 - tangential) * across * (across * d).sum(1, keepdims=True) + tangential * d)
@@ -211,13 +221,12 @@ class _System:
             d = flat.reshape(shape)
             return np.asarray(self.regular @ d + data(d)).ravel()
 
-        size = (target.size, target.size)
+        right = data(hits.points - now) + self.marked @ (self.mesh.marks - self.mesh.landmarks @ now)
         solution, _ = cg(
-            LinearOperator(size, product, dtype=np.float64),
-            (data(target) + self.right).ravel(),
-            x0=start.ravel(),
+            LinearOperator((now.size, now.size), product, dtype=np.float64),
+            np.asarray(right).ravel(),
             rtol=_TOLERANCE,
             maxiter=_MAX_ITERATIONS,
-            M=LinearOperator(size, lambda r: self.factor.solve(r.reshape(shape)).ravel(), dtype=np.float64),
+            M=LinearOperator((now.size, now.size), lambda r: self.factor.solve(r.reshape(shape)).ravel(), np.float64),
         )
         return np.asarray(solution).reshape(shape)

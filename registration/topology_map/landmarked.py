@@ -31,6 +31,7 @@ class LandmarkedMesh:
     triangles: Int[np.ndarray, "F 3"]
     schemes: Mapping[str, LandmarkScheme]
     members: Bool[np.ndarray, "V"]  # the outer surface that a map is made on
+    whole: Bool[np.ndarray, "V"]  # that with ears and rims, which find the place of the head
     parts: Mapping[str, Bool[np.ndarray, "V"]] = field(default_factory=dict)  # components of the mesh; `skin` is one
 
     @property
@@ -60,6 +61,7 @@ def of_model(data: GNMData, schemes: Mapping[str, LandmarkScheme], name: str) ->
         triangles=triangles,
         schemes={**shipped_schemes(data), **schemes},
         members=regions.outer_surface(data) & ~_cavities(vertices, triangles),
+        whole=regions.exterior(data),
         parts=parts,
     )
 
@@ -81,7 +83,7 @@ def of_mesh(
         unit_m: metres of the vertices' unit, roughly.
     """
     triangles = triangles.astype(np.int64)
-    labels = connected_parts(triangles)
+    labels, cavities = connected_parts(triangles), _cavities(unit_m * vertices, triangles)
     skin = np.zeros(len(vertices), bool)
     skin[triangles[labels == np.bincount(labels).argmax()]] = True
     return LandmarkedMesh(
@@ -89,7 +91,8 @@ def of_mesh(
         vertices=vertices.astype(np.float64),
         triangles=triangles,
         schemes=dict(schemes),
-        members=skin & ~_cavities(unit_m * vertices, triangles),
+        members=skin & ~cavities,
+        whole=skin,
         parts={_SKIN: skin},
     )
 

@@ -144,6 +144,7 @@ def _bent(
         vertices=start[rows],
         triangles=triangles,
         data=target.members[rows],
+        whole=target.whole[rows],
         landmarks=marks.on_target[:, rows],
         marks=marks.points,
         trust=marks.trust,

@@ -33,11 +33,13 @@ from registration.linear_models import registry as linear_models
 from registration.model import gnm_npz, gnmw
 from registration.model.landmarks import read_scheme
 from registration.storage.registration_folder import load_registration, read_manifest
+from registration.topology_map import file as topology_map
 from registration.types import Camera, View
 from tests.conftest import FIXTURES
 from tests.fixtures.malformed.sandbox import make_templates
 from tests.registration.cranium.smooth_heads import auxiliary_model as auxiliary
 from tests.registration.cranium.smooth_heads import tiny
+from tests.registration.topology_map.small_map import small_map
 from tests.workflows.records.plan import PLAN
 from workflows.records.coregistration import CoregistrationPlan, CoregistrationState, initial_state
 from workflows.records.dataset import DatasetRecord
@@ -85,6 +87,7 @@ def valid(tmp_path_factory: pytest.TempPathFactory) -> Path:
     faces = "element face 2\nproperty list uchar int vertex_indices\nend_header\n"
     gnmw.write(gnmw.web_model(gnm_npz.read(folder / "tiny_gnm.npz")), folder / "tiny_gnm.gnmw")
     auxiliary_model.write(auxiliary(), folder / "head_cranium.npz")
+    topology_map.write(small_map(), folder / "map.npz")
     (folder / "text.ply").write_text(header + faces + rows + "3 0 1 2\n4 3 4 5 6\n")
     ball = trimesh.creation.icosphere(subdivisions=1)
     for suffix in ("obj", "glb"):
@@ -156,6 +159,7 @@ READERS: dict[str, tuple[str, Reader]] = {  # name -> the file that is mutated, 
         for name in ("plain.npz", "flame.pkl", "flame.npz", "basel.h5", "lsfm.mat", "lsfm_7_3.mat")
     },
     "model ict": ("others/ict/identity001.obj", lambda file: linear_models.read(file.parent)),
+    "topology map": ("map.npz", topology_map.read),
     "scheme": ("head_sparse_68.txt", lambda file: read_scheme(file, np.zeros((3000, 3)))),
     "manifest": ("registration/manifest.json", lambda file: read_manifest(file.parent)),
     "history": ("registration/history.json", lambda file: load_registration(file.parent)),
@@ -272,7 +276,7 @@ def test_other_values_in_json_are_read_or_refused(valid, name, where, new):
 DTYPES = ("<f4", ">f8", "<f2", "<i8", "|u1", "|b1", "<U3", "<c8", "<M8[s]")
 
 
-@pytest.mark.parametrize("name", ["truth", "arrays", "held out", "model", "tongue arrays"])
+@pytest.mark.parametrize("name", ["truth", "arrays", "held out", "model", "tongue arrays", "topology map"])
 @given(
     where=place, dtype=st.sampled_from(DTYPES), shape=st.lists(st.integers(0, 5), max_size=4), fill=st.integers(0, 9)
 )
