@@ -194,7 +194,7 @@ def cranium(
         model: The head model, a GNM NPZ file.
         out: The file to write; by default head_cranium.npz beside the model.
         heads: Folder of at least 30 whole heads in the model's topology, meshes or registrations. By default people
-            of MakeHuman's CC0 population, which the first model's topology has.
+            of MakeHuman's CC0 population, carried to the model's topology if it is not the first model's.
         count: Number of MakeHuman's people.
         seed: Seed of MakeHuman's people.
     """

@@ -5,6 +5,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
+from coregister.anatomy.carried_heads import carry_heads
 from coregister.anatomy.cranium_model import MIN_HEADS, build_cranium_model
 from coregister.anatomy.head_meshes import read_heads
 from registration.cranium.auxiliary_model import CraniumModel, beside, write
@@ -12,8 +13,10 @@ from registration.errors import InputError, check_seed
 from registration.frames import MM_PER_M
 from registration.model import gnm_npz
 from registration.model.gnm_npz import GNMData
+from registration.model.landmarks import schemes_beside
 from registration.progress import NullProgress, Progress
 from registration.storage.files import check_output_file
+from registration.topology_map.landmarked import of_model
 
 
 def make_cranium_model(
@@ -30,8 +33,8 @@ def make_cranium_model(
     Args:
         model: the head model.
         out: the file to write; None: beside the model, where registrations find it.
-        heads: folder of whole heads in the model's topology; None: people of MakeHuman's population, which only the
-            first model's topology has.
+        heads: folder of whole heads in the model's topology; None: people of MakeHuman's population, carried
+            to the model's topology by a map from the first model's.
         count: of the people.
         seed: of the people.
         progress: where to report to.
@@ -40,8 +43,8 @@ def make_cranium_model(
         The file and what it holds.
 
     Raises:
-        InputError: the model is no GNM file, a head cannot be used, there are fewer than 30, or the topology is not the
-            first model's and there is no folder of heads.
+        InputError: the model is no GNM file, a head cannot be used, there are fewer than 30, or the map
+            from the first model's topology is refused and there is no folder of heads.
     """
     progress = progress or NullProgress()
     check_seed(seed, "--seed")
@@ -55,7 +58,7 @@ def make_cranium_model(
             what = "There are too few heads for an auxiliary model of the cranium"
             expected = f"at least {MIN_HEADS} heads"
             raise InputError(what, where="--count", expected=expected, got=count, fix="sample more people")
-        people = _population(model, data, count, seed, progress)
+        people = _population(Path(model), data, count, seed, progress)
         progress.message("choosing rank and noise by leave-one-out")
         built = build_cranium_model(data, people, seed=seed, source="MakeHuman's population (CC0)")
     write(built, out)
@@ -77,13 +80,13 @@ def _population(model: Path, data: GNMData, count: int, seed: int, progress: Pro
     from coregister.synthetic.neutral_heads import neutral_heads
 
     progress.message("sampling people")
-    first = gnm_npz.read(bootstrap())
-    if gnm_npz.topology_hash(first.triangles) != gnm_npz.topology_hash(data.triangles):
-        raise InputError(
-            "There are no heads of this topology",
-            where=model,
-            expected="the first model's topology, which MakeHuman's people have, or a folder of heads",
-            got=f"another topology, of {len(data.template_vertex_positions)} vertices",
-            fix=f"give --heads FOLDER with at least {MIN_HEADS} whole heads in the model's topology",
-        )
-    return neutral_heads(count, seed)
+    path = bootstrap()
+    first, people = gnm_npz.read(path), neutral_heads(count, seed)
+    if gnm_npz.topology_hash(first.triangles) == gnm_npz.topology_hash(data.triangles):
+        return people
+    progress.message("carrying them to the model's topology")
+    source, target = (
+        of_model(mesh, schemes_beside(file, mesh.template_vertex_positions), file.name)
+        for mesh, file in ((first, path), (data, model))
+    )
+    return carry_heads(people, source, target)
