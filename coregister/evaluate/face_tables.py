@@ -1,7 +1,7 @@
 """Tables and curves of the face protocol over all samples, with confidence intervals by bootstrap over subjects.
 
-Distances are pooled over points as in [GNM, Quantitative evaluation]; every sample has equal weight. The interval of a
-mean is over subjects; median and standard deviation have none.
+Distances are pooled over points as in [GNM, Generalization to Novel Shapes]; every sample has equal weight. The
+interval of a mean is over subjects; median and standard deviation have none.
 """
 
 from collections.abc import Iterable, Mapping, Sequence

@@ -283,7 +283,7 @@ def head_regions(data: GNMData) -> dict[str, Bool[np.ndarray, "V"]]:
 
 
 _CHEEK = ("cheek", "infraorbital", "zygomatic")
-_COMMON_AREAS = {  # of [GNM, Quantitative evaluation] -> official vertex groups
+_COMMON_AREAS = {  # of [GNM, Generalization to Novel Shapes] -> official vertex groups
     "nose": ("nose_region",),
     "mouth": ("upper_lip", "lower_lip", "upper_lip_region", "lower_lip_region"),
     "eyes": ("left_orbital_region", "right_orbital_region"),

@@ -16,7 +16,7 @@ from registration.report.heat_map import scale_limit_mm
 from registration.report.inputs import HeatMap
 from workflows.pages.base import heat_images, render
 
-PAPER = (  # [GNM, Quantitative evaluation]: mean, median, standard deviation on 15,000 scans, mm
+PAPER = (  # [GNM, Generalization to Novel Shapes]: mean, median, standard deviation on 15,000 scans, mm
     ("GNM, 15,000 scans of the paper", 0.748, 0.623, 0.529),
     ("FLAME, the same scans", 0.971, 0.780, 0.734),
     ("FLAME without jaw joint, the same scans", 0.968, 0.779, 0.729),
