@@ -46,6 +46,7 @@ def test_no_module_has_the_name_of_a_standard_library_module_and_no_benchmark_im
         ("landmark_fit", ("--only", "schur", "--count", "2"), "2 of 2 limits kept"),
         ("model_building", ("--samples", "60", "--components", "5"), "peak_gb"),
         ("renderer", ("--case", "2x48", "--stock"), "stock 2x256"),
+        ("sampler", ("--only", "collapse", "--count", "400", "--steps", "60"), "status: collapsed"),
     ],
 )
 def test_a_tiny_case_runs_to_its_figures(name, arguments, figure):

@@ -32,6 +32,7 @@ from workflows.cli import (
     importing,
     model,
     register,
+    sampler,
     stabilize,
     stereo,
     store,
@@ -87,6 +88,8 @@ GROUPS: Mapping[str, Mapping[str, Command]] = {
         "model export": model.export,
         "model evaluate": model.evaluate,
         "model compare": model.compare,
+        "sampler train": sampler.train,
+        "sample": sampler.sample,
     },
     "Farm": {
         "worker": farm.worker,

@@ -22,6 +22,8 @@ from hypothesis import strategies as st
 from coregister.anatomy.tongue_keypoints import read_recording
 from coregister.evaluate.face_data import FaceSample
 from coregister.evaluate.face_protocol import SampleResult
+from coregister.sampler.keras_decoder import read_decoder
+from coregister.sampler.storage import read_sampler
 from registration.capture import pixels
 from registration.capture.colmap import read_cameras, read_points
 from registration.capture.landmark_files import read_landmarks
@@ -36,6 +38,8 @@ from registration.storage.registration_folder import load_registration, read_man
 from registration.topology_map import file as topology_map
 from registration.types import Camera, View
 from tests.conftest import FIXTURES
+from tests.coregister.sampler.hdf5_decoder import write_decoder
+from tests.coregister.sampler.made import write_sampler
 from tests.fixtures.malformed.sandbox import make_templates
 from tests.registration.cranium.smooth_heads import auxiliary_model as auxiliary
 from tests.registration.cranium.smooth_heads import tiny
@@ -67,6 +71,8 @@ def valid(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = make_templates(tmp_path_factory.mktemp("mutated") / "valid")
     initial_state(PLAN).write(folder / "coregistration.json")
     PLAN.write(folder / "plan.json")
+    write_sampler(folder / "sampler")
+    write_decoder(folder / "decoder.h5", (84, 8, 12))
     recording = ImportRow(folder="ann/smile", source="017/EXP-1", format="nersemble", frame=3, status="imported")
     origin = DatasetImportRecord(source=Path("/data"), frames=(3,), neutral="EXP-1", unit=None, rows=(recording,))
     origin.write(folder / "import.json")
@@ -176,6 +182,9 @@ READERS: dict[str, tuple[str, Reader]] = {  # name -> the file that is mutated, 
     "result of a sample": ("face_result.npz", lambda file: read_result(file, "key")),
     "tongue": ("tongue.csv", read_recording),
     "tongue arrays": ("tongue.npz", read_recording),
+    "sampler": ("sampler/sampler.json", lambda file: read_sampler(file.parent)),
+    "sampler's arrays": ("sampler/sampler.safetensors", lambda file: read_sampler(file.parent)),
+    "decoder": ("decoder.h5", read_decoder),
     "artifact": ("store/run/a/b/artifact.json", lambda file: Store(file.parents[3]).find("run/a/b")),
 }
 place = st.floats(0, 1, exclude_max=True)

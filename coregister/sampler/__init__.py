@@ -1,0 +1,1 @@
+"""The semantic sampler: coefficients drawn by named categories [GNM, Semantically Sampling GNM]."""
