@@ -1,13 +1,45 @@
 """`gnmreg sampler train` and `gnmreg sample`: heads by named categories."""
 
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
 from tyro.conf import Positional, arg
 
+from registration.errors import InputError
 from workflows.cli.options import NOT_SET, Folder, ModelFile, OptionalFolder, Seed
 
 Weights = Annotated[str | None, arg(metavar="NAME[=W],...", help_behavior_hint=NOT_SET)]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Categories:
+    """The categories of the heads that are drawn.
+
+    Attributes:
+        gender: One category, or a blend of several; by default a random one of each head. Weights are scaled to the
+            sum 1.
+        ethnicity: As the gender.
+        expression: As the gender; by default neutral.
+        factor: Categories of other factors that the sampler was trained with.
+    """
+
+    gender: Weights = None
+    ethnicity: Weights = None
+    expression: Weights = None
+    factor: Annotated[tuple[str, ...], arg(metavar="FACTOR:NAME[=W],...", help_behavior_hint=NOT_SET)] = ()
+
+    def by_factor(self) -> dict[str, str]:
+        """Return factor -> its categories and weights, as they were given. Raises InputError."""
+        given = {"gender": self.gender, "ethnicity": self.ethnicity, "expression": self.expression}
+        wanted = {name: text for name, text in given.items() if text is not None}
+        for entry in self.factor:
+            name, colon, text = entry.partition(":")
+            if not colon or name in wanted:
+                fix, expected = "give each factor once", "FACTOR:NAME or FACTOR:NAME=WEIGHT,..."
+                raise InputError("A factor cannot be read", where="--factor", expected=expected, got=entry, fix=fix)
+            wanted[name] = text
+        return wanted
 
 
 def train(
@@ -52,10 +84,7 @@ def sample(
     sampler: Annotated[Path, arg(metavar="SAMPLER")],
     model: ModelFile,
     out: Folder,
-    gender: Weights = None,
-    ethnicity: Weights = None,
-    expression: Weights = None,
-    factor: Annotated[tuple[str, ...], arg(metavar="FACTOR:NAME[=W],...", help_behavior_hint=NOT_SET)] = (),
+    categories: Categories = Categories(),
     count: Annotated[int, arg(metavar="N")] = 12,
     seed: Seed = 0,
 ) -> int:
@@ -67,28 +96,15 @@ def sample(
         sampler: A folder that `gnmreg sampler train` wrote; or Google's decoders, one HDF5 file or the folder of both.
         model: The head model, a GNM NPZ file.
         out: The folder to write; one that this command wrote before is replaced.
-        gender: One category, or a blend of several; by default a random one of each head. Weights are scaled to the
-            sum 1.
-        ethnicity: As the gender.
-        expression: As the gender; by default neutral.
-        factor: Categories of other factors that the sampler was trained with.
+        categories: Of the heads.
         count: Number of heads.
         seed: Seed of everything random.
     """
     from coregister.sampler.sampling import SampleSettings
-    from registration.errors import InputError
     from registration.progress import console_progress
     from workflows.steps.sampler import sample as draw
 
-    given = {"gender": gender, "ethnicity": ethnicity, "expression": expression}
-    wanted = {name: text for name, text in given.items() if text is not None}
-    for entry in factor:
-        name, colon, text = entry.partition(":")
-        if not colon or name in wanted:
-            fix, expected = "give each factor once", "FACTOR:NAME or FACTOR:NAME=WEIGHT,..."
-            raise InputError("A factor cannot be read", where="--factor", expected=expected, got=entry, fix=fix)
-        wanted[name] = text
-    settings = SampleSettings(wanted=wanted, count=count, seed=seed)
+    settings = SampleSettings(wanted=categories.by_factor(), count=count, seed=seed)
     with console_progress() as progress:
         drawn = draw(sampler, model, out, settings, progress)
     for remark in drawn.remarks:
