@@ -1,4 +1,4 @@
-"""The conditional variational autoencoders of identities and expressions [GNM, Network Architecture and Layer
+"""The conditional variational autoencoders of identities and expressions [GNM, Network Architecuture and Layer
 Specifications]."""
 
 from collections.abc import Sequence
