@@ -33,7 +33,7 @@ def describe(
     if out is not None:
         if out.suffix.lower() != ".html":
             raise InputError(
-                "The page has no name of a page",
+                "The name of the page does not end in .html",
                 where="out",
                 expected="a file name that ends in .html",
                 got=out.name,
