@@ -20,6 +20,7 @@ from registration.frames import MM_PER_M
 
 _DECAY, _SQUARE_DECAY, _EPSILON = 0.9, 0.999, 1e-8
 _SINGULAR = 1e-8  # of the largest eigenvalue: smaller ones are rounding
+_UNMOVED_M2 = 1e-24  # mean square of a motion that is none
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -80,10 +81,14 @@ def _whitening(linear: Linearized) -> Float[np.ndarray, "N M"]:
     A unit changes the face by the distance at the start (root mean square): no minimum is further away.
     The matrix is scaled to the diagonal one first, so that parameters of all units are judged alike.
     """
-    scale = np.sqrt(np.maximum(np.diag(linear.matrix), 1e-300))
-    values, vectors = np.linalg.eigh(linear.matrix / np.outer(scale, scale))
+    squares = np.diag(linear.matrix)
+    moving = squares > _UNMOVED_M2
+    scale = np.sqrt(squares[moving])
+    values, vectors = np.linalg.eigh(linear.matrix[np.ix_(moving, moving)] / np.outer(scale, scale))
     kept = values > _SINGULAR * values[-1]
-    return np.sqrt(linear.cost) * vectors[:, kept] / np.sqrt(values[kept]) / scale[:, None]
+    axes = np.zeros((len(squares), int(kept.sum())))
+    axes[moving] = np.sqrt(linear.cost) * vectors[:, kept] / np.sqrt(values[kept]) / scale[:, None]
+    return axes
 
 
 def _gradient(

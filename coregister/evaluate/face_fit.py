@@ -132,7 +132,7 @@ class ScanStage:
 
     model: FaceModel
     points: Float[np.ndarray, "N 3"]  # metres, any frame
-    _last: list[tuple[FaceFit, "_Closest"]] = field(default_factory=list, repr=False)
+    _last: list[tuple[FaceFit, "_Closest"]] = field(default_factory=list, init=False, repr=False)
 
     def distances(self, fit: FaceFit, points: Float[np.ndarray, "M 3"] | None = None) -> Float[np.ndarray, "M"]:
         """Return the distances of the points, or of others in their frame, from the surface; metres."""

@@ -54,8 +54,8 @@ class FaceModel:
     face: Bool[np.ndarray, "P"]  # where meshes in correspondence are compared
     components: Mapping[str, Int[np.ndarray, "_"]]  # "identity" and regions of the expression -> rows of the basis
     articulation: Articulation | None = None
-    _products: dict[bytes, tuple[np.ndarray, np.ndarray]] = field(default_factory=dict, repr=False)
-    _inverses: dict[bytes, np.ndarray] = field(default_factory=dict, repr=False)
+    _products: dict[bytes, tuple[np.ndarray, np.ndarray]] = field(default_factory=dict, init=False, repr=False)
+    _inverses: dict[bytes, np.ndarray] = field(default_factory=dict, init=False, repr=False)
 
     @property
     def angles(self) -> int:

@@ -151,6 +151,12 @@ def test_adam_approaches_the_least_squares(model, own):
     assert stage.cost(start) > costs[0] > costs[1] >= best
     assert costs[1] < 1.0001 * best
     assert fits[1].converged and not fits[0].converged
+    still = replace(face, basis=np.concatenate([face.basis, 0 * face.basis[:1]]))
+    unmoved = adam(
+        replace(stage, model=still), RegisteredStage(model=still, rows=stage.rows, target=stage.target).start()
+    )
+    assert unmoved.coefficients[-1] == 0 and stage.cost(fits[1]) == pytest.approx(costs[1])
+    np.testing.assert_allclose(unmoved.coefficients[:-1], fits[1].coefficients, atol=1e-3)
     plain = adam(stage, start, AdamSettings(steps=500, rate=2e-3, whitened=False))
     assert best < stage.cost(plain) < stage.cost(start)
 
