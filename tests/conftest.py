@@ -26,7 +26,17 @@ def _gpu_missing() -> str | None:
     return "the NVIDIA driver finds no GPU" if driver.cuInit(0) else None
 
 
+# Files that take more than a minute and a half begin, so that no process waits for another at the end.
+LONGEST = (
+    "tests/bench/test_benchmarks.py tests/registration/register/test_recovery.py "
+    "tests/workflows/test_coregistration.py tests/workflows/web/test_review.py tests/workflows/farm/test_farm.py "
+    "tests/test_api.py tests/workflows/cli/test_malformed.py tests/registration/register/test_photographs.py"
+).split()
+
+
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    places = {ROOT / name: place for place, name in enumerate(LONGEST)}
+    items.sort(key=lambda item: places.get(item.path, len(LONGEST)))
     missing = _gpu_missing()
     for item in items:
         if missing and "cuda" in item.keywords:

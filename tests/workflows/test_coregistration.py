@@ -140,7 +140,9 @@ def test_python_builds_the_same_model_from_the_same_registrations(dataset, true_
     assert len(set(contents.values())) == 3
 
 
-@pytest.mark.parametrize("where", ["registering", "building", "evaluating"])
+@pytest.mark.parametrize(
+    "where", ["registering", *(pytest.param(place, marks=pytest.mark.slow) for place in ("building", "evaluating"))]
+)
 def test_an_interrupted_loop_resumes_without_recomputing(dataset, true_register, tmp_path, monkeypatch, where):
     out, built = tmp_path / "out", []
     real, evaluated = workflows.steps.build.build_model, workflows.steps.evaluate.evaluate_models

@@ -16,7 +16,9 @@ def describe(
     /,
     out: Annotated[Path | None, arg(metavar="HTML", help_behavior_hint=NOT_SET)] = None,
 ) -> int:
-    """Count a dataset's subjects and samples by gender, age, ethnicity and category of the expression.
+    """Count a dataset's subjects and samples by their tags.
+
+    Tags are gender, age, ethnicity, and the category of the expression.
 
     Only headers are read. Subjects and captures that lack a tag are named, all of them in the files.
 

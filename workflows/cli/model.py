@@ -119,7 +119,7 @@ def compare(
     settings: FaceSettings = FaceSettings(),  # noqa: B008
     jobs: Annotated[int, arg(metavar="N")] = 1,
 ) -> int:
-    """Compare models of any topology on the face of registered scans, by the paper's protocol.
+    """Compare models of any topology on registered scans, as the paper does.
 
     Models are fitted to each registered mesh, then to the scan, without regularization. A folder holds the page, all
     numbers as CSV and a result per scan; the same command resumes.

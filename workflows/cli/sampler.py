@@ -88,8 +88,9 @@ def sample(
     count: Annotated[int, arg(metavar="N")] = 12,
     seed: Seed = 0,
 ) -> int:
-    """Draw heads of named categories and write coefficients, meshes and a contact sheet.
+    """Draw heads of named categories.
 
+    Writes coefficients, meshes and a contact sheet.
     Heads whose parts penetrate one another are drawn again.
 
     Args:

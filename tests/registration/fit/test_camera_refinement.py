@@ -74,6 +74,7 @@ def errors_px(cameras: Sequence[Camera], true: Sequence[Camera], points: Float[n
     return float(np.sqrt(np.square(rig_errors_px(cameras, true, points)).mean()))
 
 
+@pytest.mark.slow
 def test_a_fit_finds_the_errors_of_cameras(inputs: RegistrationInputs, truth: synthetic.Truth) -> None:
     points = truth.vertices.astype(np.float64)
     capture = wrong_cameras(inputs, points)

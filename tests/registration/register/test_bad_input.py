@@ -77,6 +77,7 @@ def test_a_previous_result_is_kept(request_: Request, monkeypatch: pytest.Monkey
     assert state(request_.folder) == before
 
 
+@pytest.mark.slow
 def test_masks_without_a_head_are_refused(request_: Request):
     """Without landmarks the pose is estimated from the masks; thin stripes are no head. Nothing is written."""
     shutil.rmtree(request_.capture / "landmarks")

@@ -78,7 +78,10 @@ def exchange(files: list[Path]) -> None:
         file.write_bytes(content)
 
 
-@pytest.mark.parametrize(("change", "got"), [(blur, "no face in any of 8 views"), (exchange, "agree on a face")])
+@pytest.mark.parametrize(
+    ("change", "got"),
+    [pytest.param(blur, "no face in any of 8 views", marks=pytest.mark.slow), (exchange, "agree on a face")],
+)
 def test_photographs_without_one_face_are_refused_with_a_picture(
     photographs, tmp_path, monkeypatch, change, got
 ) -> None:

@@ -90,7 +90,7 @@ def coverage_of_disc(scene: Scene, shift_px: np.ndarray) -> torch.Tensor:
     return scene.pixels.of_image(torch.tensor(image)[None])
 
 
-@pytest.mark.parametrize("side_px", [256, 512])
+@pytest.mark.parametrize("side_px", [256, pytest.param(512, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("mesh", [head, disc])
 def test_silhouette_coverage_equals_that_of_many_samples(mesh, side_px, capsys):
     scene, shift = Scene(mesh(), side_px), np.array([0.37, 0.21])

@@ -10,7 +10,9 @@ LIMIT = 0.03
 
 
 @pytest.mark.parametrize(
-    "file", [gradient_table.TINY, pytest.param(gradient_table.REAL, marks=needs_shared)], ids=["tiny", "real"]
+    "file",
+    [gradient_table.TINY, pytest.param(gradient_table.REAL, marks=[needs_shared, pytest.mark.slow])],
+    ids=["tiny", "real"],
 )
 def test_every_cell_is_within_three_percent(file, capsys):
     backend.activate()
