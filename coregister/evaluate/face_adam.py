@@ -19,7 +19,7 @@ from coregister.evaluate.face_fit import FaceFit, Linearized, Stage
 from registration.frames import MM_PER_M
 
 _DECAY, _SQUARE_DECAY, _EPSILON = 0.9, 0.999, 1e-8
-_SINGULAR = 1e-8  # of the largest eigenvalue: smaller ones are rounding
+_SINGULAR = 1e-5  # of the largest eigenvalue: along directions that matter less, steps are too long to be linear
 _UNMOVED_M2 = 1e-24  # mean square of a motion that is none
 
 
