@@ -20,24 +20,12 @@ from registration.model import gnm_npz
 from registration.model.gnm_npz import GNMData
 from registration.model.landmarks import LandmarkScheme, schemes_beside
 from registration.model.regions import group
+from registration.report.head_pictures import COLOURS, FILL, KEY
 from registration.report.pictures import BACKGROUND
 from registration.types import Camera
 
 SMOOTHING = 2  # images are rendered this many times larger and reduced
 QUALITY = 82
-COLOURS = {  # later ones override
-    "skin": (222, 190, 168),
-    "upper_lip": (200, 132, 122),
-    "lower_lip": (200, 132, 122),
-    "mouth_sock": (150, 78, 80),
-    "eye_sockets": (190, 120, 110),
-    "tongue": (206, 108, 112),
-    "gums": (216, 124, 126),
-    "teeth": (240, 236, 222),
-    "eyes": (240, 240, 238),
-    "irises": (96, 134, 160),
-    "pupils": (20, 20, 22),
-}
 REGIONS = (  # of the texture map and of the template, in distinct colours
     *("forehead", "left_brow", "middle_brow", "right_brow", "left_temple", "right_temple", "left_orbital"),
     *("right_orbital", "left_zygomatic", "right_zygomatic", "nose", "left_parotid", "right_parotid"),
@@ -46,8 +34,6 @@ REGIONS = (  # of the texture map and of the template, in distinct colours
 UNITS = ("browInnerUp", "browDownLeft", "eyeBlinkLeft", "eyeWideRight", "noseSneerLeft") + (
     *("jawOpen", "mouthSmileLeft", "mouthFrownRight", "mouthPucker", "cheekPuff"),
 )
-# Towards the light from the camera: x right, y down, z forward.
-KEY, FILL = np.array([-0.45, -0.6, -0.66]), np.array([0.8, -0.1, -0.59])
 FRONT, SIDE = (0.0, 0.0, 1.0), (1.0, 0.0, 0.0)
 HEAD = (0.0, 0.26, 0.03)
 Picture = UInt8[np.ndarray, "H W 3"]

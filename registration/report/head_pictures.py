@@ -22,7 +22,7 @@ from registration.types import Camera
 
 _SMOOTHING = 2  # pictures are rendered this many times larger and reduced
 _DISTANCE_M = 1.2  # of the camera from the face
-_COLOURS = {  # by vertex group; later ones override
+COLOURS = {  # by vertex group; later ones override
     "skin": (222, 190, 168),
     "upper_lip": (200, 132, 122),
     "lower_lip": (200, 132, 122),
@@ -36,7 +36,7 @@ _COLOURS = {  # by vertex group; later ones override
     "pupils": (20, 20, 22),
 }
 # Towards the light from the camera: x right, y down, z forward.
-_KEY, _FILL = np.array([-0.45, -0.6, -0.66]), np.array([0.8, -0.1, -0.59])
+KEY, FILL = np.array([-0.45, -0.6, -0.66]), np.array([0.8, -0.1, -0.59])
 _INK, _FAINT = (40, 40, 44), (110, 110, 116)
 _LINE_PX, _HEADING_PX, _GAP_PX = 31, 52, 8
 
@@ -83,7 +83,7 @@ class HeadPainter:
         point = np.einsum("pk,pkc->pc", weight, vertices[corner]) @ rotation.T + camera.T_cam_world[:3, 3]
         behind = (normal * point).sum(1) > 0
         normal[behind] *= -1
-        light = 0.30 + 0.62 * np.clip(normal @ _KEY, 0, 1) + 0.22 * np.clip(normal @ _FILL, 0, 1)
+        light = 0.30 + 0.62 * np.clip(normal @ KEY, 0, 1) + 0.22 * np.clip(normal @ FILL, 0, 1)
         colour = np.einsum("pk,pkc->pc", weight, self._colours[corner]) * light[:, None]
         colour[behind] *= (0.75, 0.5, 0.5)
         picture = np.empty((*shown.shape, 3))
@@ -133,8 +133,8 @@ def _fitting(
 
 
 def _part_colours(data: GNMData) -> Float[np.ndarray, "V 3"]:
-    colours = np.tile(np.array(_COLOURS["skin"], float), (len(data.template_vertex_positions), 1))
-    for name, colour in _COLOURS.items():
+    colours = np.tile(np.array(COLOURS["skin"], float), (len(data.template_vertex_positions), 1))
+    for name, colour in COLOURS.items():
         if name in data.vertex_group_names:
             colours[group(data, name) > 0.5] = colour
     return colours
