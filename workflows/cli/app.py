@@ -33,6 +33,7 @@ from workflows.cli import (
     model,
     register,
     sampler,
+    service,
     stabilize,
     stereo,
     store,
@@ -92,6 +93,10 @@ GROUPS: Mapping[str, Mapping[str, Command]] = {
         "sample": sampler.sample,
     },
     "Farm": {
+        "serve": service.serve,
+        "token create": service.token_create,
+        "token list": service.token_list,
+        "token revoke": service.token_revoke,
         "worker": farm.worker,
         "coordinator": farm.coordinator,
         "status": farm.status,

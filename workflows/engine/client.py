@@ -24,6 +24,7 @@ CHUNK = 1000  # jobs submitted in one transaction
 ACTIVE = ("ENQUEUED", "PENDING", "DELAYED")
 WAITING = ("ENQUEUED", "DELAYED")
 FAILED = ("ERROR", "MAX_RECOVERY_ATTEMPTS_EXCEEDED")
+MAX_PRIORITY = 1000
 SETTLE_S = 4.0  # within which a worker has noticed that its job was cancelled
 _ITERATION = re.compile(r"^[^/]+/(it[0-9]+)(?:/|$)")
 
@@ -114,6 +115,27 @@ class QueueClient:
                 self._client.cancel_workflows(chunk)
             cancelled += len(ids)
         return cancelled
+
+    def prioritize(self, run: str, priority: int) -> int:
+        """Give the waiting jobs of a run, or of a part of it, a priority; return their number.
+
+        Args:
+            run: id of the run or part.
+            priority: the lowest number is taken first.
+
+        Raises:
+            InputError: the priority is out of range.
+        """
+        if not 1 <= priority <= MAX_PRIORITY:
+            expected = f"1 to {MAX_PRIORITY}, the lowest first"
+            raise InputError("The priority is out of range", where="priority", expected=expected, got=priority)
+        update = sa.text(
+            f"UPDATE {table(self.url, 'workflow_status')} SET priority = :priority, updated_at = :now "
+            f"WHERE {BELOW} AND status IN {WAITING} AND name = 'job'"
+        )
+        with self._engine.begin() as connection:
+            values = {**below(check_id(run)), "priority": priority, "now": int(time.time() * 1000)}
+            return connection.execute(update, values).rowcount
 
     def retry(self, run: str, *, failed: bool = True, cancelled: bool = False) -> list[str]:
         """Requeue the failed jobs of a run and their dependents, under their ids. Returns the ids.

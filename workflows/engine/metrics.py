@@ -39,7 +39,11 @@ class QueueMetrics:
 
 def queue_metrics(reader: QueueReader, run: str | None = None) -> QueueMetrics:
     """Return the figures of a run, of a part of it, or of the whole queue."""
-    rows = reader.times(run)
+    return metrics_of(reader, reader.times(run))
+
+
+def metrics_of(reader: QueueReader, rows: Sequence[JobTimes]) -> QueueMetrics:
+    """Return the figures of jobs and flows that were read from a queue."""
     jobs = [row for row in rows if row.kind == "job"]
     registrations = [row for row in jobs if row.captures]
     counted = registrations or jobs

@@ -61,6 +61,8 @@ class JobTimes:
     started: float | None
     version: str | None
     queue: str | None
+    created: float
+    updated_ms: float  # when the row last changed
     captures: bool  # whether it registers a capture
     made: bool  # whether it computed something, or found the result of the same inputs
     failure: dict[str, Any] | None
@@ -114,12 +116,14 @@ class QueueReader:
             replace(row, state=INTERRUPTED) if row.state == RUNNING and row.executor in ended else row for row in rows
         ]
 
-    def times(self, run: str | None = None) -> list[JobTimes]:
-        """Return what `listing` does, in short."""
+    def times(self, run: str | None = None, *, since_ms: int = 0) -> list[JobTimes]:
+        """Return what `listing` does, in short; only rows that changed at `since_ms`, ms since 1970, or later."""
         where, parameters = _among(run)
+        if since_ms:
+            where, parameters = f"{where} AND w.updated_at >= :since", {**parameters, "since": since_ms}
         rows = self._rows(
             "SELECT w.workflow_uuid, w.name, w.status, w.executor_id, w.completed_at, w.started_at_epoch_ms, "
-            "w.application_version, w.queue_name, "
+            "w.application_version, w.queue_name, w.created_at, w.updated_at, "
             "CASE WHEN coalesce(i.inputs, w.inputs) LIKE :capture THEN 1 ELSE 0 END, "
             "CASE WHEN coalesce(o.output, w.output) LIKE :kept THEN 0 ELSE 1 END, "
             f"CASE WHEN w.status IN {_FAILED} THEN coalesce(o.error, w.error) END "
@@ -156,7 +160,7 @@ def ended(counts: dict[str, int]) -> int:
     return sum(counts.get(state, 0) for state in (DONE, FAILED, CANCELLED))
 
 
-def _among(run: str | None) -> tuple[str, dict[str, str]]:
+def _among(run: str | None) -> tuple[str, dict[str, Any]]:
     """The condition for the rows `w` of a run, or of the whole queue, and its parameters."""
     if run is None:
         return "1 = 1", {}
@@ -192,7 +196,7 @@ def _row(row: Any) -> JobRow:
 
 
 def _times(row: Any, ended_processes: set[str]) -> JobTimes:
-    identity, kind, status, executor, ended_ms, started, version, queue, captures, made, error = row
+    identity, kind, status, executor, ended_ms, started, version, queue, created, updated, captures, made, error = row
     state = _state(status)
     dead = DEAD if status == "MAX_RECOVERY_ATTEMPTS_EXCEEDED" else ""
     return JobTimes(
@@ -204,6 +208,8 @@ def _times(row: Any, ended_processes: set[str]) -> JobTimes:
         started=number(started) / 1000 if started else None,
         version=version,
         queue=queue,
+        created=number(created) / 1000,
+        updated_ms=number(updated),
         captures=bool(captures),
         made=bool(made),
         failure=_failure(error, dead) if state == FAILED else None,

@@ -66,7 +66,7 @@ def run_until_done(
         raise InputError(
             "There are no workers", where="--workers", expected="at least 1", got=farm.workers, fix="use one or more"
         )
-    processes = _Processes(farm)
+    processes = FarmProcesses(farm)
     reader = QueueReader(farm.url)
     stuck_s = 0.0  # for which all jobs that are left lie outside the roots
     try:
@@ -100,10 +100,11 @@ def _summary(counts: Mapping[str, int]) -> str:
     return ", ".join(f"{counts[state]} {state}" for state in (RUNNING, WAITING, DONE, FAILED) if counts.get(state))
 
 
-class _Processes:
+class FarmProcesses:
     """Commands that are restarted when they die."""
 
     def __init__(self, farm: LocalFarm) -> None:
+        """Nothing is started before `restart`."""
         devices = [["--gpu", str(number)] for number in farm.gpus] or [[] for _ in range(farm.workers)]
         shared = ["--folder", str(farm.folder), "--db", ENVIRONMENT]  # the URL may hold a password
         roots = ["--root", *farm.roots] if farm.roots else []

@@ -10,7 +10,7 @@ import viser
 
 from registration.errors import InputError
 from registration.terminal import printable
-from workflows.web.gate import PARAMETER, Gate, guarded_servers
+from workflows.web.page_access import PARAMETER, PageAccess, guarded_servers
 
 _HOST = "127.0.0.1"
 
@@ -46,8 +46,8 @@ class PageServer:
                     got=error,
                     fix="choose another one with --port",
                 ) from error
-        self._gate = Gate()
-        with guarded_servers(self._gate), redirect_stdout(io.StringIO()):  # viser prints a URL without the token
+        self._access = PageAccess()
+        with guarded_servers(self._access), redirect_stdout(io.StringIO()):  # viser prints a URL without the token
             self._server = viser.ViserServer(host=_HOST, port=port, label=title, verbose=False)
         self.port = self._server.get_port()
         gui, scene = self._server.gui, self._server.scene
@@ -60,7 +60,7 @@ class PageServer:
     @property
     def url(self) -> str:
         """The page's URL, with the token that it asks for."""
-        return f"http://{_HOST}:{self.port}/?{PARAMETER}={self._gate.token}"
+        return f"http://{_HOST}:{self.port}/?{PARAMETER}={self._access.token}"
 
     def wait(self) -> None:
         """Block until Ctrl-C, then close."""

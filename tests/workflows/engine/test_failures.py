@@ -28,7 +28,7 @@ def test_other_reasons_are_other_kinds(first: str, second: str) -> None:
 
 
 def row(name: str, **failure: str) -> JobTimes:
-    return JobTimes(name, "job", "failed", "w", 2.0, 1.0, "wf", "gpu", True, True, failure)
+    return JobTimes(name, "job", "failed", "w", 2.0, 1.0, "wf", "gpu", 0.0, 0.0, True, True, failure)
 
 
 def test_failures_are_grouped_with_the_fix_of_the_first() -> None:

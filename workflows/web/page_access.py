@@ -29,7 +29,7 @@ _HEADERS = {
 Answer = Callable[[ServerConnection, Request], Response | None]
 
 
-class Gate:
+class PageAccess:
     """The check of every request to one server, before a web socket opens or a file is sent."""
 
     def __init__(self) -> None:
@@ -66,8 +66,8 @@ class Gate:
 
 
 @contextmanager
-def guarded_servers(gate: Gate) -> Iterator[None]:
-    """Put the gate before every server of websockets that starts in this context.
+def guarded_servers(access: PageAccess) -> Iterator[None]:
+    """Put the check before every server of websockets that starts in this context.
 
     viser starts its server itself and takes no check of its own.
 
@@ -78,7 +78,7 @@ def guarded_servers(gate: Gate) -> Iterator[None]:
 
     def serve(*arguments: Any, process_request: Answer, **settings: Any) -> Any:
         started.append(True)
-        check = lambda connection, request: gate.answer(connection, request, process_request)  # noqa: E731
+        check = lambda connection, request: access.answer(connection, request, process_request)  # noqa: E731
         return original(*arguments, process_request=check, **settings)
 
     websockets.asyncio.server.serve = serve  # type: ignore[assignment, misc]

@@ -12,7 +12,7 @@ from websockets.exceptions import InvalidStatus
 from websockets.typing import Subprotocol
 
 from tests.workflows.browser import CHROMIUM, FLAGS, needs_browser
-from workflows.web.gate import Gate, guarded_servers
+from workflows.web.page_access import PageAccess, guarded_servers
 from workflows.web.server import PageServer, literal
 
 NAME = "![x](http://127.0.0.1:1/x.png) <img src=http://127.0.0.1:1/y.png> `a` *b* {c}"
@@ -20,7 +20,7 @@ NAME = "![x](http://127.0.0.1:1/x.png) <img src=http://127.0.0.1:1/y.png> `a` *b
 
 @pytest.fixture(scope="module")
 def page() -> Iterator[PageServer]:
-    served = PageServer(0, "Gate")
+    served = PageServer(0, "PageAccess")
     yield served
     served.close()
 
@@ -113,7 +113,7 @@ def test_each_page_has_a_token_of_its_own(page: PageServer) -> None:
 
 
 def test_a_release_of_viser_without_the_check_does_not_start() -> None:
-    with pytest.raises(RuntimeError, match="another way"), guarded_servers(Gate()):
+    with pytest.raises(RuntimeError, match="another way"), guarded_servers(PageAccess()):
         pass
 
 

@@ -1,0 +1,61 @@
+"""What the routes of a service share."""
+
+import time
+from dataclasses import dataclass
+from threading import Lock
+from typing import Annotated
+
+from fastapi import Depends, Request
+
+from workflows.engine.metrics import QueueMetrics, metrics_of
+from workflows.engine.reader import QueueReader
+from workflows.service.access import Access
+from workflows.service.audit import AuditLog
+from workflows.service.board import Board
+from workflows.service.settings import ServiceSettings
+from workflows.service.tokens import Tokens
+
+METRICS_S = 2.0  # for which the figures of the queue are kept
+
+
+@dataclass(frozen=True)
+class _Kept:
+    until: float
+    metrics: QueueMetrics
+
+
+class ServiceState:
+    """The parts of a running service."""
+
+    def __init__(self, settings: ServiceSettings) -> None:
+        """Open the queue, which `migrate` created, and the folder of the service's state."""
+        self.settings = settings
+        self.tokens = Tokens(settings.state)
+        self.audit = AuditLog(settings.state)
+        self.access = Access(settings, self.tokens, self.audit)
+        self.board = Board(settings.url, settings.poll_s)
+        self.reader = QueueReader(settings.url, known=True)
+        self.started = time.time()
+        self._metrics: dict[str, _Kept] = {}
+        self._lock = Lock()
+
+    def metrics(self, run: str | None = None) -> QueueMetrics:
+        """Return the figures of a run, or of the whole queue; at most two seconds old."""
+        key = run or ""
+        with self._lock:
+            kept = self._metrics.get(key)
+            if kept is None or kept.until < time.monotonic():
+                rows = [entry.times for entry in self.board.entries.values() if run is None or entry.run == run]
+                kept = _Kept(time.monotonic() + METRICS_S, metrics_of(self.reader, rows))
+                self._metrics = {name: old for name, old in self._metrics.items() if old.until > time.monotonic()}
+                self._metrics[key] = kept
+            return kept.metrics
+
+
+def service(request: Request) -> ServiceState:
+    """Return the state of the service that answers a request: a dependency of routes."""
+    state: ServiceState = request.app.state.service
+    return state
+
+
+Service = Annotated[ServiceState, Depends(service)]  # a parameter of routes
