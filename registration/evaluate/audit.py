@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
+from scipy.spatial import cKDTree
 
 from registration.errors import InputError
 from registration.frames import MM_PER_M
@@ -112,15 +113,19 @@ def audit_penetration(vertices: Float[np.ndarray, "V 3"], data: GNMData, scale: 
 
 # By the model's content hash; only the last model, which all captures of a process usually share.
 _audited_template: dict[str, tuple["_PartSurfaces", Mapping[str, Float[np.ndarray, "V"]]]] = {}
+_last_model: list[GNMData] = []  # whose template that is: the hash takes a tenth of an audit
 
 
 def _template_parts(data: GNMData) -> tuple["_PartSurfaces", Mapping[str, Float[np.ndarray, "V"]]]:
     """Return a model's parts, and the depths in its template by pair, in millimetres."""
+    if _audited_template and _last_model and _last_model[0] is data:
+        return next(iter(_audited_template.values()))
     content = gnm_npz.content_hash(data)
     if content not in _audited_template:
         parts = _PartSurfaces(data)
         _audited_template.clear()
         _audited_template[content] = parts, parts.depths(parts.rest)
+    _last_model[:] = [data]
     return _audited_template[content]
 
 
@@ -187,6 +192,10 @@ class _PartSurfaces:
         A lip's vertex counts as inside the other lip unless it entered the skin elsewhere, because the lips overlap in
         the template too. "ears in skin" is any self-intersection that involves an ear. A vertex that entered through an
         inner surface, such as an eyelid's rim through the eye socket, does not count.
+
+        At the bottom of a crease the penetrated face begins at the vertex, which is then not behind it, and a distant
+        one is found. But the way to a vertex that is not inside leads through the penetrated surface: no depth is
+        larger than the distance to the nearest of these.
         """
         names = ("upper lip in lower lip", "lower lip in upper lip", "ears in skin", "skin in itself")
         depths = {name: np.zeros(len(vertices)) for name in names}
@@ -194,6 +203,10 @@ class _PartSurfaces:
         def set_depths(name: str, members: Int[np.ndarray, "N"], distance: Float[np.ndarray, "N"]) -> None:
             depths[name][members] = distance * MM_PER_M
 
+        outside = np.setdiff1d(np.flatnonzero(self.exterior), inside)
+        largest = np.full(len(vertices), np.inf)
+        if len(inside) and len(outside):
+            largest[inside] = cKDTree(vertices[outside]).query(vertices[inside])[0]
         lips = self.upper_lip | self.lower_lip
         other_faces = np.flatnonzero(self.exterior_faces & ~lips[self.skin].any(1))
         pairs = (self.upper_lip, self.lower_lip), (self.lower_lip, self.upper_lip)
@@ -203,12 +216,12 @@ class _PartSurfaces:
             distance, _, penetrated = self.overlap.penetrated_faces(vertices, members, other_faces, to_lip)
             elsewhere = penetrated & (distance < to_lip) | np.isinf(to_lip)
             set_depths(name, members[~elsewhere], to_lip[~elsewhere])
-            set_depths(names[-1], members[elsewhere], distance[elsewhere])
+            set_depths(names[-1], members[elsewhere], np.minimum(distance, largest[members])[elsewhere])
         members = inside[~lips[inside]]
         unbounded = np.full(len(members), np.inf)
         distance, face, _ = self.overlap.penetrated_faces(vertices, members, np.arange(len(self.skin)), unbounded)
         in_ear = self.ears[members] | self.ears[self.skin[face]].all(1)
-        distance = np.where(self.exterior_faces[face], distance, 0.0)
+        distance = np.where(self.exterior_faces[face], np.minimum(distance, largest[members]), 0.0)
         for name, rows in (("ears in skin", in_ear), ("skin in itself", ~in_ear)):
             set_depths(name, members[rows], distance[rows])
         return depths
@@ -223,8 +236,15 @@ def _inside(
     vertices: Float[np.ndarray, "V 3"], tested: Bool[np.ndarray, "V"], triangles: Int[np.ndarray, "_ 3"]
 ) -> Int[np.ndarray, "M"]:
     """Return the tested vertices that lie inside the triangles' surface, its openings closed."""
+    surface, faces = closed(vertices, triangles)
+    corners = surface[faces]
+    # A closed surface does not wind around a point outside its bounding box, where almost all vertices are.
+    low, high = corners.min((0, 1)), corners.max((0, 1))
     members = np.flatnonzero(tested)
-    return members[Winding(*closed(vertices, triangles)).numbers(vertices[members]) > _INSIDE]
+    members = members[((vertices[members] >= low) & (vertices[members] <= high)).all(1)]
+    if not len(members):
+        return members
+    return members[Winding(surface, faces).numbers(vertices[members]) > _INSIDE]
 
 
 def _distance(

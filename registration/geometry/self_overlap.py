@@ -69,10 +69,14 @@ class SelfOverlap:
         corners = vertices[self.triangles[faces]]
         centroids = corners.mean(1)
         radii = np.linalg.norm(corners - centroids[:, None], axis=-1).max(1)
+        row_of = np.full(len(vertices), -1)  # of a vertex, in its batch
         for first in range(0, len(members) if len(faces) else 0, _BATCH):
             rows = np.arange(first, min(first + _BATCH, len(members)))
             bound = cdist(vertices[members[rows]], centroids) - radii  # of the distance, from below
-            bound[(self.triangles[faces][None] == members[rows][:, None, None]).any(2)] = np.inf
+            row_of[members[rows]] = np.arange(len(rows))
+            own_face, corner = np.nonzero(row_of[self.triangles[faces]] >= 0)
+            bound[row_of[self.triangles[faces[own_face], corner]], own_face] = np.inf
+            row_of[members[rows]] = -1
             for count in _ROUNDS:
                 count = min(count, len(faces))
                 near = np.argpartition(bound, count - 1, axis=1)[:, :count]

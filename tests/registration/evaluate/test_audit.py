@@ -337,3 +337,24 @@ def test_an_upper_lid_pushed_through_the_lower_lid(head):
         members = here[row.vertices]
         expected = distance_to_surface(vertices[row.vertices[members]], vertices[lids[other[lids].all(1)]]) * 1e3
         np.testing.assert_allclose(row.depth_mm[members], expected, atol=1e-6)
+
+
+@needs_shared
+def test_a_crease_is_no_deeper_than_its_vertices_are_from_those_outside(head):
+    """The chin turned down by 15 degrees towards the throat: faces of the nape used to be taken for the crease."""
+    rest = head.template_vertex_positions.astype(float)
+    share = np.clip((rest[:, 2] - 0.068) / 0.016 + 0.5, 0, 1) * (rest[:, 1] < 0.225)
+    angle = np.radians(15) * share**2 * (3 - 2 * share)
+    vertices, (y, z) = rest.copy(), (rest[:, 1:] - [0.26, 0.03]).T
+    vertices[:, 1] = 0.26 + np.cos(angle) * y - np.sin(angle) * z
+    vertices[:, 2] = 0.03 + np.sin(angle) * y + np.cos(angle) * z
+    row = pair(audit_penetration(vertices, head), "skin in itself")
+    normals = vertex_normals(torch.from_numpy(vertices), torch.from_numpy(head.triangles.astype(int))).numpy()
+    near = np.flatnonzero(
+        regions.exterior(head) & (np.linalg.norm(vertices - vertices[row.vertices[0]], axis=1) < 0.04)
+    )
+    skin = closed(vertices, regions.solids(head)["skin"])
+    outside = near[by_ray((vertices + 1e-5 * normals)[near], *skin) <= 0]
+    bound = np.linalg.norm(vertices[row.vertices][:, None] - vertices[outside], axis=2).min(1) * 1e3
+    assert len(row.vertices) > 10 and not np.isin(row.vertices, outside).any()
+    assert (row.depth_mm <= bound + 1e-6).all() and row.depth_mm.max() > 0.3
