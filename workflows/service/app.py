@@ -9,7 +9,7 @@ from fastapi.dependencies.models import Dependant
 from fastapi.routing import APIRoute
 from starlette.middleware import Middleware
 
-from workflows.service import health, login, problems, rendering
+from workflows.service import health, login, problems, prometheus, rendering
 from workflows.service.api import actions, events, jobs
 from workflows.service.middleware import Guard
 from workflows.service.settings import ServiceSettings
@@ -52,7 +52,7 @@ def create_app(settings: ServiceSettings) -> FastAPI:
     problems.install(app)
     for module in (jobs, actions, events):
         app.include_router(module.router, prefix=API)
-    for module in (health, login, rendering):
+    for module in (health, prometheus, login, rendering):
         app.include_router(module.router)
     refuse_open_routes(app)
     return app

@@ -9,7 +9,7 @@ import secrets
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import islice
 from typing import Any
@@ -88,6 +88,7 @@ class Board:
         self._poll_s = poll_s
         self.epoch = secrets.token_hex(4)  # numbers of changes are unique within it
         self.entries: dict[str, Entry] = {}  # replaced, not changed: readers need no lock
+        self.stage_seconds: dict[str, tuple[int, float]] = {}  # stage -> number and seconds of registrations seen
         self.answered = 0.0  # when the database last answered, seconds since 1970
         self._changes: deque[Change] = deque(maxlen=KEPT)
         self._number = 0
@@ -178,6 +179,7 @@ class Board:
         for start in range(0, len(done), _CHUNK):
             for identity, job in self._reader.rows(done[start : start + _CHUNK]).items():
                 results[identity] = _outcome(job.result)
+                self._add_stages(job.result)
         for row in rows:
             if row.state == FAILED and row.failure:
                 yield Entry(row, str(row.failure.get("status")), str(row.failure.get("reason")))
@@ -185,6 +187,13 @@ class Board:
                 yield Entry(row, *results[row.id])
             else:
                 yield Entry(row, row.state)
+
+    def _add_stages(self, result: Mapping[str, Any] | None) -> None:
+        stages = _about(result).get("stages")
+        for name, seconds in stages.items() if isinstance(stages, dict) else ():
+            if isinstance(seconds, int | float):
+                count, total = self.stage_seconds.get(name, (0, 0.0))
+                self.stage_seconds = {**self.stage_seconds, name: (count + 1, total + seconds)}
 
     def _interrupted(self, entries: dict[str, Entry]) -> dict[str, Entry]:
         """Entries of running jobs whose process has ended, and of interrupted ones whose process lives again."""
@@ -199,15 +208,25 @@ class Board:
         return found
 
 
-def _outcome(result: dict[str, Any] | None) -> tuple[str, str, str, str]:
-    """Status, reason, level of the verdict and content id in a job's result; others can write to the queue."""
+def _inner(result: Mapping[str, Any] | None) -> Mapping[str, Any]:
+    """What a step returned; others can write to the queue."""
     inner = (result or {}).get("result")
-    inner = inner if isinstance(inner, dict) else {}
+    return inner if isinstance(inner, dict) else {}
+
+
+def _about(result: Mapping[str, Any] | None) -> Mapping[str, Any]:
+    """What is known about a registration, whether it is in a store or in a subject's folder."""
+    inner = _inner(result)
     about = inner.get("about")
-    about = about if isinstance(about, dict) else inner
+    return about if isinstance(about, dict) else inner
+
+
+def _outcome(result: Mapping[str, Any] | None) -> tuple[str, str, str, str]:
+    """Status, reason, level of the verdict and content id in a job's result."""
+    about = _about(result)
     figures = about.get("figures")
     verdict = figures.get("verdict") if isinstance(figures, dict) else None
     level = verdict.get("level") if isinstance(verdict, dict) else None
-    words = about.get("status"), about.get("reason"), level, inner.get("content_id")
+    words = about.get("status"), about.get("reason"), level, _inner(result).get("content_id")
     status, reason, shown, content = (word if isinstance(word, str) else "" for word in words)
     return status or DONE, reason, shown, content

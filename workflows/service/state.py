@@ -1,8 +1,11 @@
 """What the routes of a service share."""
 
+import os
 import time
+from contextlib import suppress
 from dataclasses import dataclass
-from threading import Lock
+from pathlib import Path
+from threading import Lock, Thread
 from typing import Annotated
 
 from fastapi import Depends, Request
@@ -12,9 +15,10 @@ from workflows.engine.reader import QueueReader
 from workflows.service.access import Access
 from workflows.service.audit import AuditLog
 from workflows.service.board import Board
-from workflows.service.settings import ServiceSettings
+from workflows.service.settings import RESULTS, ServiceSettings
 from workflows.service.tokens import Tokens
 
+SIZE_S = 300.0  # between two counts of the results' bytes
 METRICS_S = 2.0  # for which the figures of the queue are kept
 
 
@@ -22,6 +26,30 @@ METRICS_S = 2.0  # for which the figures of the queue are kept
 class _Kept:
     until: float
     metrics: QueueMetrics
+
+
+class StoreSize:
+    """Bytes of the results in the farm's folder, counted by a thread: there may be millions of files."""
+
+    def __init__(self, folder: Path) -> None:
+        """`folder`: of the results."""
+        self._folder, self._bytes, self._until, self._lock = folder, 0, 0.0, Lock()
+
+    def bytes(self) -> int:
+        """Return the last count, and start another one if it is old."""
+        with self._lock:
+            if time.monotonic() > self._until:
+                self._until = time.monotonic() + SIZE_S
+                Thread(target=self._count, name="store size", daemon=True).start()
+        return self._bytes
+
+    def _count(self) -> None:
+        total = 0
+        for folder, _, names in os.walk(self._folder):
+            for name in names:
+                with suppress(OSError):
+                    total += os.lstat(os.path.join(folder, name)).st_size
+        self._bytes = total
 
 
 class ServiceState:
@@ -35,7 +63,7 @@ class ServiceState:
         self.access = Access(settings, self.tokens, self.audit)
         self.board = Board(settings.url, settings.poll_s)
         self.reader = QueueReader(settings.url, known=True)
-        self.started = time.time()
+        self.store_size = StoreSize(settings.folder / RESULTS)
         self._metrics: dict[str, _Kept] = {}
         self._lock = Lock()
 

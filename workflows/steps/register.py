@@ -71,6 +71,7 @@ def register_stored(
                 "reason": result.reason,
                 "figures": brief(result.figures),
                 "seconds": sum(result.seconds.values()),
+                "stages": dict(result.seconds),
                 "thumbnail": _write_thumbnail(result, attempt / THUMBNAIL, progress or NullProgress()),
             }
             return hashing.to_jsonable(about)
