@@ -24,6 +24,7 @@ from coregister.evaluate.face_model import IDENTITY, FaceModel
 from registration.errors import InputError
 from registration.frames import MM_PER_M
 
+CODE = 2  # raised when the same scan, model and settings give other results: kept ones are computed again
 NEUTRAL = "neutral"
 STAGES = ("stage1", "stage2")
 ADAM = "adam_"  # prefix of a stage by Adam

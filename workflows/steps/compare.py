@@ -12,6 +12,7 @@ from coregister.evaluate.face_data import ComparedModel, FaceReference, FaceSamp
 from coregister.evaluate.face_model import IDENTITY
 from coregister.evaluate.face_numbers import FaceComparison
 from coregister.evaluate.face_protocol import (
+    CODE,
     NEUTRAL,
     STAGES,
     ProtocolSettings,
@@ -42,7 +43,6 @@ from workflows.records.face_samples import FaceSampleSet, read_samples
 
 MANIFEST, PAGE, NUMBERS, RESULTS = "manifest.json", "index.html", "numbers.csv", "samples"
 _FILES = (MANIFEST, PAGE, NUMBERS, RESULTS)
-_VERSION = "1"  # of the protocol: results of another are computed again
 _LEAST_DATABASE = 2  # neutrals that specificity needs
 
 
@@ -234,7 +234,7 @@ def _key(sample: FaceSample, model: ComparedModel, settings: ProtocolSettings, t
     carried = model.target(np.arange(3 * len(sample.vertices), dtype=np.float64).reshape(-1, 3))
     inputs = {"sample": sample.content(), "model": model.face.content, "map": f"{carried.sum():.6g}"}
     used = {"points": settings.points, "components": settings.components, "seed": settings.seed, "adam": settings.adam}
-    return input_hash(inputs, to_jsonable({**used, "tasks": tasks, "category": sample.category, "version": _VERSION}))
+    return input_hash(inputs, to_jsonable({**used, "tasks": tasks, "category": sample.category, "code": CODE}))
 
 
 def _summarize(

@@ -16,7 +16,7 @@ from coregister.evaluate.face_fit import (
     fit_registered,
     least_squares,
 )
-from coregister.evaluate.face_protocol import ProtocolSettings, SampleTasks, evaluate_sample, planned_tasks
+from coregister.evaluate.face_protocol import CODE, ProtocolSettings, SampleTasks, evaluate_sample, planned_tasks
 from coregister.evaluate.face_tables import FaceTables
 from coregister.evaluate.linear_fit import twist_to_matrix
 from registration.errors import InputError
@@ -25,7 +25,7 @@ from registration.geometry.closest_point import barycentric_points
 from registration.geometry.surface_samples import sample_surface
 from registration.linear_models.gnm import from_gnm
 from registration.linear_models.model import LinearModel
-from tests.coregister.spectrum import heads, spectrum_model
+from tests.coregister.spectrum import heads, spectrum_model, with_identity
 
 MOTION = twist_to_matrix(np.array([0.2, -0.5, 0.1, 0.3, -0.2, 1.0]))
 SETTINGS = ProtocolSettings(
@@ -180,6 +180,18 @@ def test_a_scan_elsewhere_is_refused(model, own, reference):
     sample = replace(sample, scan=sample.scan + 1.0)
     with pytest.raises(InputError, match="cannot be compared"):
         evaluate_sample(sample, own, reference, SETTINGS, SampleTasks())
+
+
+def test_other_results_have_another_code(model, reference):
+    """Whoever changes these numbers raises CODE, or comparisons mix results of both."""
+    few = compared_gnm("few", with_identity(model, model.vertex_identity_basis[4:]), reference, None)
+    result = evaluate_sample(a_sample(model), few, reference, SETTINGS, SampleTasks(adam=True, curve=True))
+    means = {name: float(values.mean()) for name, values in result.distances_mm.items()}
+    assert CODE == 2
+    assert means == pytest.approx(
+        {"stage1": 0.06237, "stage2": 0.06095, "adam_stage1": 0.06922, "adam_stage2": 0.06567}, rel=1e-3
+    )
+    assert result.curves_mm["identity"] == pytest.approx([0.06381, 0.06196], rel=1e-3)
 
 
 def test_tables_of_known_distances(model, own, reference):

@@ -86,6 +86,9 @@ def test_the_folder_and_its_resumption(given, tmp_path, monkeypatch):
     assert again.csv() == comparison.csv()
     with pytest.raises(AssertionError):
         compare_models(given, out=tmp_path, settings=replace(SETTINGS, points=201))
+    monkeypatch.setattr(workflows.steps.compare, "CODE", workflows.steps.compare.CODE + 1)
+    with pytest.raises(AssertionError):
+        compare_models(given, out=tmp_path, settings=SETTINGS)
 
 
 def test_refusals_come_before_the_work(given, tmp_path):
