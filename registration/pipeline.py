@@ -19,6 +19,7 @@ from registration.cranium.complete import CompletedCranium, CraniumCompletion
 from registration.cranium.registered import NEUTRAL, cranium_figure, cranium_note, write_cranium
 from registration.evaluate.audit import audit_penetration
 from registration.evaluate.evaluation import RegistrationEvaluation, evaluate_registration, without_scan
+from registration.evaluate.plausibility import plausibility
 from registration.evaluate.verdict import judge
 from registration.evaluate.viewpoint import intersection_figures
 from registration.fit import camera_refinement
@@ -345,7 +346,10 @@ def _evaluate(
             view.name: view.camera.relative_to(inputs.origin) for view in inputs.capture.views if view.name in shown
         }
         intersections = intersection_figures(audit, vertices, cameras)
-        registration = replace(registration, figures={**registration.figures, "intersections": intersections})
+        plausible = plausibility(registration, inputs.data, inputs.neutral)
+        registration = replace(
+            registration, figures={**registration.figures, "intersections": intersections, **plausible}
+        )
     if inputs.capture.scan is not None and finite:
         progress.message("measuring against the scan")
         evaluation = evaluate_registration(registration, inputs.capture)

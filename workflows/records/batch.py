@@ -74,9 +74,9 @@ class BatchTable:
         for row in self.rows:
             values = [headline_value(row.figures, headline) for headline in headlines]
             verdict = verdict_title(row.figures)
-            words = [_cell(word) for word in (row.name, row.state, row.status, verdict, row.look, row.reason)]
+            words = [cell(word) for word in (row.name, row.state, row.status, verdict, row.look, row.reason)]
             numbers = ["" if value is None else f"{value:.6g}" for value in (*values, row.seconds)]
-            writer.writerow((*words, *numbers, *map(_cell, (row.report or "", row.source, row.job))))
+            writer.writerow((*words, *numbers, *map(cell, (row.report or "", row.source, row.job))))
         return text.getvalue()
 
 
@@ -134,7 +134,7 @@ def _rank(row: BatchRow, limits: Mapping[Headline, _Limit]) -> tuple[Any, ...]:
     return (level, -max(ratios, default=0.0), -first, row.name)
 
 
-def _cell(text: str) -> str:
-    """A text without control characters that no spreadsheet takes for a formula."""
+def cell(text: str) -> str:
+    """Return a text without control characters that no spreadsheet takes for a formula."""
     plain = "".join(character if character.isprintable() else " " for character in text).strip()
     return f"'{plain}" if plain.startswith(_FORMULA) else plain

@@ -72,14 +72,15 @@ def append_decisions(file: Path, dataset: str, decisions: Sequence[Decision]) ->
     previous = read_text(file, partial(DecisionEntry.invalid, file)) if os.path.lexists(file) else ""
     if previous:
         read_decisions(file, dataset)
-    time, user = datetime.now(UTC).isoformat(timespec="seconds"), _user()
+    time, user = datetime.now(UTC).isoformat(timespec="seconds"), user_name()
     entries = [DecisionEntry(time=time, by=user, dataset=dataset, **vars(decision)) for decision in decisions]
     lines = [json.dumps(entry.to_json()) for entry in entries]
     file.parent.mkdir(parents=True, exist_ok=True)
     atomic_write_text(file, previous + "".join(f"{line}\n" for line in lines))
 
 
-def _user() -> str:
+def user_name() -> str:
+    """Return the name of the user of this process, "unknown" if it has none."""
     try:
         return getuser()
     except (OSError, KeyError):  # a container's user without a name

@@ -112,6 +112,29 @@ class Store:
                 return None
         return _checked(content, where=where, key=key)
 
+    def read(self, artifact: Artifact, name: str) -> bytes:
+        """Return the content of a text file of an artifact, of at most `MAX_TEXT_BYTES`.
+
+        Raises:
+            InputError: the artifact names no such file, or it is missing, larger, or altered.
+        """
+        where = f"{self.url}/{artifact.key}/{artifact.attempt}/{name}"
+        stored, path = artifact.files.get(name), self._path(artifact.key, artifact.attempt, name)
+        if stored is None or stored.bytes > MAX_TEXT_BYTES:
+            raise Artifact.invalid(
+                where, expected="a text file of the artifact", got="none" if stored is None else "a larger one"
+            )
+        if self.local is not None:
+            content = read_bytes(Path(path), partial(Artifact.invalid, where))
+        else:
+            try:
+                content = self._fs.cat_file(path)
+            except FileNotFoundError:
+                raise Artifact.invalid(where, expected="a file of the artifact", got="no such file") from None
+        if hashlib.sha256(content).hexdigest() != stored.sha256:
+            raise Artifact.invalid(where, expected=f"sha256 {stored.sha256}", got="other content")
+        return bytes(content)
+
     def produce(self, key: str, *, input_hash: str, make: Callable[[Path], Mapping[str, Any]]) -> Artifact:
         """Return the artifact of a key: the published one if it has this input hash, else a new one.
 
