@@ -40,10 +40,11 @@ def test_dependencies_are_installed_before_the_source_is_copied():
 
 def test_the_password_is_in_no_url_and_only_this_machine_reaches_the_database():
     services = COMPOSE["services"]
-    for name in ("coordinator", "worker", "gnmreg"):
+    for name in ("coordinator", "worker", "serve", "gnmreg"):
         environment = services[name]["environment"]
         assert "PASSWORD" not in environment["GNMREG_DB"]
         assert "POSTGRES_PASSWORD" in environment["PGPASSWORD"]
+    assert services["serve"]["ports"] == ["127.0.0.1:8080:8080"]
     assert services["postgres"]["ports"] == ["${GNMREG_DB_ADDRESS:-127.0.0.1}:5432:5432"]
 
 

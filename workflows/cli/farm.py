@@ -57,7 +57,9 @@ _LIST = ListOptions()
 def worker(
     farm: FarmOptions = _FARM,
     root: Annotated[tuple[str, ...], arg(metavar="FOLDER|URL", help_behavior_hint=NOT_SET)] = (),
-    gpu: Annotated[int | None, arg(metavar="N", help_behavior_hint="(default: no GPU)")] = None,
+    gpu: Annotated[
+        int | Literal["assigned"] | None, arg(metavar="N|assigned", help_behavior_hint="(default: no GPU)")
+    ] = None,
     queue: Annotated[tuple[QueueName, ...], arg(metavar="{gpu,rebuild}")] = ("gpu",),
 ) -> int:
     """Execute jobs of the queue, one at a time, in a child process.
@@ -68,11 +70,12 @@ def worker(
         farm: Which farm.
         root: Captures, models and results of jobs must lie below one of these folders and URLs or the farm's folder;
             other jobs are refused.
-        gpu: Use this GPU only.
+        gpu: Use this GPU only. assigned: the one that a scheduler such as Slurm assigned to this process.
         queue: Queues to take jobs from: gpu (registrations), rebuild (model building: much memory), or both.
     """
-    os.environ["CUDA_VISIBLE_DEVICES"] = "" if gpu is None else str(gpu)  # before any library looks for a GPU
-    from workflows.engine.process import EngineProcess, check_queues, names, serve
+    if gpu != "assigned":
+        os.environ["CUDA_VISIBLE_DEVICES"] = "" if gpu is None else str(gpu)  # before any library looks for a GPU
+    from workflows.engine.process import EngineProcess, check_queues, serve
     from workflows.steps.table import STEPS
 
     folder = farm.directory.resolve()
@@ -81,12 +84,23 @@ def worker(
             url=farm.url,
             queues=check_queues(queue),
             logs=folder / "logs",
-            names=names("cpu") if gpu is None else names("gpu")[gpu : gpu + 1],
+            names=_worker_names(gpu),
             roots=(str(folder), *root),
             steps=STEPS,
             modules=("workflows.steps.register",),
         )
     )
+
+
+def _worker_names(gpu: int | Literal["assigned"] | None) -> tuple[str, ...]:
+    """Names that a worker may have: of a GPU the only one, so that two workers cannot share it."""
+    from workflows.engine.process import names
+
+    if gpu is None:
+        return names("cpu")
+    if gpu == "assigned":  # several jobs of a scheduler may each see their own GPU as the first
+        return names(f"job{os.environ.get('SLURM_JOB_ID') or os.getpid()}-gpu", 1)
+    return names("gpu")[gpu : gpu + 1]
 
 
 def coordinator(farm: FarmOptions = _FARM) -> int:
