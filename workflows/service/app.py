@@ -3,13 +3,15 @@
 from collections.abc import AsyncIterator, Iterator
 from contextlib import asynccontextmanager
 from importlib.metadata import version
+from typing import Any
 
-from fastapi import FastAPI
+from fastapi import Depends, FastAPI
 from fastapi.dependencies.models import Dependant
-from fastapi.routing import APIRoute
+from fastapi.routing import APIRoute, RouteContext, iter_route_contexts
 from starlette.middleware import Middleware
 
 from workflows.service import health, login, problems, prometheus, rendering
+from workflows.service.access import need
 from workflows.service.api import actions, events, jobs
 from workflows.service.middleware import Guard
 from workflows.service.settings import ServiceSettings
@@ -42,7 +44,7 @@ def create_app(settings: ServiceSettings) -> FastAPI:
         title="gnm-registration",
         version=version("gnm-registration"),
         summary="Submit, follow and decide registrations of a farm.",
-        openapi_url=f"{API}/openapi.json",
+        openapi_url=None,  # it would be open to all
         docs_url=None,  # they load scripts from elsewhere
         redoc_url=None,
         lifespan=lifespan,
@@ -54,20 +56,27 @@ def create_app(settings: ServiceSettings) -> FastAPI:
         app.include_router(module.router, prefix=API)
     for module in (health, prometheus, login, rendering):
         app.include_router(module.router)
+
+    @app.get(f"{API}/openapi.json", dependencies=[Depends(need("viewer"))], include_in_schema=False)
+    def description() -> dict[str, Any]:
+        """Describe the API."""
+        return app.openapi()
+
     refuse_open_routes(app)
     return app
 
 
 def refuse_open_routes(app: FastAPI) -> None:
     """Raise RuntimeError if a route asks for no role and is not meant to."""
-    for route in app.routes:
-        if isinstance(route, APIRoute) and route.path not in OPEN and not role_of(route):
+    for route in iter_route_contexts(app.routes):
+        if route.path not in OPEN and not role_of(route):
             raise RuntimeError(f"{route.path} asks for no role")
 
 
-def role_of(route: APIRoute) -> str:
-    """Return the role that a route asks for; empty if it is open."""
-    return next(iter(_roles(route.dependant)), "")
+def role_of(route: RouteContext) -> str:
+    """Return the role that a route asks for, that of its router or a higher one of its own; empty if it is open."""
+    roles = list(_roles(route.dependant)) if isinstance(route.original_route, APIRoute) else []
+    return next((role for role in roles if role != "viewer"), roles[0] if roles else "")
 
 
 def _roles(dependant: Dependant) -> Iterator[str]:

@@ -5,7 +5,7 @@ import json
 
 def test_it_is_alive_and_says_what_it_offers(service):
     assert service.get("//healthz", role=None).json == {"status": "alive"}
-    described = service.get("/openapi.json", role=None)
+    described = service.get("/openapi.json")
     assert described.status == 200 and "/api/v1/jobs" in json.loads(described.body)["paths"]
 
 

@@ -14,7 +14,7 @@ from workflows.service.access import need
 from workflows.service.problems import RESPONSES, Problem
 from workflows.service.state import Service, ServiceState
 
-router = APIRouter(tags=["actions"], dependencies=[Depends(need("operator"))], responses=RESPONSES)
+router = APIRouter(tags=["actions"], dependencies=[Depends(need("operator"))], responses=RESPONSES, max_body_size=2**16)
 Part = Annotated[str, Field(max_length=800, examples=["monday"], description="a run, a part of one, or a job")]
 
 
