@@ -8,8 +8,8 @@ from rich.table import Table
 from rich.text import Text
 
 from registration import terminal
+from registration.evaluate.names import LEVEL_TITLES
 from registration.evaluate.residuals import residual_rows
-from registration.evaluate.verdict import LEVEL_TITLES
 from registration.types import METRIC_TITLES
 
 

@@ -1,48 +1,18 @@
 """Residuals of a registration in its own images: what can be measured without a scan (docs/formats.md, "Figures")."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 from torch import Tensor
 
+from registration.evaluate.names import RESIDUALS, ResidualKind
 from registration.fit.view_weights import view_errors
 from registration.frames import linear_to_srgb
 from registration.types import Rendered, Targets
 
 _LEVELS = 255  # of 8 bit sRGB
-
-
-@dataclass(frozen=True, kw_only=True)
-class ResidualKind:
-    """One kind of residual, as the report and the terminal show it."""
-
-    title: str
-    unit: str
-    meaning: str
-
-    def text(self, value: float) -> str:
-        """Return a value with its unit."""
-        space = "" if self.unit == "°" else "\N{NO-BREAK SPACE}"
-        return f"{value:.{2 if self.unit == 'mm' else 1}f}{space}{self.unit}"
-
-
-RESIDUALS: Mapping[str, ResidualKind] = {
-    "silhouette_px": ResidualKind(
-        title="silhouette", unit="px", meaning="mean distance of the outlines; the head is 512 px high"
-    ),
-    "normals_deg": ResidualKind(title="normals", unit="°", meaning="median angle between the normals"),
-    "depth_mm": ResidualKind(title="depth", unit="mm", meaning="median distance of the depth maps from the skin"),
-    "colour_levels": ResidualKind(
-        title="colour", unit="levels", meaning="mean difference of the colours, of 255 sRGB levels"
-    ),
-    "labels_percent": ResidualKind(title="labels", unit="%", meaning="pixels whose label is another one"),
-    "landmarks_px": ResidualKind(
-        title="landmarks", unit="px", meaning="median distance of the landmarks; the head is 512 px high"
-    ),
-}
 
 
 def view_residuals(

@@ -6,13 +6,11 @@ are documented in docs/evaluation.md.
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any
 
-from registration.evaluate.residuals import RESIDUALS
+from registration.evaluate.names import RESIDUALS, Level
 from registration.types import Status
 
-Level = Literal["good", "look", "wrong"]
-LEVEL_TITLES: Mapping[Level, str] = {"good": "good", "look": "look at it", "wrong": "wrong"}
 _ORDER: tuple[Level, ...] = ("good", "look", "wrong")
 
 

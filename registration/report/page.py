@@ -9,7 +9,8 @@ import cv2
 import numpy as np
 from markupsafe import Markup
 
-from registration.evaluate.residuals import RESIDUALS, residual_rows
+from registration.evaluate.names import RESIDUALS
+from registration.evaluate.residuals import residual_rows
 from registration.frames import linear_to_srgb
 from registration.report.charts import loss_curves
 from registration.report.heat_map import distance_paint, plain_paint, render_painted, scale_limit_mm, texture_paint

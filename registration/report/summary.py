@@ -6,8 +6,8 @@ from typing import Any
 
 from markupsafe import Markup
 
-from registration.evaluate.residuals import RESIDUALS
-from registration.evaluate.verdict import LEVEL_TITLES, judge
+from registration.evaluate.names import LEVEL_TITLES, RESIDUALS
+from registration.evaluate.verdict import judge
 from registration.report.remarks import Assessed, format_mm, headline, remarks
 from registration.report.templates import environment
 from registration.storage.registration_folder import REPORT, read_manifest, update_figures

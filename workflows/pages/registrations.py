@@ -4,7 +4,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from registration.evaluate.verdict import LEVEL_TITLES, Level
+from registration.evaluate.names import LEVEL_TITLES, Level
 from workflows.records.headline import Headline, headline_value
 
 MISSING = "–"

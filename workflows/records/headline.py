@@ -5,8 +5,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from registration.evaluate.residuals import RESIDUALS
-from registration.evaluate.verdict import LEVEL_TITLES, Level
+from registration.evaluate.names import LEVEL_TITLES, RESIDUALS, Level
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 import torch
 
-from registration.evaluate.residuals import RESIDUALS, residual_figures, view_residuals
+from registration.evaluate.names import RESIDUALS
+from registration.evaluate.residuals import residual_figures, view_residuals
 from registration.frames import srgb_to_linear
 from registration.types import Camera, Pixels, Rendered, Targets
 

@@ -4,8 +4,9 @@ from typing import Any
 
 import pytest
 
+from registration.evaluate.names import LEVEL_TITLES
 from registration.evaluate.residuals import residual_figures
-from registration.evaluate.verdict import LEVEL_TITLES, judge
+from registration.evaluate.verdict import judge
 
 
 def scan(median: float, mean: float, p95: float) -> dict[str, Any]:
