@@ -85,7 +85,7 @@ test-durability: setup
 		exit 1
 	}
 	rm -f $(DURABILITY)
-	GNMREG_DURABILITY=$(DURABILITY) $(BIN)/python -m pytest -m durability tests/workflows/farm
+	GNMREG_DURABILITY=$(DURABILITY) $(BIN)/python -m pytest -m durability tests/workflows
 	cat $(DURABILITY)
 
 $(INSTALLED): .venv/bin/python

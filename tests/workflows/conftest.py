@@ -15,6 +15,7 @@ from registration.types import Registration
 from tests.registration.capture import small
 from tests.registration.register import synthetic
 from tests.registration.report.test_page import a_registration
+from tests.workflows.farm.databases import farm, postgres  # noqa: F401  fixtures
 
 MODEL = synthetic.MODEL
 

@@ -1,6 +1,8 @@
 """Log records of this package and of DBOS: to stderr, printable, without passwords."""
 
+import json
 import logging
+import os
 import sys
 
 from dbos._error import DBOSAwaitedWorkflowCancelledError, DBOSWorkflowCancelledError
@@ -13,15 +15,39 @@ from workflows.ids import redact
 _REPORTED = (JobFailed, DBOSWorkflowCancelledError, DBOSAwaitedWorkflowCancelledError)
 
 
+FORMAT = "GNMREG_LOG_FORMAT"  # an environment variable: "json" for one JSON object a line, from the level info
+JSON = "json"
+
+
 def configure_logging() -> None:
-    """Write warnings and errors of the loggers "dbos" and "gnmreg" to stderr, and nowhere else."""
+    """Write warnings and errors of our loggers, of DBOS and of uvicorn to stderr as text, and nowhere else.
+
+    With GNMREG_LOG_FORMAT=json also information, one JSON object for each record, with the job's id where there is one.
+    """
+    as_json = os.environ.get(FORMAT) == JSON
     handler = _StderrHandler()
-    handler.setFormatter(logging.Formatter("%(asctime)s %(name)s: %(message)s", datefmt="%H:%M:%S"))
+    plain = logging.Formatter("%(asctime)s %(name)s: %(message)s", datefmt="%H:%M:%S")
+    handler.setFormatter(JsonFormatter() if as_json else plain)
     handler.addFilter(_Redacting())
-    for name in ("dbos", "gnmreg"):
+    for name in ("dbos", "gnmreg", "uvicorn"):
         logger = logging.getLogger(name)
         logger.handlers, logger.propagate = [handler], False
-        logger.setLevel(logging.WARNING)
+        logger.setLevel(logging.INFO if as_json and name == "gnmreg" else logging.WARNING)
+
+
+class JsonFormatter(logging.Formatter):
+    """One JSON object for each record of a log, with what its `extra` holds."""
+
+    _OWN = frozenset((*vars(logging.makeLogRecord({})), "message", "taskName"))
+
+    def format(self, record: logging.LogRecord) -> str:
+        """Return the line."""
+        content = {"time": round(record.created, 3), "level": record.levelname.lower(), "logger": record.name}
+        content |= {"message": record.getMessage()}
+        content |= {key: value for key, value in vars(record).items() if key not in self._OWN}
+        if record.exc_text or record.exc_info:
+            content["error"] = record.exc_text or self.formatException(record.exc_info)  # type: ignore[arg-type]
+        return json.dumps(content, default=str)
 
 
 class _StderrHandler(logging.Handler):

@@ -158,8 +158,13 @@ def _register_workflows(process: EngineProcess, url: str, child: StepProcess | N
             return {"status": "refused", "reason": f"{error.where}: expected {error.expected}, got {error.got}"}
         if number > 1:
             log.warning("%s: attempt %d", DBOS.workflow_id, number)
+        about = {"job": DBOS.workflow_id, "attempt": number, "step": spec["step"], "executor": name}
+        log.info("job begins", extra=about)
         title = f"attempt {number} of {ATTEMPTS} on {name}"
-        return await child.run(step.function, arguments, log=file, timeout_s=step.timeout_s, title=title)
+        outcome = await child.run(step.function, arguments, log=file, timeout_s=step.timeout_s, title=title)
+        shown = {key: outcome.get(key) for key in ("status", "reason", "seconds")}
+        log.info("job ends", extra={**about, **shown})
+        return outcome
 
     @DBOS.workflow(name="job", max_recovery_attempts=RECOVERIES)
     async def job(spec: Any, queue: str) -> Any:

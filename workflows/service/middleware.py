@@ -1,6 +1,5 @@
 """What every response gets and every request passes: the Host header's check, security headers, logs of requests."""
 
-import json
 import logging
 import time
 from http import HTTPStatus
@@ -82,20 +81,6 @@ class Guard:
                 "who": who,
             },
         )
-
-
-class JsonFormatter(logging.Formatter):
-    """One JSON object for each record of a log, with what its `extra` holds."""
-
-    _OWN = frozenset(vars(logging.makeLogRecord({})))
-
-    def format(self, record: logging.LogRecord) -> str:
-        """Return the line."""
-        content = {"time": round(record.created, 3), "level": record.levelname.lower(), "message": record.getMessage()}
-        content |= {key: value for key, value in vars(record).items() if key not in self._OWN and key != "message"}
-        if record.exc_info:
-            content["error"] = self.formatException(record.exc_info)
-        return json.dumps(content, default=str)
 
 
 def _host(request: Request) -> str | None:

@@ -2,7 +2,6 @@
 
 import logging
 import os
-import sys
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -12,10 +11,10 @@ import uvicorn
 
 from registration.errors import InputError
 from workflows.engine.database import redacted_url
+from workflows.engine.log_output import FORMAT, JSON, configure_logging
 from workflows.engine.process import migrate
 from workflows.farm.local import FarmProcesses, LocalFarm, local_gpus
 from workflows.service.app import create_app
-from workflows.service.middleware import JsonFormatter
 from workflows.service.settings import CAPTURES, MODELS, RESULTS, ServiceSettings
 from workflows.service.tokens import ROLES, Token, Tokens
 
@@ -45,8 +44,9 @@ def serve(settings: ServiceSettings, *, workers: int = 0) -> None:
         )
     for name in (CAPTURES, MODELS, RESULTS):
         (settings.folder / name).mkdir(parents=True, exist_ok=True)
+    os.environ.setdefault(FORMAT, JSON)  # of this process and of the farm's
+    configure_logging()
     migrate(settings.url)
-    _log_as_json()
     app = create_app(settings)
     server = _Server(app, settings)
     with _farm(settings, workers):
@@ -126,12 +126,3 @@ def _farm(settings: ServiceSettings, workers: int) -> Iterator[None]:
     finally:
         stop.set()
         thread.join()
-
-
-def _log_as_json() -> None:
-    handler = logging.StreamHandler(sys.stderr)
-    handler.setFormatter(JsonFormatter())
-    for name in ("gnmreg.service", "uvicorn"):
-        logger = logging.getLogger(name)
-        logger.handlers, logger.propagate = [handler], False
-        logger.setLevel(os.environ.get("GNMREG_LOG", "INFO").upper() if name != "uvicorn" else "WARNING")

@@ -4,47 +4,20 @@ Light steps stand in for registrations; the tests check who runs them, how often
 """
 
 import os
-import re
 import signal
 import time
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-import sqlalchemy as sa
 
-from bench.support.postgres_server import Server, programs, server
-from tests.workflows.farm.harness import QUICK, Farm, alive, children_of, open_farm
+from tests.workflows.farm.harness import QUICK, Farm, alive, children_of
 from workflows.engine.alive import lock_key
-from workflows.engine.database import checked_url, engine
 from workflows.engine.jobs import FlowJob, Job
 from workflows.engine.metrics import queue_metrics
 from workflows.records.store import Store
 
 pytestmark = pytest.mark.durability
 RESULTS = Path(os.environ.get("GNMREG_DURABILITY", "build/durability.txt"))
-
-
-@pytest.fixture(scope="session")
-def postgres() -> Iterator[Server]:
-    if programs() is None:
-        pytest.fail("no PostgreSQL here: sudo apt-get install -y postgresql")
-    with server() as running:
-        yield running
-
-
-@pytest.fixture(params=["sqlite", "postgres"])
-def farm(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Farm]:
-    url = None
-    if request.param == "postgres":
-        base = request.getfixturevalue("postgres").url
-        name = "q" + re.sub(r"\W", "", request.node.name).lower()[-40:]
-        connection = engine(checked_url(base)).connect().execution_options(isolation_level="AUTOCOMMIT")
-        connection.execute(sa.text(f"CREATE DATABASE {name}"))
-        connection.close()
-        url = base.rpartition("/")[0] + f"/{name}"
-    with open_farm(tmp_path, url) as opened:
-        yield opened
 
 
 def work(farm: Farm, identity: str, seconds: float = 0.0) -> Job:
