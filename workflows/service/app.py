@@ -12,7 +12,7 @@ from starlette.middleware import Middleware
 
 from workflows.service import health, login, problems, prometheus, rendering
 from workflows.service.access import need
-from workflows.service.api import actions, events, jobs
+from workflows.service.api import actions, captures, events, jobs
 from workflows.service.middleware import Guard
 from workflows.service.settings import ServiceSettings
 from workflows.service.state import ServiceState
@@ -34,11 +34,11 @@ def create_app(settings: ServiceSettings) -> FastAPI:
 
     @asynccontextmanager
     async def lifespan(app: FastAPI) -> AsyncIterator[None]:
-        state.board.start()
+        state.start()
         try:
             yield
         finally:
-            state.board.stop()
+            state.stop()
 
     app = FastAPI(
         title="gnm-registration",
@@ -52,7 +52,7 @@ def create_app(settings: ServiceSettings) -> FastAPI:
     )
     app.state.service = state
     problems.install(app)
-    for module in (jobs, actions, events):
+    for module in (jobs, actions, events, captures):
         app.include_router(module.router, prefix=API)
     for module in (health, prometheus, login, rendering):
         app.include_router(module.router)

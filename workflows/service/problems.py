@@ -31,6 +31,7 @@ class ProblemDetails(BaseModel):
     expected: str | None = None
     got: str | None = None
     fix: str | None = None
+    more: list[str] | None = None  # other things that are wrong
 
 
 class Problem(Exception):
@@ -84,6 +85,7 @@ RESPONSES: dict[int | str, dict[str, Any]] = {
         HTTPStatus.FORBIDDEN: "The token lacks the role, or the request comes from another page",
         HTTPStatus.NOT_FOUND: "No such run, job, capture or artifact",
         HTTPStatus.CONFLICT: "The state of the queue does not allow it",
+        HTTPStatus.REQUEST_ENTITY_TOO_LARGE: "The body, or what it unpacks to, is too large",
         HTTPStatus.UNPROCESSABLE_ENTITY: "Input that cannot be used",
         HTTPStatus.TOO_MANY_REQUESTS: "Too many failed tokens",
     }.items()

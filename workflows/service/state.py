@@ -15,8 +15,10 @@ from workflows.engine.reader import QueueReader
 from workflows.service.access import Access
 from workflows.service.audit import AuditLog
 from workflows.service.board import Board
+from workflows.service.places import Places
 from workflows.service.settings import RESULTS, ServiceSettings
 from workflows.service.tokens import Tokens
+from workflows.service.uploads import Uploads
 
 SIZE_S = 300.0  # between two counts of the results' bytes
 METRICS_S = 2.0  # for which the figures of the queue are kept
@@ -58,6 +60,8 @@ class ServiceState:
     def __init__(self, settings: ServiceSettings) -> None:
         """Open the queue, which `migrate` created, and the folder of the service's state."""
         self.settings = settings
+        self.places = Places(settings)
+        self.uploads = Uploads(settings)
         self.tokens = Tokens(settings.state)
         self.audit = AuditLog(settings.state)
         self.access = Access(settings, self.tokens, self.audit)
@@ -66,6 +70,16 @@ class ServiceState:
         self.store_size = StoreSize(settings.folder / RESULTS)
         self._metrics: dict[str, _Kept] = {}
         self._lock = Lock()
+
+    def start(self) -> None:
+        """Read the queue and follow it; delete what a service that was killed has left."""
+        self.uploads.start()
+        self.board.start()
+
+    def stop(self) -> None:
+        """End threads and child processes."""
+        self.board.stop()
+        self.uploads.stop()
 
     def metrics(self, run: str | None = None) -> QueueMetrics:
         """Return the figures of a run, or of the whole queue; at most two seconds old."""

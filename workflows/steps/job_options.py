@@ -4,10 +4,9 @@ from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
-from registration.detect.providers import PROVIDERS
 from registration.errors import InputError
 from registration.fit.recipes import RECIPES, load_recipe, named_recipe
-from registration.options import RegisterOptions
+from registration.options import DETECTOR, RegisterOptions
 from registration.storage.records import structure
 
 
@@ -39,11 +38,11 @@ def from_job(value: Mapping[str, Any] | None) -> RegisterOptions:
     options: RegisterOptions = structure(value or {}, RegisterOptions, where="options", title="options of a job")
     if isinstance(options.recipe, str):
         named_recipe(options.recipe)
-    if options.detector not in PROVIDERS:
+    if options.detector != DETECTOR:  # the only one, whose name needs no import of what it computes with
         raise InputError(
             "There is no such landmark provider",
             where="detector",
-            expected=" or ".join(PROVIDERS),
+            expected=DETECTOR,
             got=options.detector,
             fix="choose one of them",
         )
