@@ -8,21 +8,20 @@ from pathlib import Path
 
 import numpy as np
 
-from bench.sampler_checks import BenchOptions, Figure, population
+from bench.sampler_checks import BenchOptions, Figure, penetration, population
 from coregister.first_model import build
-from coregister.sampler import pictures
 from coregister.sampler.categories import Blend, blended
-from coregister.sampler.decoder import Decoder, Part, Sampler
-from coregister.sampler.penetration import LIMIT_MM, HeadMaker
-from coregister.sampler.sampling import DrawnHead, SampleSettings, draw_heads
+from coregister.sampler.decoder import Decoder, Part
+from coregister.sampler.penetration import HeadMaker
+from coregister.sampler.samples import split_by_subject
 from coregister.sampler.storage import SamplerRecord, read_sampler
 from coregister.sampler.training import TrainingSettings
 from registration.model import gnm_npz
 from registration.progress import console_progress
-from registration.report.head_pictures import write_sheet
-from workflows.steps.sampler import SamplerInput, train_sampler
+from workflows.records.coefficients import read_coefficients
+from workflows.steps.sampler import SamplerInput, coefficient_sets, train_sampler
 
-MIN_ACCURACY, MAX_PENETRATING, MAX_MINUTES = 0.9, 0.02, 10.0
+MIN_ACCURACY, MAX_MINUTES = 0.9, 10.0
 _BLENDED = 60  # draws of a blend, and of each of its ends
 
 
@@ -40,18 +39,23 @@ def figures(options: BenchOptions) -> Iterator[Figure]:
         value = f"{seconds:.0f} s for {options.count} people; predicted identities of others to {people.error:.3f} rms"
         yield Figure(name="making coefficients", value=value)
         settings = TrainingSettings(steps=options.steps, seed=options.seed)
+        given = SamplerInput(source=file)
         with console_progress() as progress:
-            record = train_sampler(SamplerInput(source=file), model, folder / "sampler", settings, progress)
+            record = train_sampler(given, model, folder / "sampler", settings, progress)
         yield from _trained(record)
         sampler, _ = read_sampler(folder / "sampler")
         for part, decoder in sampler.decoders.items():
             yield from _blends(part, decoder, np.random.default_rng([41, options.seed]))
-        yield from _penetration(sampler, HeadMaker(data), options)
+        sets, _ = coefficient_sets(read_coefficients(file, None, given.factors), given)
+        _, held_out = split_by_subject(sets["expression"], options.seed)
+        yield from penetration.figures(sampler, HeadMaker(data), held_out, options)
 
 
 def _trained(record: SamplerRecord) -> Iterator[Figure]:
-    minutes = sum(record.seconds.values()) / 60
-    value = ", ".join(f"{name} {seconds:.0f} s" for name, seconds in record.seconds.items())
+    minutes = sum(record.seconds.values()) / 60  # with the audit
+    value = ", ".join(
+        f"{name} {record.seconds[name]:.0f} s, CPU {cpu:.0f} s" for name, cpu in record.cpu_seconds.items()
+    )
     kept = minutes <= MAX_MINUTES
     yield Figure(
         name="training", value=f"{value}; {record.threads} threads", limit=f"<= {MAX_MINUTES:.0f} min", kept=kept
@@ -114,23 +118,3 @@ def _draws(decoder: Decoder, factor: str, weights: dict[str, float], rng: np.ran
     }
     condition = np.tile(blended(blends, decoder.factors), (_BLENDED, 1))
     return decoder.decode(rng.standard_normal((_BLENDED, decoder.latent)), condition)
-
-
-def _penetration(sampler: Sampler, maker: HeadMaker, options: BenchOptions) -> Iterator[Figure]:
-    """Draw heads of all expressions and count those that penetrate, before and after they are drawn again."""
-    heads, names = list[DrawnHead](), sampler.decoders["expression"].factors[0].categories
-    each = max(1, options.audited // len(names))
-    for number, name in enumerate(names):
-        settings = SampleSettings(wanted={"expression": name}, count=each, seed=options.seed + 1000 * number)
-        heads += draw_heads(sampler, maker, settings).heads
-    first = sum(head.redrawn > 0 for head in heads) / len(heads)
-    left = sum(head.penetrates for head in heads)
-    value = f"{first:.2%} of {len(heads)}; {left} after {sum(head.redrawn for head in heads)} redraws"
-    kept = first <= MAX_PENETRATING
-    yield Figure(name="penetrating before redrawing", value=value, limit=f"<= {MAX_PENETRATING:.0%}", kept=kept)
-    shallow = [name for name, depth in sampler.depth_mm.items() if depth <= LIMIT_MM]
-    value = f"{len(shallow)} of {len(names)} expressions; the deepest {max(sampler.depth_mm.values()):.1f} mm"
-    yield Figure(name=f"training samples less deep than {LIMIT_MM} mm", value=value)
-    if options.out:
-        page = pictures.contact_sheet(maker, heads[::each], "a head of each expression")
-        write_sheet(page, options.out / "sheet.png")

@@ -50,6 +50,6 @@ class Sampler:
 
     decoders: Mapping[Part, Decoder]
     model: str = ""  # content hash of the head model; empty: unknown
-    depth_mm: Mapping[str, float] = field(default_factory=dict)  # expression category -> how deep its training samples
-    # penetrate (95 % of them), mm; empty: unknown
+    # Expression category -> how deep its training samples penetrate, mm, as `training_depths_mm` returns it.
+    depth_mm: Mapping[str, float] = field(default_factory=dict)  # empty: unknown
     origin: str = ""  # what it is, for people

@@ -25,6 +25,7 @@ class CoefficientSet:
     categories: Int[np.ndarray, "N F"]  # indices into the factors' categories
     factors: tuple[Factor, ...]
     subjects: tuple[str, ...]
+    identities: Float[np.ndarray, "N I"] | None = None  # of expressions: the coefficients of those who make them
 
     def rows(self, members: Bool[np.ndarray, "N"]) -> "CoefficientSet":
         """Return the set of some samples, with the same factors."""
@@ -33,6 +34,7 @@ class CoefficientSet:
             categories=self.categories[members],
             factors=self.factors,
             subjects=tuple(name for name, kept in zip(self.subjects, members.tolist(), strict=True) if kept),
+            identities=None if self.identities is None else self.identities[members],
         )
 
     @property

@@ -49,6 +49,7 @@ class DrawnHead:
     expression: Float[np.ndarray, "E"]
     categories: Mapping[str, Mapping[str, float]]  # factor -> category -> weight
     depth_mm: float | None  # of the penetration; None: not audited
+    first_depth_mm: float | None  # before it was drawn again
     redrawn: int  # how often
     penetrates: bool  # still, after `MAX_REDRAWS`
 
@@ -117,6 +118,7 @@ def _draw(
     weights = blends["expression"].weights if "expression" in blends else {}
     limit = limit_mm(weights, sampler.depth_mm)
     best: tuple[float, dict[Part, np.ndarray]] | None = None
+    first = None
     redrawn = -1
     while redrawn < MAX_REDRAWS:
         redrawn += 1
@@ -125,6 +127,8 @@ def _draw(
             latent = rng.standard_normal((1, decoder.latent))
             drawn[part] = decoder.decode(latent, blended(blends, decoder.factors)[None])[0]
         depth = maker.depth_mm(maker.vertices(drawn["identity"], drawn["expression"])) if settings.audit else None
+        if redrawn == 0:
+            first = depth
         if best is None or (depth is not None and depth < best[0]):
             best = (depth or 0.0, drawn)
         if depth is None or depth <= limit:
@@ -136,6 +140,7 @@ def _draw(
         expression=chosen["expression"],
         categories={name: dict(blend.weights) for name, blend in blends.items()},
         depth_mm=depth_mm if settings.audit else None,
+        first_depth_mm=first,
         redrawn=redrawn,
         penetrates=settings.audit and depth_mm > limit,
     )

@@ -49,10 +49,11 @@ class SamplerRecord(Record, kind="gnm-sampler", title="sampler", fix=_FIX):
     parts: Mapping[str, PartRecord]
     content_id: str  # sha256 of the arrays
     model: str = ""  # content hash of the head model that the coefficients belong to
-    depth_mm: Mapping[str, float] = field(default_factory=dict)
+    depth_mm: Mapping[str, float] = field(default_factory=dict)  # as `Sampler.depth_mm`
     inputs: Mapping[str, str] = field(default_factory=dict)  # what the coefficients were read from -> digest
     remarks: tuple[str, ...] = ()
-    seconds: Mapping[str, float] = field(default_factory=dict)  # part -> duration of its training
+    seconds: Mapping[str, float] = field(default_factory=dict)  # part -> duration of its training; of the audit
+    cpu_seconds: Mapping[str, float] = field(default_factory=dict)  # of all cores together
     threads: int = 0  # of the training; other numbers may give slightly other networks
     versions: Mapping[str, str] = field(default_factory=versions)
 

@@ -1,8 +1,9 @@
 """`gnmreg sampler train` and `gnmreg sample`: a sampler trained from registrations, and heads drawn from it."""
 
 import time
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -30,6 +31,7 @@ from workflows.records.coefficients import Coefficients, read_coefficients
 from workflows.records.subject import NEUTRAL
 
 EXPRESSION = "expression"  # the factor of the expression network
+AUDIT = "audit"  # its duration, in `SamplerRecord.seconds`
 CURVES, SHEET, COEFFICIENTS, MANIFEST, MESHES = (
     *("training.png", "contact_sheet.png", "coefficients.npz", "manifest.json", "meshes"),
 )
@@ -98,17 +100,18 @@ def train_sampler(
     read = read_coefficients(given.source, given.captures, given.factors)
     content = gnm_npz.content_hash(data)
     _check_model(read, data, content, model)
-    sets, remarks = _coefficient_sets(read, given)
-    networks, parts, seconds = dict[Part, TrainedNetwork](), dict[Part, PartRecord](), dict[str, float]()
+    sets, remarks = coefficient_sets(read, given)
+    networks, parts = dict[Part, TrainedNetwork](), dict[Part, PartRecord]()
+    maker, depths = HeadMaker(data), dict[str, float]()
+    seconds, cpu_seconds = dict[str, float](), dict[str, float]()
     for part, samples in sets.items():
         training, held_out = split_by_subject(samples, settings.seed)
-        begin = time.perf_counter()
-        networks[part] = train(training, held_out, LAYERS[part], settings, PrefixedProgress(progress, part))
-        seconds[part] = round(time.perf_counter() - begin, 1)
+        with _timed(part, seconds, cpu_seconds):
+            networks[part] = train(training, held_out, LAYERS[part], settings, PrefixedProgress(progress, part))
         parts[part] = _part_record(networks[part], training, held_out, settings)
-    maker = HeadMaker(data)
-    progress.message("auditing the training samples' penetration")
-    depths = training_depths_mm(maker, sets["expression"], settings.seed) if "expression" in sets else {}
+        if part == "expression":
+            with _timed(AUDIT, seconds, cpu_seconds):
+                depths = training_depths_mm(maker, training, settings.seed, progress)
     arrays = storage.arrays_of(networks)
     record = SamplerRecord(
         parts={str(part): found for part, found in parts.items()},
@@ -118,6 +121,7 @@ def train_sampler(
         inputs=read.inputs,
         remarks=(*read.remarks, *remarks),
         seconds=seconds,
+        cpu_seconds=cpu_seconds,
         threads=torch.get_num_threads(),
     )
     decoders = {part: networks[part].decoder(sets[part].factors) for part in networks}
@@ -128,6 +132,15 @@ def train_sampler(
         write_sheet(pictures.contact_sheet(maker, heads.heads, "drawn heads"), temporary / SHEET)
         storage.write_sampler(record, arrays, temporary)
     return record
+
+
+@contextmanager
+def _timed(name: str, seconds: dict[str, float], cpu_seconds: dict[str, float]) -> Iterator[None]:
+    """Record how long the block takes, on the clock and of all cores together."""
+    wall, cpu = time.perf_counter(), time.process_time()
+    yield
+    seconds[name] = round(time.perf_counter() - wall, 1)
+    cpu_seconds[name] = round(time.process_time() - cpu, 1)
 
 
 def sample(sampler_path: Path, model: Path, out: Path, settings: SampleSettings, progress: Progress) -> DrawnHeads:
@@ -211,12 +224,30 @@ def draw_each_category(sampler: Sampler, maker: HeadMaker, seed: int, progress: 
     return DrawnHeads(heads=tuple(heads), remarks=())
 
 
-def _coefficient_sets(read: Coefficients, given: SamplerInput) -> tuple[dict[Part, CoefficientSet], list[str]]:
-    """The identities, one of each subject, and the expressions; samples without tags are left out and counted."""
+def coefficient_sets(read: Coefficients, given: SamplerInput) -> tuple[dict[Part, CoefficientSet], list[str]]:
+    """Return what each network is trained on, and remarks.
+
+    Args:
+        read: coefficients and tags. Its identities are those of each subject once, its expressions all but the
+            neutrals; identities without a tag are left out and counted.
+        given: what they were read from.
+
+    Raises:
+        InputError: too few samples for the categories, or neither tags nor expressions.
+    """
     sets, remarks = dict[Part, CoefficientSet](), list[str]()
     if given.factors:
         first = sorted({name: row for row, name in reversed(list(enumerate(read.subjects)))}.values())
         rows = [row for row in first if all(read.tags[name][row] for name in given.factors)]
+        if not rows:
+            have = [f"{name} of {sum(bool(read.tags[name][row]) for row in first)}" for name in given.factors]
+            raise InputError(
+                "No subject has all of the tags",
+                where=given.source,
+                expected=", ".join(given.factors),
+                got=f"of {len(first)} subjects " + ", ".join(have),
+                fix="add the tags to the neutrals' captures, or name those that they have with --factors",
+            )
         if len(rows) < len(first):
             remarks.append(f"{len(first) - len(rows)} subjects without a tag are left out of the identities")
         names = [tuple(read.tags[name][row] for name in given.factors) for row in rows]
@@ -224,7 +255,8 @@ def _coefficient_sets(read: Coefficients, given: SamplerInput) -> tuple[dict[Par
     rows = [row for row, label in enumerate(read.labels) if label != NEUTRAL]
     if rows:
         names = [(read.labels[row],) for row in rows]
-        sets["expression"] = _set(read.expression, read, rows, names, (EXPRESSION,), given.source)
+        expressions = _set(read.expression, read, rows, names, (EXPRESSION,), given.source)
+        sets["expression"] = replace(expressions, identities=read.identity[rows])
     else:
         remarks.append("there are no expressions: only identities can be drawn")
     if not sets:

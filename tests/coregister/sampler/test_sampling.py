@@ -3,7 +3,8 @@ import pytest
 
 from coregister.sampler.categories import Factor
 from coregister.sampler.decoder import Decoder, Sampler
-from coregister.sampler.penetration import LIMIT_MM, HeadMaker, limit_mm
+from coregister.sampler.penetration import AUDITED, LIMIT_MM, PERCENTILE, HeadMaker, limit_mm, training_depths_mm
+from coregister.sampler.samples import CoefficientSet
 from coregister.sampler.sampling import MAX_REDRAWS, SampleSettings, draw_heads
 from registration.errors import InputError
 from registration.model import gnm_npz
@@ -58,7 +59,7 @@ def test_heads_that_penetrate_are_drawn_again_and_counted(maker, sampler, monkey
     drawn = draw_heads(sampler, maker, SampleSettings(wanted={"expression": "open"}, count=2))
     assert [head.redrawn for head in drawn.heads] == [2, 0]
     assert (drawn.first_penetrating, drawn.redrawn) == (1, 2)
-    assert drawn.heads[0].depth_mm == 0.5
+    assert (drawn.heads[0].depth_mm, drawn.heads[0].first_depth_mm) == (0.5, LIMIT_MM + 1)
 
 
 def test_a_head_that_always_penetrates_is_the_least_deep_one_and_says_so(maker, sampler, monkeypatch):
@@ -79,6 +80,28 @@ def test_categories_whose_training_samples_penetrate_may_do_so():
     assert limit_mm({}, {"closed": 3.0}) == LIMIT_MM
     assert limit_mm({"closed": 0.2, "open": 0.8}, {"closed": 3.0, "open": 0.1}) == 3.0
     assert limit_mm({"closed": 0.0, "open": 1.0}, {"closed": 3.0, "open": 0.1}) == LIMIT_MM
+
+
+def test_training_samples_are_audited_with_their_own_identities(maker, monkeypatch):
+    """Depths that their identities determine, evenly distributed: a sample in twenty is deeper than the depth found."""
+    count = 2 * AUDITED
+    depth = np.arange(count) // 2 + np.arange(count) % 2 * 1000.0  # closed 0, 1, ...; open 1000, 1001, ...
+    identities = np.zeros((count, len(maker.data.vertex_identity_basis)), np.float32)
+    identities[:, 0] = depth
+    samples = CoefficientSet(
+        coefficients=np.zeros((count, len(maker.data.expression_basis)), np.float32),
+        categories=(np.arange(count) % 2)[:, None],
+        factors=(ACTS,),
+        subjects=tuple(str(k) for k in range(count)),
+        identities=identities,
+    )
+    monkeypatch.setattr(maker, "vertices", lambda identity, expression: identity)
+    monkeypatch.setattr(maker, "depth_mm", lambda vertices: float(vertices[0]))
+    found = training_depths_mm(maker, samples, 0)
+    expected = PERCENTILE / 100 * (AUDITED + 1) - 1
+    assert found == pytest.approx({"closed": expected, "open": 1000 + expected})
+    few = training_depths_mm(maker, samples.rows(np.arange(count) < 4), 0)
+    assert few == {"closed": 1.0, "open": 1001.0}
 
 
 def test_an_identity_that_does_not_fit_is_left_out_unless_it_is_asked_for(maker, sampler):

@@ -13,8 +13,17 @@ from registration.storage.registration_folder import save_registration
 from tests.registration.report.test_page import a_registration
 
 
-def write_subject(folder: Path, name: str, data: GNMData, heads: dict[str, tuple[str, np.ndarray, np.ndarray]]) -> Path:
-    """Write a subject folder; heads: registration -> (expression, vertices, confidence), the neutral first."""
+def write_subject(
+    folder: Path,
+    name: str,
+    data: GNMData,
+    heads: dict[str, tuple[str, np.ndarray, np.ndarray]],
+    coefficients: dict[str, dict[str, np.ndarray]] | None = None,
+) -> Path:
+    """Write a subject folder; heads: registration -> (expression, vertices, confidence), the neutral first.
+
+    Coefficients: registration -> its `identity` and `expression`.
+    """
     model = gnm_npz.content_hash(data)
     rows = []
     for row, (expression, vertices, confidence) in heads.items():
@@ -25,6 +34,7 @@ def write_subject(folder: Path, name: str, data: GNMData, heads: dict[str, tuple
             triangles=data.triangles.astype(np.int32),
             corner_uvs=np.zeros((len(data.triangles), 3, 2), np.float32),
             inputs={"model": model},
+            **(coefficients or {}).get(row, {}),
         )
         save_registration(result, folder / row, "<html></html>")
         rows.append(

@@ -16,6 +16,8 @@ from registration.model import gnm_npz
 from registration.storage.mesh_files import read_mesh
 from tests.conftest import FIXTURES
 from tests.coregister.sampler.hdf5_decoder import write_decoder
+from tests.registration.capture import small
+from tests.registration.stabilize.runs import write_subject
 from workflows.cli.app import main
 from workflows.records.coefficients import read_coefficients
 
@@ -149,6 +151,62 @@ def test_a_changed_sampler_is_refused(trained, tmp_path):
         record_["parts"]["identity"][path] = value
         with pytest.raises(InputError):
             read_sampler(changed(RECORD, json.dumps(record_).encode()))
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+    """A run of five subjects with two expressions each, and their captures; the last subject has no gender."""
+    folder = tmp_path_factory.mktemp("run")
+    data = gnm_npz.read(MODEL)
+    small.make(folder / "capture")
+    rng = np.random.default_rng(2)
+    for number, tag in enumerate(("female", "male", "female", "male", None)):
+        person, identity = f"p{number}", rng.normal(size=SIZES[0]).astype(np.float32)
+        acts = {"rest": "neutral", "a": "smile", "b": "jaw_open"}
+        heads = {
+            name: (label, data.template_vertex_positions, np.ones(len(data.template_vertex_positions)))
+            for name, label in acts.items()
+        }
+        coefficients = {
+            name: {"identity": identity, "expression": (k * rng.normal(size=SIZES[1])).astype(np.float32)}
+            for k, name in enumerate(acts)
+        }
+        write_subject(folder / "run" / person, person, data, heads, coefficients)
+        shutil.copytree(folder / "capture", folder / "captures" / person / "rest")
+        lines = [f'subject = "{person}"', 'expression = "neutral"', 'units = "m"', f"age = {30 + 10 * (number // 2)}"]
+        lines += [f'gender = "{tag}"'] if tag else []
+        (folder / "captures" / person / "rest" / "capture.toml").write_text("\n".join([*lines, ""]))
+    return folder / "run", folder / "captures"
+
+
+def test_a_run_is_trained_on_with_the_tags_of_its_captures(run, tmp_path, capsys):
+    registrations, captures = run
+    words = ["sampler", "train", registrations, "--captures", captures, "--model", MODEL, "--out", tmp_path / "S"]
+    assert main([str(word) for word in (*words, "--factors", "gender", "--steps", 20)]) in (0, 1)
+    assert "1 subjects without a tag are left out" in capsys.readouterr().out
+    _, record = read_sampler(tmp_path / "S")
+    assert record.parts["identity"].counts == {"gender": {"female": 2, "male": 2}}
+    counts = record.parts["expression"].counts["expression"]
+    assert set(counts) == {"jaw_open", "smile"} and sum(counts.values()) == 10
+    assert "p0/rest" in record.inputs
+    read = read_coefficients(registrations, captures, ("gender", "age"))
+    assert read.tags["age"] == ("30-39",) * 6 + ("40-49",) * 6 + ("50-59",) * 3
+    assert read.labels[:3] == ("neutral", "smile", "jaw_open") and (read.identity[0] == read.identity[2]).all()
+
+
+def test_what_a_run_lacks_for_its_tags_is_said(run, tmp_path, capsys):
+    registrations, captures = run
+    words = ["sampler", "train", registrations, "--model", MODEL, "--out", tmp_path / "S", "--steps", 1]
+    for more, found in (
+        ((), "give --captures"),
+        (("--captures", captures), "of 5 subjects gender of 4, ethnicity of 0"),
+        (("--captures", tmp_path / "nowhere"), "nowhere"),
+        (("--captures", captures, "--factors", "age"), "5 for 3"),
+    ):
+        assert main([str(word) for word in (*words, *more)]) == 2
+        assert found in capsys.readouterr().err
+    assert main([str(word) for word in (*words, "--factors")]) in (0, 1)  # expressions alone need no captures
+    assert set(read_sampler(tmp_path / "S")[1].parts) == {"expression"}
 
 
 def test_a_run_needs_registrations(tmp_path):
