@@ -18,7 +18,7 @@ from workflows.engine.alive import ended_processes
 from workflows.engine.reader import DONE, FAILED, INTERRUPTED, RUNNING, JobTimes, QueueReader
 
 KEPT = 20_000  # changes that are kept
-OVERLAP_MS = 5000  # by which queries for changes overlap: transactions become visible later than their time stamps
+OVERLAP_MS = 30_000  # by which queries for changes overlap: transactions become visible later than their time stamps
 RELOAD_S = 60.0  # after which deleted rows are noticed
 _CHUNK = 500  # rows whose results are read at a time
 log = logging.getLogger("gnmreg.service")

@@ -103,7 +103,7 @@ class Viewer:
             raise OSError(stream.status)
         self.connections += 1
         if not self._last:
-            self._load()
+            self._load()  # after the connection: what changes meanwhile is an event
         kind = ""
         while not self._end:
             line = stream.readline().decode().rstrip("\n")
@@ -120,8 +120,10 @@ class Viewer:
 
     def _load(self) -> None:
         status, body = self._serve.get("/api/v1/jobs?run=run&limit=500")
-        if status == 200:
-            self.states |= {job["id"]: job["state"] for job in json.loads(body)["jobs"]}
+        if status not in (200, 404):  # 404: there is no such run yet
+            self._last = ""  # load it with the next connection
+            raise OSError(status)
+        self.states |= {job["id"]: job["state"] for job in json.loads(body).get("jobs", ())}
 
 
 def work(farm: Farm, number: int) -> Job:
@@ -153,8 +155,11 @@ def test_each_process_is_killed_in_turn_and_nothing_is_lost(farm: Farm) -> None:
         assert {farm.job(identity)["state"] for identity in ids} == {"done"}
         assert farm.lines("end").total() <= JOBS + 2  # the two jobs in flight may have been repeated
         assert {line.split()[1] for line in farm.lines("end")} == ids
-        done = lambda: sum(viewer.states.get(identity) == "done" for identity in ids) == JOBS  # noqa: E731
-        farm.wait_until(done, within_s=20.0, what="the viewer to have seen every end")
+        unseen = lambda: sorted(identity for identity in ids if viewer.states.get(identity) != "done")  # noqa: E731
+        try:
+            farm.wait_until(lambda: not unseen(), within_s=20.0, what="the viewer to have seen every end")
+        except AssertionError:
+            raise AssertionError([(name, viewer.states.get(name)) for name in unseen()]) from None
         assert viewer.connections >= 3
     finally:
         viewer.close()

@@ -75,9 +75,16 @@ class LogPart(BaseModel):
 
 
 @router.get("/runs")
-def runs(state: Service) -> list[Run]:
-    """List all runs, the newest first."""
-    return list_runs(state)
+def runs(
+    state: Service,
+    kind: Annotated[str | None, Query(max_length=40, description="batch, subject, coregister")] = None,
+    run_state: Annotated[State | None, Query(alias="state", description="of the run's driver")] = None,
+    offset: Offset = 0,
+    limit: Limit = 100,
+) -> list[Run]:
+    """List runs, the newest first."""
+    chosen = [run for run in list_runs(state) if kind in (None, run.kind) and run_state in (None, run.state)]
+    return chosen[offset : offset + limit]
 
 
 @router.get("/runs/{run}")
@@ -162,9 +169,13 @@ def subject_names(identity: str) -> Iterator[str]:
     """The names of folders in a job's id that may be a subject's, with and without number."""
     for part in identity.split("/")[1:]:
         yield part
-        head, _, name = part.partition("-")
-        if name and head[:1] == "s" and head[1:].isdigit():
-            yield name
+        yield plain_name(part)
+
+
+def plain_name(part: str) -> str:
+    """Return a part of a job's id without the number of the subject or expression."""
+    head, _, name = part.partition("-")
+    return name if name and head[:1] in ("s", "e") and head[1:].isdigit() else part
 
 
 def list_runs(state: ServiceState) -> list[Run]:
