@@ -12,7 +12,7 @@ from starlette.middleware import Middleware
 
 from workflows.service import health, login, problems, prometheus, rendering
 from workflows.service.access import need
-from workflows.service.api import actions, captures, events, jobs, subjects
+from workflows.service.api import actions, captures, events, jobs, subjects, submissions
 from workflows.service.middleware import Guard
 from workflows.service.settings import ServiceSettings
 from workflows.service.state import ServiceState
@@ -52,7 +52,7 @@ def create_app(settings: ServiceSettings) -> FastAPI:
     )
     app.state.service = state
     problems.install(app)
-    for module in (jobs, subjects, actions, events, captures):
+    for module in (jobs, subjects, actions, events, captures, submissions):
         app.include_router(module.router, prefix=API)
     for module in (health, prometheus, login, rendering):
         app.include_router(module.router)

@@ -11,6 +11,7 @@ from workflows.service.problems import Problem
 from workflows.service.settings import CAPTURES, MODELS, RESULTS, ServiceSettings
 
 OFFERED = (CAPTURES, MODELS, RESULTS)  # folders of the farm that requests may name: the others hold queue, logs, tokens
+FIRST, OFFICIAL = "first", "official"  # models that may be in this machine's cache
 EXTRA = ".extra.npz"  # ending of a model's second file
 BESIDE_MODELS = "head_cranium.npz"  # an auxiliary model, which is no head model itself
 
@@ -90,13 +91,13 @@ class Places:
                 got=repr(location[:200]),
                 fix="list the uploads at /api/v1/captures",
             )
-        yield from map(str, found)
+        yield from (self.check(str(path), "captures") for path in found)  # not a link that leads elsewhere
 
     def subject(self, location: str) -> str:
         """Return the folder of a subject: a path, or the name of an uploaded one. Raises Problem."""
         if not _is_name(location):
             return self.folder(location, "subject")
-        return str(self.captures / _checked(location, "subject"))
+        return self.check(str(self.captures / _checked(location, "subject")), "subject")
 
     def folder(self, location: str, where: str) -> str:
         """Return a folder of this machine; "captures" stands for all uploads. Raises Problem."""
@@ -116,7 +117,8 @@ class Places:
         if not _is_name(location):
             return self.check(location, "model")
         name = _checked(location, "model")
-        return next((str(file) for known, file in self.stored_models() if known == name), None)
+        file = next((file for known, file in self.stored_models() if known == name), None)
+        return None if file is None else self.check(str(file), "model")
 
     def stored_models(self) -> Iterator[tuple[str, Path]]:
         """Yield the models in the farm's folder: NAME.npz, or the one file in the folder NAME."""

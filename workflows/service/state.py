@@ -15,6 +15,8 @@ from workflows.engine.reader import QueueReader
 from workflows.service.access import Access
 from workflows.service.audit import AuditLog
 from workflows.service.board import Board
+from workflows.service.helper import Helper
+from workflows.service.idempotency import Answers
 from workflows.service.places import Places
 from workflows.service.settings import RESULTS, ServiceSettings
 from workflows.service.tokens import Tokens
@@ -62,6 +64,8 @@ class ServiceState:
         self.settings = settings
         self.places = Places(settings)
         self.uploads = Uploads(settings)
+        self.submitting = Helper("workflows.service.submitting")
+        self.answers = Answers(settings.state)
         self.tokens = Tokens(settings.state)
         self.audit = AuditLog(settings.state)
         self.access = Access(settings, self.tokens, self.audit)
@@ -80,6 +84,7 @@ class ServiceState:
         """End threads and child processes."""
         self.board.stop()
         self.uploads.stop()
+        self.submitting.stop()
 
     def metrics(self, run: str | None = None) -> QueueMetrics:
         """Return the figures of a run, or of the whole queue; at most two seconds old."""

@@ -17,6 +17,7 @@ def test_no_request_causes_a_server_error(tmp_path):
         command += ["--checks", "not_a_server_error,content_type_conformance,response_schema_conformance"]
         command += ["--phases", "examples,coverage,fuzzing", "--max-examples", str(EXAMPLES), "--seed", "7"]
         command += ["--exclude-path", f"{API}/events", "--generation-database", "none", "--workers", "1"]
+        command += ["--request-timeout", "120"]  # the first submission imports the library, in a child process
         environment = {**os.environ, "SCHEMATHESIS_HOOKS": ""}
         done = subprocess.run(command, capture_output=True, text=True, cwd=tmp_path, env=environment, check=False)
         assert done.returncode == 0, f"{done.stdout[-6000:]}\n{done.stderr[-2000:]}"
