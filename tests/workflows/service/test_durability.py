@@ -104,19 +104,25 @@ class Viewer:
         self.connections += 1
         if not self._last:
             self._load()  # after the connection: what changes meanwhile is an event
-        kind = ""
+        event: dict[str, str] = {}
         while not self._end:
-            line = stream.readline().decode().rstrip("\n")
-            name, _, value = line.partition(": ")
-            if name == "id":
-                self._last = value
-            elif name == "event":
-                kind = value
-            elif name == "data" and kind == "job":
-                entry = json.loads(value)
-                self.states[entry["id"]] = entry["state"]
-            elif name == "data" and kind == "reset":
-                self._load()
+            raw = stream.readline()
+            if not raw.endswith(b"\n"):
+                raise OSError("the stream has ended, perhaps within an event, which does not count then")
+            name, _, value = raw.decode().rstrip("\n").partition(": ")
+            if name:
+                event[name] = value
+            elif event:
+                self._take(event)
+                event = {}
+
+    def _take(self, event: dict[str, str]) -> None:
+        self._last = event.get("id", self._last)
+        if event.get("event") == "job":
+            entry = json.loads(event["data"])
+            self.states[entry["id"]] = entry["state"]
+        elif event.get("event") == "reset":
+            self._load()
 
     def _load(self) -> None:
         status, body = self._serve.get("/api/v1/jobs?run=run&limit=500")
