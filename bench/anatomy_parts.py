@@ -1,15 +1,17 @@
 """Measure regenerated eyes, teeth, tongue and pupils of models.
 
-    python -m bench.anatomy_parts [--model NPZ ...] [--only eyes ...]
+    python -m bench.anatomy_parts [--model NPZ ...] [--only eyes ...] [--out FOLDER]
 
 Without --model: the first model, and the reconstructed GNM file of a folder `shared` beside the repository, if there is
-one. Each section is a module of bench/anatomy_checks; the exit status is 1 if a limit is not kept.
+one. --out keeps what subject_teeth makes, in a folder per model, so that its next run fits only what has changed.
+Each section is a module of bench/anatomy_checks; the exit status is 1 if a limit is not kept.
 """
 
 import argparse
 import importlib
 import pkgutil
 import sys
+from functools import partial
 from pathlib import Path
 
 from rich.console import Console
@@ -27,6 +29,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--model", type=Path, nargs="+")
     parser.add_argument("--only", nargs="+", choices=SECTIONS, default=SECTIONS)
+    parser.add_argument("--out", type=Path, help="keep the captures and registrations of subject_teeth here")
     options = parser.parse_args()
     known = (SHARED / "gnm" / "gnm_head_reconstructed.npz",)
     models = options.model or [build.bootstrap(), *filter(Path.is_file, known)]
@@ -35,7 +38,10 @@ def main() -> int:
     for path in models:
         data = gnm_npz.read(path)
         for section in options.only:
-            for figure in importlib.import_module(f"bench.anatomy_checks.{section}").figures(data):
+            figures = importlib.import_module(f"bench.anatomy_checks.{section}").figures
+            if options.out and section == "subject_teeth":
+                figures = partial(figures, out=options.out / path.stem)
+            for figure in figures(data):
                 cells = (path.stem, section, figure.name, f"{figure.value:.4g} {figure.unit}", figure.limit)
                 table.add_row(*cells, "" if figure.kept else "NOT KEPT")
                 kept &= figure.kept

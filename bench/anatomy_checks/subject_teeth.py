@@ -5,6 +5,7 @@ Crowns are measured twice, in every capture's world and with each arch aligned r
 dentition itself. "Alone" is the neutral's estimate, which every expression used before captures shared their teeth.
 """
 
+import contextlib
 import shutil
 import tempfile
 from collections.abc import Iterator, Mapping
@@ -22,7 +23,7 @@ from coregister.first_model.population import mean_person
 from coregister.synthetic import expressions
 from coregister.synthetic.capture import Studio, render_capture
 from coregister.synthetic.subject import sample_subject
-from registration.anatomy.own_parts import FIGURE, OwnParts, with_parts
+from registration.anatomy.own_parts import OwnParts, found_alone, with_parts
 from registration.anatomy.tooth_structure import DentalArch, find_teeth
 from registration.capture.scan import read_truth
 from registration.frames import MM_PER_M
@@ -40,16 +41,23 @@ _IDENTITY = SHARED / "captures" / "gnm_identity_a"
 _OPTIONS = RegisterOptions(recipe="draft")
 
 
-def figures(data: GNMData) -> Iterator[Figure]:
-    """Register the subject of this model, if there is one, with components of teeth."""
+def figures(data: GNMData, out: Path | None = None) -> Iterator[Figure]:
+    """Register the subject of this model, if there is one, with components of teeth.
+
+    Args:
+        data: the model.
+        out: a folder that keeps model, captures and registrations for the next run, which fits only what has changed;
+            None for one that is deleted.
+    """
     first = build.bootstrap()
     is_first = gnm_npz.topology_hash(data.triangles) == gnm_npz.topology_hash(gnm_npz.read(first).triangles)
     beside = first.parent if is_first else SHARED / "gnm"
-    with tempfile.TemporaryDirectory() as folder:
+    with tempfile.TemporaryDirectory() if out is None else contextlib.nullcontext(out) as folder:
         model = Path(folder) / "model" / "model.npz"
-        model.parent.mkdir()
-        made = regenerate(data, AnatomySettings(parts=("teeth",))).data
-        gnm_npz.write(made, model)
+        model.parent.mkdir(parents=True, exist_ok=True)
+        if not model.is_file():
+            gnm_npz.write(regenerate(data, AnatomySettings(parts=("teeth",))).data, model)
+        made = gnm_npz.read(model)
         for scheme in beside.glob("head_sparse_*.txt"):
             shutil.copy(scheme, model.parent)
         if is_first:
@@ -71,7 +79,8 @@ def _synthetic(data: GNMData, made: GNMData, model: Path, folder: Path) -> Itera
     shift += np.tensordot(own, made.vertex_identity_basis[identity_order(made)["teeth"]].astype(np.float64), 1)
     schemes = schemes_beside(model, made.template_vertex_positions)
     for name in CAPTURES:
-        _render(folder / "captures" / name, name, data, shift, schemes)
+        if not (folder / "captures" / name).is_dir():
+            _render(folder / "captures" / name, name, data, shift, schemes)
     register_subject(folder / "captures", model, folder / "out", _OPTIONS)
     yield from measured(made, folder / "out", folder / "captures", schemes)
 
@@ -80,7 +89,7 @@ def measured(made: GNMData, out: Path, captures: Path, schemes: Mapping[str, Lan
     """Distances of the crowns from the truth in all captures, before and after they share their teeth."""
     parts, arches = OwnParts.of(made), find_teeth(made)
     results = {name: load_registration(out / name) for name in CAPTURES}
-    alone = np.asarray(results["neutral"].figures[FIGURE]["alone"], np.float32)
+    alone = parts.coefficients(found_alone(results["neutral"], made, parts, schemes))
     for title, most in (("of the neutral alone", None), ("of all captures", 0.6)):
         world, shape = [], []
         for name, result in results.items():

@@ -43,7 +43,7 @@ class Weights:
     identity: float = 2e-3
     expression: float = 2e-3
     rotations: float = 0.1  # joints other than the root, per rad^2
-    parts: float = 1e-3  # mean square of the identity coefficients that move no skin, where they alone are free
+    parts: float = 1e-4  # mean square of the identity coefficients that move no skin, where they alone are free
     eyes: float = 1.0  # translation of the eyeballs relative to the model, per m^2
     eye_scale: float = 2e-3
     offsets: float = 2e4  # per m^2: the assumed strength of the image losses, against which `Lengths` are balanced

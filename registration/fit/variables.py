@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from registration.anatomy.own_parts import still_components
+from registration.anatomy.own_parts import OwnParts
 from registration.frames import axis_angle_to_matrix, matrix_to_axis_angle
 from registration.geometry.large_steps import LargeSteps
 from registration.model.gnm import GNM
@@ -56,8 +56,9 @@ class Variables:
 
     The names: identity (I) and expression (E) coefficients; root (3), joints (C 3), axis-angle rotations; position (3),
     of the pivot in the world, metres; scale, its logarithm; eyes (2 4), of each eyeball a translation in the bind pose,
-    metres, and the logarithm of a scale about its centre; parts (S), added to the identity coefficients that move no
-    skin: teeth and eyes, which an expression may show better than the neutral that its identity comes from.
+    metres, and the logarithm of a scale about its centre; parts (C), added to the identity coefficients that move
+    no skin and to the placements of the dental arches (`anatomy.own_parts`): teeth and eyes, which an expression may
+    show better than the neutral that its identity comes from.
 
     The root rotates by a small rotation times a constant one, and the position is that of the pivot: in these
     coordinates rotation and translation are independent, and no rotation is near the singularity of the axis-angle
@@ -87,12 +88,11 @@ class Variables:
             "scale": tensor(np.log(initial.scale)),
             "eyes": tensor(None, 2, 4),
         }
-        own = still_components(data)
-        self._own_parts = torch.as_tensor(own, device=device)
-        moved = np.flatnonzero((data.vertex_identity_basis[own] != 0).any((0, 2)))
-        self._part_vertices = torch.as_tensor(moved, device=device)
-        self._part_basis = model.identity_basis.unflatten(-1, (-1, 3))[self._own_parts][:, self._part_vertices]
-        self.tensors["parts"] = tensor(None, len(own))
+        own = OwnParts.of(data)
+        self._own_parts = torch.as_tensor(own.components, device=device)
+        self._part_vertices = torch.as_tensor(own.vertices, device=device)
+        self._part_basis = tensor(own.basis, *own.basis.shape)
+        self.tensors["parts"] = tensor(None, len(own.basis))
         self.fixed_offsets = tensor(initial.offsets, count, 3)  # of all vertices but the skin's
         self._offsets = self.fixed_offsets[self._skin]  # of the skin, unless there is a latent
         self.fixed_offsets[self._skin] = 0
@@ -161,16 +161,17 @@ class Variables:
 
     def identity(self) -> Float[Tensor, "I"]:
         """Return the identity coefficients with the own parts'."""
-        return self.tensors["identity"].index_add(0, self._own_parts, self.tensors["parts"])
+        return self.tensors["identity"].index_add(0, self._own_parts, self.tensors["parts"][: len(self._own_parts)])
 
     @property
     def has_parts(self) -> bool:
         """Whether the model has identity components that move no skin."""
         return len(self.tensors["parts"]) > 0
 
-    def part_coefficients(self) -> Float[Tensor, "S"]:
-        """Return the identity coefficients of the components that move no skin."""
-        return self.tensors["identity"][self._own_parts] + self.tensors["parts"]
+    def part_coefficients(self) -> Float[Tensor, "C"]:
+        """Return the identity coefficients of the components that move no skin, and the placements' since the start."""
+        parts, count = self.tensors["parts"], len(self._own_parts)
+        return torch.cat([self.tensors["identity"][self._own_parts] + parts[:count], parts[count:]])
 
     @torch.no_grad()
     def expression_vertices(self) -> Float[Tensor, "V 3"]:
@@ -205,14 +206,17 @@ class Variables:
             translation=translation,
             scale=scale,
         )
-        return parameters, self._all_offsets(self.skin_offsets(), bind, self["eyes"])
+        offsets = self._all_offsets(self.skin_offsets(), bind, self["eyes"])
+        count = len(self._own_parts)
+        placed = torch.tensordot(self["parts"][count:], self._part_basis[count:], 1)
+        return parameters, offsets.index_add(0, self._part_vertices, placed)
 
     def _bind_pose(self, tensors: Mapping[str, Tensor]) -> tuple[Float[Tensor, "V 3"], Float[Tensor, "J 3"]]:
         """Vertices without offsets and without the own parts, and joints."""
         identity = tensors["identity"]
         return self.model.bind(identity, tensors["expression"]), self.model.joints(identity)
 
-    def _with_parts(self, bind: Float[Tensor, "V 3"], parts: Float[Tensor, "S"]) -> Float[Tensor, "V 3"]:
+    def _with_parts(self, bind: Float[Tensor, "V 3"], parts: Float[Tensor, "C"]) -> Float[Tensor, "V 3"]:
         return bind.index_add(0, self._part_vertices, torch.tensordot(parts, self._part_basis, 1))
 
     def _all_offsets(self, skin_offsets: Tensor, bind: Tensor, eyes: Tensor) -> Float[Tensor, "V 3"]:

@@ -8,7 +8,16 @@ from pathlib import Path
 
 import numpy as np
 
-from registration.anatomy.own_parts import FIGURE, OwnParts, PartEstimate, found_alone, fuse, views_that_see, with_parts
+from registration.anatomy.own_parts import (
+    FIGURE,
+    OwnParts,
+    PartEstimate,
+    found_alone,
+    fuse,
+    record,
+    views_that_see,
+    with_parts,
+)
 from registration.evaluate.audit import audit_penetration
 from registration.evaluate.viewpoint import intersection_figures
 from registration.model.gnm_npz import GNMData
@@ -38,7 +47,7 @@ def share_own_parts(
     """Fuse what registrations of one subject found of its teeth and eyes, and write the result into all of them.
 
     Args:
-        captures: folder of a usable registration -> its capture.
+        captures: folder of a usable registration -> its capture; the neutral's first.
         data: the model.
         schemes: its landmark schemes.
 
@@ -53,8 +62,11 @@ def share_own_parts(
     sources = {item.folder.name: item.digest for item in shown}
     if all(_sources(item.registration) == sources for item in shown):
         return {}
-    coefficients = fuse(parts, [item.estimate for item in shown]).astype(np.float32)
-    return {item.folder: _write(item, data, parts, coefficients, schemes, sources) for item in shown}
+    fused = fuse(parts, [item.estimate for item in shown])
+    return {
+        item.folder: _write(item, data, parts, coefficients, schemes, sources)
+        for item, coefficients in zip(shown, fused, strict=True)
+    }
 
 
 def _sources(registration: Registration) -> Mapping[str, str] | None:
@@ -75,7 +87,9 @@ def _shown(
         folder=folder,
         registration=written,
         digest=entry["digest"] if entry else hash_fields(written),
-        estimate=PartEstimate(coefficients=alone.identity[parts.components].astype(np.float64), views=views),
+        estimate=PartEstimate(
+            coefficients=parts.coefficients(alone), views=views, jaw=parts.jaw_motion(data, alone.expression)
+        ),
     )
 
 
@@ -89,7 +103,7 @@ def _write(
 ) -> Registration:
     entry = {
         "digest": item.digest,
-        "alone": [float(value) for value in item.estimate.coefficients],
+        **record(parts, item.estimate.coefficients),
         "vertices_seen": int((item.estimate.views > 0).sum()),
         "from": dict(sources),
     }

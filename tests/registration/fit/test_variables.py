@@ -8,6 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from registration.fit.variables import InitialGuess, Variables, initial_guess_from, skin_triangles, skin_vertices
 from registration.geometry.large_steps import LargeSteps
+from registration.model import regions
 from registration.model.gnm import GNM
 from registration.model.regions import exterior
 from tests.fixtures.make_fixtures import tiny_model
@@ -114,11 +115,13 @@ def test_own_parts_add_to_the_identity_that_is_saved() -> None:
     assert variables.has_parts and not _fitted()[0].has_parts
     variables.set_free(["parts"])
     with torch.no_grad():
-        variables["parts"].copy_(torch.tensor([0.5, -1.5]))
+        variables["parts"][:2].copy_(torch.tensor([0.5, -1.5]))
+        variables["parts"][2:].copy_(torch.linspace(-1, 1, 12))  # placements of the arches
     mesh = variables.vertices(variables.skin_offsets())
     mesh.square().sum().backward()
     assert variables["parts"].grad is not None and variables["parts"].grad.abs().min() > 0
     parameters, offsets = variables.parameters()
     expected = torch.tensor(identity[-2:] + [0.5, -1.5], dtype=torch.float32)
     torch.testing.assert_close(parameters.identity[-2:], expected)
+    assert offsets[torch.as_tensor(regions.teeth(data))].norm(dim=1).min() > 1e-4
     torch.testing.assert_close(model(parameters, offsets), mesh.detach(), rtol=0, atol=2e-6)

@@ -26,7 +26,7 @@ def _capture(name: str) -> Capture:
     return Capture(root=Path(name), subject="anna", expression=name, views=tuple(views))
 
 
-def _registration(data, teeth):  # noqa: F811
+def _registration(data, teeth, placed=0.0):  # noqa: F811
     count = len(data.vertex_identity_basis) - 3
     values = {
         "identity": np.array([0.1] * count + teeth),
@@ -35,6 +35,8 @@ def _registration(data, teeth):  # noqa: F811
         "translation": np.zeros(3),
         "offsets": np.zeros(data.template_vertex_positions.shape),
     }
+    parts = OwnParts.of(data)  # noqa: F811
+    values["offsets"][parts.vertices] = 0.5 * placed * parts.placements[4]  # both arches upwards
     vertices = gnm_numpy.evaluate(data, scale=1.0, **values)
     return a_registration(
         **{name: value.astype(np.float32) for name, value in values.items()},
@@ -60,7 +62,7 @@ def shared(tmp_path, data, parts, monkeypatch):  # noqa: F811
     folders = {}
     by_teeth_vertices = {}
     for value, name in by_teeth.items():
-        registration = _registration(data, [value] * 3)
+        registration = _registration(data, [value] * 3, value)
         by_teeth_vertices[name] = registration.vertices.astype(np.float64)
         folders[save_registration(registration, tmp_path / name, "<html></html>")] = _capture(name)
     monkeypatch.setattr("workflows.steps.own_parts.views_that_see", views)
@@ -75,11 +77,15 @@ def test_all_captures_get_what_those_that_saw_the_teeth_found(shared, data, part
     for folder in shared:
         after = load_registration(folder)
         assert np.allclose(after.identity[parts.components], 1.5, rtol=1e-2)
+        shift = after.offsets[parts.vertices] - 0.75 * parts.placements[4]
+        assert np.abs(shift).max() < 2e-5
         others = np.setdiff1d(np.arange(len(after.vertices)), parts.vertices)
         assert np.array_equal(after.vertices[others], before[folder].vertices[others])
         assert np.array_equal(after.texture, before[folder].texture)
         assert read_manifest(folder).input_hash == digests[folder]
         assert set(after.figures[FIGURE]["from"]) == {"neutral", "smile"}
+    found = {folder.name: load_registration(folder).figures[FIGURE] for folder in shared}
+    assert found["smile"]["placed"] == pytest.approx([0.0] * 4 + [1.5e-3] + [0.0] * 7, abs=1e-6)
     neutral = next(folder for folder in shared if folder.name == "neutral")
     assert load_registration(neutral).figures[FIGURE]["alone"] == [0.0, 0.0, 0.0]
 
@@ -95,7 +101,7 @@ def test_a_capture_that_is_registered_later_takes_part(shared, data, parts):  # 
     first, second = shared
     assert share_own_parts({first: shared[first]}, data, {}) == {}
     share_own_parts(shared, data, {})
-    again = replace(_registration(data, [1.5] * 3), reason="registered again")
+    again = replace(_registration(data, [1.5] * 3, 1.5), reason="registered again")
     save_registration(again, second, "<html></html>")
     written = share_own_parts(shared, data, {})
     assert np.allclose(written[first].identity, written[second].identity)
