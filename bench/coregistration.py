@@ -43,8 +43,8 @@ from workflows.engine.database import default_url
 from workflows.engine.process import migrate
 from workflows.farm.coregistration import coregister
 from workflows.farm.plan import RoundSettings, make_plan
-from workflows.records.coregistration import FIRST_MODEL as FIRST
 from workflows.records.held_out import read_held_out
+from workflows.records.round_files import FIRST_MODEL as FIRST
 from workflows.steps.hold_out import HELD_OUT
 from workflows.steps.synthesize import Population, synth_dataset
 

@@ -16,6 +16,7 @@ from jaxtyping import Bool, Float, Int
 from scipy.spatial import cKDTree
 
 from registration.errors import InputError
+from registration.evaluate.names import BEYOND_KEY, TOLERANCE_MM
 from registration.frames import MM_PER_M
 from registration.geometry.closest_point import closest_points
 from registration.geometry.self_overlap import SelfOverlap
@@ -24,8 +25,6 @@ from registration.geometry.winding import Winding, closed
 from registration.model import gnm_npz, regions
 from registration.model.gnm_npz import GNMData
 
-TOLERANCE_MM = 0.3
-BEYOND_KEY = f"vertices_beyond_{TOLERANCE_MM}mm"
 _INSIDE = 0.5  # winding number
 
 

@@ -6,6 +6,8 @@ from typing import Literal
 
 Level = Literal["good", "look", "wrong"]
 LEVEL_TITLES: Mapping[Level, str] = {"good": "good", "look": "look at it", "wrong": "wrong"}
+TOLERANCE_MM = 0.3
+BEYOND_KEY = f"vertices_beyond_{TOLERANCE_MM}mm"  # of a penetration audit's figures
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from typing import Any, Protocol, runtime_checkable
 
-from registration.evaluate.audit import BEYOND_KEY
+from registration.evaluate.names import BEYOND_KEY
 from registration.types import METRIC_TITLES, Status
 
 # Pair of the penetration audit -> what lies where, and where to look.

@@ -70,6 +70,7 @@ def test_no_module_has_the_name_of_a_standard_library_module_and_no_benchmark_im
         ("landmark_fit", ("--only", "schur", "--count", "2"), "2 of 2 limits kept"),
         ("model_building", ("--samples", "60", "--components", "5"), "peak_gb"),
         ("renderer", ("--case", "2x48", "--stock"), "stock 2x256"),
+        ("service", ("--captures", "60", "--requests", "2", "--viewers", "3", "--seconds", "2"), "0 lost of"),
         ("sampler", ("--only", "collapse", "--count", "400", "--steps", "60"), "status: collapsed"),
     ],
 )

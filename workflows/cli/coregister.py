@@ -70,7 +70,7 @@ def coregister(
     from workflows.farm.coregistration import coregister, submit_coregistration
     from workflows.farm.local import local_gpus
     from workflows.farm.plan import RoundSettings, make_plan
-    from workflows.records.coregistration import PAGE
+    from workflows.records.round_files import PAGE
 
     settings = RoundSettings(
         model_recipe=rounds.model_recipe,

@@ -11,7 +11,7 @@ from registration.errors import InputError
 from workflows.cli.options import FarmOptions, OptionalFile
 
 if TYPE_CHECKING:
-    from workflows.gate.items import GateItem
+    from workflows.gate.item import GateItem
     from workflows.gate.rules import GateThresholds
 
 Runs = Positional[Annotated[tuple[str, ...], arg(metavar="RUN", help_behavior_hint="(required)")]]
@@ -49,7 +49,7 @@ def verdicts(runs: Runs, /, out: OptionalFile = None, gate: GateOptions = _GATE,
         gate: The rules of the gate.
         farm: Which farm: its queue, and its log of decisions.
     """
-    from workflows.gate.items import gate_error
+    from workflows.gate.item import gate_error
     from workflows.gate.table import counts, to_csv
 
     if out is not None:

@@ -5,7 +5,7 @@ all of that, so it runs no step itself. Whatever happens becomes an outcome, a s
 
     {"status": "done" | "bad input" | "unusable" | "failed" | "timed out" | "died" | "refused", "reason": str,
      "seconds": float, "result": what the step returned, only if done,
-     "what": what is wrong in general, "fix": how to mend it, both only if an `InputError` says so}
+     "what": what is wrong in general, "where", "expected", "got", "fix": how to mend it; only of an `InputError`}
 """
 
 import asyncio
@@ -155,7 +155,8 @@ def _call(dotted: str, arguments: dict[str, Any], log: str) -> StepOutcome:
             return _done(function(**arguments))
         except InputError as error:
             print(error, flush=True)
-            return {**_outcome("bad input", error.line), "what": redact(error.what), "fix": redact(error.fix)}
+            parts = {name: redact(getattr(error, name)) for name in ("what", "where", "expected", "got", "fix")}
+            return {**_outcome("bad input", error.line), **parts}
         except PermanentStepError as error:
             print(error, flush=True)
             return _outcome("unusable", str(error))

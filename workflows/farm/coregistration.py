@@ -11,12 +11,11 @@ from workflows.engine.reader import QueueReader
 from workflows.farm.local import LocalFarm, run_until_done
 from workflows.ids import check_id
 from workflows.records.coregistration import (
-    MANIFEST,
-    PLAN,
     CoregistrationPlan,
     CoregistrationState,
     initial_state,
 )
+from workflows.records.round_files import MANIFEST, PLAN
 from workflows.steps.coregistration_page import write_record
 
 

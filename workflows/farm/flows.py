@@ -22,7 +22,8 @@ from workflows.engine.jobs import (
     Job,
 )
 from workflows.ids import id_part
-from workflows.records.coregistration import FIRST_MODEL, PLAN, CoregistrationPlan, RoundProducts, model_name
+from workflows.records.coregistration import CoregistrationPlan, RoundProducts
+from workflows.records.round_files import FIRST_MODEL, PLAN, model_name
 from workflows.records.step_results import BuildResult, EvaluateResult, HoldOutResult, StabilizeResult
 from workflows.steps import table
 

@@ -72,7 +72,7 @@ def status_lines(reader: QueueReader, run: str | None, logs: Path) -> list[str]:
         end = datetime.fromtimestamp(time.time() + figures.left_s).strftime("%Y-%m-%d %H:%M")
         lines.append(f"expected end: {end}, in {_duration(figures.left_s)}, of the {figures.left} {unit} in the queue")
     lines += _process_lines(figures, logs)
-    lines += _remarks(figures)
+    lines += remarks(figures)
     if figures.failures:
         lines.append("failed:")
         lines += [line for kind in figures.failures[:MAX_KINDS] for line in _failure_lines(kind)]
@@ -173,21 +173,22 @@ def _process_lines(figures: QueueMetrics, logs: Path) -> Iterator[str]:
     for name in figures.processes:
         row = by_executor.get(name)
         if row is not None:
-            yield f"{name}: {row.id}, {_stage(row, logs)}, for {_duration(time.time() - row.since)}"
+            yield f"{name}: {row.id}, {stage_of(row, logs)}, for {_duration(time.time() - row.since)}"
         else:
-            yield f"{name}: {'runs' if _is_coordinator(name) else 'idle'}"
+            yield f"{name}: {'runs' if is_coordinator(name) else 'idle'}"
 
 
-def _is_coordinator(name: str) -> bool:
+def is_coordinator(name: str) -> bool:
+    """Return whether a process of this name is a coordinator."""
     return re.search(r"-coordinator\d+$", name) is not None
 
 
-def _remarks(figures: QueueMetrics) -> Iterator[str]:
-    """What keeps jobs waiting."""
-    workers = [name for name in figures.processes if not _is_coordinator(name)]
+def remarks(figures: QueueMetrics) -> Iterator[str]:
+    """Yield what keeps jobs waiting."""
+    workers = [name for name in figures.processes if not is_coordinator(name)]
     if figures.left and not workers:
         yield "no worker runs: jobs wait until one starts (gnmreg worker, or the command with --local again)"
-    elif figures.left and not any(map(_is_coordinator, figures.processes)) and _active(figures.flows):
+    elif figures.left and not any(map(is_coordinator, figures.processes)) and _active(figures.flows):
         yield "no coordinator runs: flows wait until one starts (gnmreg coordinator)"
     for name in figures.unserved if workers else ():
         if name in (GPU, REBUILD):
@@ -218,7 +219,7 @@ def _job_row(row: JobRow, logs: Path) -> tuple[str, str, str, str, str]:
     arguments = arguments if isinstance(arguments, dict) else {}
     place = arguments.get("capture") or arguments.get("subject_dir") or arguments.get("out") or ""
     since = datetime.fromtimestamp(row.since).strftime("%Y-%m-%d %H:%M:%S")
-    stage = _stage(row, logs)
+    stage = stage_of(row, logs)
     if row.state == FAILED and row.failure:
         stage = f"{row.failure.get('status')}"
     elif row.state == DONE and row.started and row.ended:
@@ -228,8 +229,8 @@ def _job_row(row: JobRow, logs: Path) -> tuple[str, str, str, str, str]:
     return row.id, row.state, since, stage, str(place)
 
 
-def _stage(row: JobRow, logs: Path) -> str:
-    """What a running job does, from the last line of its progress beside its log, if that is on this machine."""
+def stage_of(row: JobRow, logs: Path) -> str:
+    """Return what a running job does, from the last line of its progress beside its log, if that is on this machine."""
     step = str(row.spec.get("step"))
     try:
         with (logs / f"{check_id(row.id)}.jsonl").open("rb") as file:

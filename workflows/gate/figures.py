@@ -3,11 +3,13 @@
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from registration.evaluate.audit import BEYOND_KEY
-from registration.storage.registration_folder import RegistrationManifest
-from registration.types import Status
+from registration.evaluate.names import BEYOND_KEY
+
+if TYPE_CHECKING:  # they load numeric libraries
+    from registration.storage.registration_folder import RegistrationManifest
+    from registration.types import Status
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -136,13 +138,13 @@ class Assessed:
     """What the gate judges: one registration, without its arrays."""
 
     content_id: str
-    status: Status
+    status: "Status"
     reason: str
     is_neutral: bool  # not registered from a neutral
     figures: GateFigures
 
 
-def assess(manifest: RegistrationManifest) -> Assessed:
+def assess(manifest: "RegistrationManifest") -> Assessed:
     """Return what the gate judges of a registration."""
     return Assessed(
         content_id=manifest.content_id,

@@ -1,62 +1,24 @@
 """The registrations of a run at the gate: figures, verdict, decision, and whether a model may be built from them."""
 
-import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
 
 from registration.capture.native import natural_key
 from registration.errors import InputError
 from registration.storage.registration_folder import MANIFEST, RegistrationManifest, is_registration, read_manifest
 from workflows.engine.reader import DONE, FAILED, JobRow, QueueReader
 from workflows.gate.decisions import DecisionEntry
-from workflows.gate.figures import Assessed, GateFigures, assess
-from workflows.gate.rules import GateThresholds, Verdict, judge
+from workflows.gate.figures import assess
+from workflows.gate.item import GateItem
+from workflows.gate.rules import GateThresholds, judge
 from workflows.ids import check_id
-from workflows.records.coregistration import PLAN
+from workflows.records.round_files import PLAN
 from workflows.records.store import Store
 from workflows.records.subject import is_subject_folder, read_subject
 
-Policy = Literal["auto", "person"]
 REGISTRATION = "registration"  # the folder within an attempt in a store
 _ROUND = "it[0-9][0-9]*"  # folders of a coregistration's rounds
-
-
-@dataclass(frozen=True, kw_only=True)
-class GateItem:
-    """One registration at the gate."""
-
-    name: str  # SUBJECT/CAPTURE, or its key in a store
-    place: str  # folder or URL of the registration
-    assessed: Assessed
-    verdict: Verdict
-    decision: DecisionEntry | None = None  # that holds
-
-    @property
-    def content_id(self) -> str:
-        """Of the registration: what decisions are bound to."""
-        return self.assessed.content_id
-
-    @property
-    def figures(self) -> GateFigures:
-        return self.assessed.figures
-
-    @property
-    def waits(self) -> bool:
-        """Whether a person is asked and has not decided."""
-        return self.decision is None and self.verdict.for_person
-
-    def accepted(self, policy: Policy) -> bool:
-        """Return whether a model may be built from it: a decision beats the verdict.
-
-        Args:
-            policy: "auto": what is to be looked at is used until a person rejects it. "person": it is not used until
-                a person accepts it.
-        """
-        if self.decision is not None:
-            return self.decision.decision == "accept"
-        return self.verdict.level == "accept" or (self.verdict.level == "look" and policy == "auto")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -195,30 +157,3 @@ def _arguments(job: JobRow) -> dict[str, str]:
     arguments = job.spec.get("arguments")
     pairs = arguments.items() if isinstance(arguments, Mapping) else ()
     return {str(name): value for name, value in pairs if isinstance(value, str)}
-
-
-@dataclass(frozen=True, kw_only=True)
-class GateError:
-    """The gate's own error, from the accepted that a person was shown: the share that the person rejected."""
-
-    shown: int  # decided by a person
-    rejected: int
-    low: float  # bounds of the share, 95 %, exact [Clopper 1934]
-    high: float
-
-    @property
-    def share(self) -> float:
-        return self.rejected / self.shown if self.shown else math.nan
-
-
-def gate_error(items: Sequence[GateItem]) -> GateError | None:
-    """Return the gate's own error, from the sample of the accepted; None: no person has decided about any of it."""
-    from scipy.stats import beta
-
-    decided = [item.decision for item in items if item.verdict.sampled and item.decision is not None]
-    shown, rejected = len(decided), sum(entry.decision == "reject" for entry in decided)
-    if not shown:
-        return None
-    low = float(beta.ppf(0.025, rejected, shown - rejected + 1)) if rejected else 0.0
-    high = float(beta.ppf(0.975, rejected + 1, shown - rejected)) if rejected < shown else 1.0
-    return GateError(shown=shown, rejected=rejected, low=low, high=high)

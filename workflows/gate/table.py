@@ -6,7 +6,7 @@ import io
 from collections.abc import Sequence
 
 from workflows.gate.figures import FIGURES
-from workflows.gate.items import GateItem, Policy
+from workflows.gate.item import GateItem, Policy
 from workflows.gate.rules import LEVELS
 from workflows.records.batch import cell
 

@@ -12,6 +12,7 @@ from registration.storage.files import refuse_foreign
 from registration.storage.hashing import versions
 from registration.storage.records import Record
 from workflows.records.dataset import Split
+from workflows.records.round_files import FIRST_MODEL, MANIFEST
 from workflows.records.step_results import (
     BuildResult,
     CaptureResult,
@@ -20,14 +21,6 @@ from workflows.records.step_results import (
     HoldOutResult,
     StabilizeResult,
 )
-
-MANIFEST, PAGE, PLAN = "coregistration.json", "index.html", "plan.json"
-FIRST_MODEL = "model 0"
-
-
-def model_name(number: int) -> str:
-    """Return the name of a model in records and figures; 0 is the first model, n the one that round n built."""
-    return f"model {number}"
 
 
 @dataclass(frozen=True, kw_only=True)

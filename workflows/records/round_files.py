@@ -6,6 +6,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+MANIFEST, PAGE, PLAN = "coregistration.json", "index.html", "plan.json"  # in a coregistration's folder
+FIRST_MODEL = "model 0"
 HELD_OUT = "held_out"
 _ROUND = re.compile(r"it[0-9]{2,}")
 _PRODUCTS = (  # title, path in the folder of a round
@@ -17,6 +19,11 @@ _PRODUCTS = (  # title, path in the folder of a round
     ("record of the evaluation", "evaluation/manifest.json"),
     ("meshes", "held_out.npz"),
 )
+
+
+def model_name(number: int) -> str:
+    """Return the name of a model in records and figures; 0 is the first model, n the one that round n built."""
+    return f"model {number}"
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -12,8 +12,10 @@ from starlette.middleware import Middleware
 
 from workflows.service import health, login, problems, prometheus, rendering
 from workflows.service.access import need
-from workflows.service.api import actions, captures, events, jobs, subjects, submissions
+from workflows.service.api import actions, captures, events, gate, jobs, reviews, subjects, submissions
 from workflows.service.middleware import Guard
+from workflows.service.pages import all as pages
+from workflows.service.pages.base import for_people
 from workflows.service.settings import ServiceSettings
 from workflows.service.state import ServiceState
 
@@ -51,10 +53,10 @@ def create_app(settings: ServiceSettings) -> FastAPI:
         middleware=[Middleware(Guard, state=state)],
     )
     app.state.service = state
-    problems.install(app)
-    for module in (jobs, subjects, actions, events, captures, submissions):
+    problems.install(app, for_people)
+    for module in (jobs, subjects, actions, events, captures, submissions, reviews, gate):
         app.include_router(module.router, prefix=API)
-    for module in (health, prometheus, login, rendering):
+    for module in (health, prometheus, login, rendering, pages):
         app.include_router(module.router)
 
     @app.get(f"{API}/openapi.json", dependencies=[Depends(need("viewer"))], include_in_schema=False)

@@ -8,20 +8,25 @@ import logging
 import secrets
 import threading
 import time
+from array import array
 from collections import deque
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import islice
-from typing import Any
+from math import nan
+from typing import Any, TypeVar
 
 from workflows.engine.alive import ended_processes
 from workflows.engine.reader import DONE, FAILED, INTERRUPTED, RUNNING, JobTimes, QueueReader
+from workflows.records.headline import HEADLINES, headline_value, verdict_level
 
 KEPT = 20_000  # changes that are kept
 OVERLAP_MS = 30_000  # by which queries for changes overlap: transactions become visible later than their time stamps
 RELOAD_S = 60.0  # after which deleted rows are noticed
+MAX_DERIVED = 64  # values that are kept
 _CHUNK = 500  # rows whose results are read at a time
 log = logging.getLogger("gnmreg.service")
+Value = TypeVar("Value")
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,6 +39,9 @@ class Entry:
         reason: of a failure, or of the registration's status.
         level: of the registration's verdict; empty without one.
         content_id: of the published result; empty without one.
+        thumbnail: whether there is a picture of the head.
+        figures: of the registration, a number for each of `records.headline.HEADLINES`, NaN where there is none; or
+            nothing.
     """
 
     times: JobTimes
@@ -41,6 +49,8 @@ class Entry:
     reason: str = ""
     level: str = ""
     content_id: str = ""
+    thumbnail: bool = False
+    figures: Sequence[float] = ()
 
     @property
     def id(self) -> str:
@@ -79,6 +89,25 @@ class Change:
     entry: Entry | None
 
 
+class Derived:
+    """Values that follow from all jobs, such as a sorted list: kept until a job changes, for all viewers."""
+
+    def __init__(self) -> None:
+        self._kept: dict[tuple[Any, ...], Any] = {}
+        self._of: dict[str, Entry] | None = None
+        self._lock = threading.RLock()
+
+    def get(self, entries: dict[str, Entry], key: tuple[Any, ...], make: Callable[[], Value]) -> Value:
+        """Return the value of a key, which `make` computes from these entries of the board if it is not kept."""
+        with self._lock:
+            if self._of is not entries or len(self._kept) > MAX_DERIVED:
+                self._of, self._kept = entries, {}
+            if key not in self._kept:
+                self._kept[key] = make()
+            value: Value = self._kept[key]
+            return value
+
+
 class Board:
     """All jobs of a queue, kept up to date by a thread."""
 
@@ -89,6 +118,7 @@ class Board:
         self.epoch = secrets.token_hex(4)  # numbers of changes are unique within it
         self.entries: dict[str, Entry] = {}  # replaced, not changed: readers need no lock
         self.stage_seconds: dict[str, tuple[int, float]] = {}  # stage -> number and seconds of registrations seen
+        self.derived = Derived()
         self.answered = 0.0  # when the database last answered, seconds since 1970
         self._changes: deque[Change] = deque(maxlen=KEPT)
         self._number = 0
@@ -174,17 +204,18 @@ class Board:
 
     def _entries(self, rows: Sequence[JobTimes]) -> Iterable[Entry]:
         """Entries of rows, with what the results of done jobs say."""
-        done = [row.id for row in rows if row.state == DONE and row.kind == "job"]
-        results: dict[str, tuple[str, str, str, str]] = {}
+        by_id = {row.id: row for row in rows if row.state == DONE and row.kind == "job"}
+        done = list(by_id)
+        results: dict[str, Entry] = {}
         for start in range(0, len(done), _CHUNK):
             for identity, job in self._reader.rows(done[start : start + _CHUNK]).items():
-                results[identity] = _outcome(job.result)
+                results[identity] = _entry(by_id[identity], job.result)
                 self._add_stages(job.result)
         for row in rows:
             if row.state == FAILED and row.failure:
                 yield Entry(row, str(row.failure.get("status")), str(row.failure.get("reason")))
             elif row.id in results:
-                yield Entry(row, *results[row.id])
+                yield results[row.id]
             else:
                 yield Entry(row, row.state)
 
@@ -221,12 +252,23 @@ def _about(result: Mapping[str, Any] | None) -> Mapping[str, Any]:
     return about if isinstance(about, dict) else inner
 
 
-def _outcome(result: Mapping[str, Any] | None) -> tuple[str, str, str, str]:
-    """Status, reason, level of the verdict and content id in a job's result."""
-    about = _about(result)
+def _entry(times: JobTimes, result: dict[str, Any] | None) -> Entry:
+    """The entry of a done job, from its result; others can write to the queue."""
+    inner = (result or {}).get("result")
+    inner = inner if isinstance(inner, dict) else {}
+    about = inner.get("about")
+    about = about if isinstance(about, dict) else inner
     figures = about.get("figures")
-    verdict = figures.get("verdict") if isinstance(figures, dict) else None
-    level = verdict.get("level") if isinstance(verdict, dict) else None
-    words = about.get("status"), about.get("reason"), level, _inner(result).get("content_id")
-    status, reason, shown, content = (word if isinstance(word, str) else "" for word in words)
-    return status or DONE, reason, shown, content
+    figures = figures if isinstance(figures, dict) else {}
+    words = about.get("status"), about.get("reason"), inner.get("content_id")
+    status, reason, content = (word if isinstance(word, str) else "" for word in words)
+    values = [headline_value(figures, headline) for headline in HEADLINES] if figures else []
+    return Entry(
+        times,
+        status or DONE,
+        reason,
+        level=verdict_level(figures) or "",
+        content_id=content,
+        thumbnail=about.get("thumbnail") is True,
+        figures=array("f", [nan if value is None else value for value in values]) if values else (),
+    )

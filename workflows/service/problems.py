@@ -1,6 +1,7 @@
 """Errors of the API as problem details, application/problem+json [RFC 9457], with the parts of an `InputError`."""
 
 import logging
+from collections.abc import Callable
 from http import HTTPStatus
 from typing import Any
 
@@ -9,7 +10,7 @@ from fastapi.encoders import jsonable_encoder
 from fastapi.exceptions import RequestValidationError
 from pydantic import BaseModel
 from starlette.exceptions import HTTPException
-from starlette.responses import JSONResponse
+from starlette.responses import JSONResponse, Response
 
 from registration.errors import InputError
 from registration.storage.files import DiskFull
@@ -92,41 +93,54 @@ RESPONSES: dict[int | str, dict[str, Any]] = {
 }
 
 
-def install(app: FastAPI) -> None:
-    """Have an application answer all errors with problem details. An unexpected error is logged, not shown."""
+ForPeople = Callable[[Request, Problem], Response | None]
+
+
+def install(app: FastAPI, for_people: ForPeople) -> None:
+    """Have an application answer all errors with problem details. An unexpected error is logged, not shown.
+
+    Args:
+        app: the application.
+        for_people: returns the page that a browser shows instead; None: the request is a program's.
+    """
+
+    def answer(request: Request, problem: Problem) -> Response:
+        return for_people(request, problem) or problem.response()
 
     @app.exception_handler(Problem)
-    async def refuse(request: Request, error: Problem) -> JSONResponse:
-        return error.response()
+    async def refuse(request: Request, error: Problem) -> Response:
+        return answer(request, error)
 
     @app.exception_handler(InputError)
-    async def bad_input(request: Request, error: InputError) -> JSONResponse:
-        return Problem.of_input(error).response()
+    async def bad_input(request: Request, error: InputError) -> Response:
+        return answer(request, Problem.of_input(error))
 
     @app.exception_handler(RequestValidationError)
-    async def malformed(request: Request, error: RequestValidationError) -> JSONResponse:
+    async def malformed(request: Request, error: RequestValidationError) -> Response:
         first = jsonable_encoder(error.errors())[0]
         where = printable(".".join(map(str, first["loc"])))[:200]
-        return Problem(
+        problem = Problem(
             HTTPStatus.UNPROCESSABLE_ENTITY,
             "The request cannot be read",
             where=where,
             expected=printable(str(first["msg"]))[:400],
             got=printable(repr(first.get("input")))[:200],
             fix="see the API's description at /api/v1/openapi.json",
-        ).response()
+        )
+        return answer(request, problem)
 
     @app.exception_handler(HTTPException)
-    async def of_framework(request: Request, error: HTTPException) -> JSONResponse:
+    async def of_framework(request: Request, error: HTTPException) -> Response:
         headers = dict(error.headers or {})
-        return Problem(HTTPStatus(error.status_code), str(error.detail), headers=headers).response()
+        return answer(request, Problem(HTTPStatus(error.status_code), str(error.detail), headers=headers))
 
     @app.exception_handler(DiskFull)
-    async def full(request: Request, error: DiskFull) -> JSONResponse:
-        return Problem(HTTPStatus.INSUFFICIENT_STORAGE, "The disk is full", fix="free space, then repeat").response()
+    async def full(request: Request, error: DiskFull) -> Response:
+        fix = "free space, then repeat"
+        return answer(request, Problem(HTTPStatus.INSUFFICIENT_STORAGE, "The disk is full", fix=fix))
 
     @app.exception_handler(Exception)
-    async def unexpected(request: Request, error: Exception) -> JSONResponse:
+    async def unexpected(request: Request, error: Exception) -> Response:
         log.error("%s %s failed", request.method, request.url.path, exc_info=error)
         status = HTTPStatus.INTERNAL_SERVER_ERROR
-        return Problem(status, "An error of the service; its log says more", fix="report it").response()
+        return answer(request, Problem(status, "An error of the service; its log says more", fix="report it"))

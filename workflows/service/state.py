@@ -15,9 +15,11 @@ from workflows.engine.reader import QueueReader
 from workflows.service.access import Access
 from workflows.service.audit import AuditLog
 from workflows.service.board import Board
+from workflows.service.gate_book import GateBook
 from workflows.service.helper import Helper
 from workflows.service.idempotency import Answers
 from workflows.service.places import Places
+from workflows.service.reviews import Reviews
 from workflows.service.settings import RESULTS, ServiceSettings
 from workflows.service.tokens import Tokens
 from workflows.service.uploads import Uploads
@@ -71,6 +73,8 @@ class ServiceState:
         self.access = Access(settings, self.tokens, self.audit)
         self.board = Board(settings.url, settings.poll_s)
         self.reader = QueueReader(settings.url, known=True)
+        self.reviews = Reviews()
+        self.gate = GateBook(settings.folder)
         self.store_size = StoreSize(settings.folder / RESULTS)
         self._metrics: dict[str, _Kept] = {}
         self._lock = Lock()
@@ -84,6 +88,7 @@ class ServiceState:
         """End threads and child processes."""
         self.board.stop()
         self.uploads.stop()
+        self.reviews.stop()
         self.submitting.stop()
 
     def metrics(self, run: str | None = None) -> QueueMetrics:

@@ -13,8 +13,8 @@ from typing import Any
 from registration.storage.files import atomic_write_text
 from registration.storage.records import read_json
 from workflows.pages.coregistration import render_coregistration_page
-from workflows.records.coregistration import MANIFEST, PAGE, PLAN, CoregistrationPlan, CoregistrationState, write_state
-from workflows.records.round_files import find_round_files
+from workflows.records.coregistration import CoregistrationPlan, CoregistrationState, write_state
+from workflows.records.round_files import MANIFEST, PAGE, PLAN, find_round_files
 
 PERIOD_S = 20.0  # least time between two versions on account of registrations, of which there are many
 _DEPTH = 5  # of a product below the coregistration's folder, at most

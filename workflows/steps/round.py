@@ -12,14 +12,13 @@ from registration.progress import Progress
 from registration.storage.records import structure, to_json
 from workflows.ids import check_name
 from workflows.records.coregistration import (
-    FIRST_MODEL,
     CoregistrationPlan,
     CoregistrationState,
     RoundProducts,
     RoundRecord,
     initial_state,
-    model_name,
 )
+from workflows.records.round_files import FIRST_MODEL, model_name
 from workflows.records.step_results import CaptureResult, EvaluateResult, HoldOutResult
 from workflows.records.subject import read_subject
 from workflows.steps.coregistration_page import write_record

@@ -15,7 +15,7 @@ from workflows.engine.reader import QueueReader
 from workflows.farm.coregistration import coregister, submit_coregistration
 from workflows.farm.local import LocalFarm, run_until_done
 from workflows.farm.plan import RoundSettings, make_plan
-from workflows.records.coregistration import PLAN
+from workflows.records.round_files import PLAN
 
 
 def test_an_active_run_is_kept_and_an_ended_run_is_replaced(capture: Path, tmp_path: Path) -> None:

@@ -14,7 +14,8 @@ from tests.workflows.gate import made
 from tests.workflows.gate.test_decisions import ruling
 from workflows.cli.app import main
 from workflows.gate.decisions import DecisionLog, current
-from workflows.gate.items import find_registrations, gate_error, gate_items
+from workflows.gate.item import gate_error
+from workflows.gate.items import find_registrations, gate_items
 from workflows.gate.rules import GateThresholds
 from workflows.gate.table import accepted_id, to_csv
 from workflows.records.store import Store

@@ -1,12 +1,14 @@
 """Routes that list and show runs and jobs."""
 
-from collections.abc import Iterator
+import re
+from collections.abc import Iterator, Mapping
 from typing import Annotated, Any, Literal
 
 from fastapi import APIRouter, Depends, Query
 from pydantic import BaseModel, Field
 
 from registration.errors import InputError
+from workflows.engine.failures import kind_of
 from workflows.engine.reader import CANCELLED, DONE, FAILED, INTERRUPTED, RUNNING, WAITING
 from workflows.ids import check_id, redact
 from workflows.service.access import need
@@ -90,10 +92,10 @@ def runs(
 @router.get("/runs/{run}")
 def run(state: Service, run: str) -> Run:
     """Show one run."""
-    found = next((item for item in list_runs(state) if item.id == run), None)
-    if found is None:
+    found = list_runs(state, run)
+    if not found:
         raise Problem.missing("run", run, "list them at /api/v1/runs")
-    return found
+    return found[0]
 
 
 @router.get("/jobs")
@@ -143,17 +145,27 @@ class JobQuery(BaseModel):
     state: str | None = None
     status: str | None = None
     subject: str | None = None
+    expression: str | None = None
+    kind: str | None = None  # of a failure, as `engine.failures.kind_of` returns it
     text: str | None = None
 
-    def jobs(self, state: ServiceState) -> list[Entry]:
-        """Return the jobs on the board, those that need a look first. Raises Problem for an unknown run."""
-        entries = [entry for entry in state.board.entries.values() if entry.times.kind == "job"]
-        if self.run is not None:
-            entries = [entry for entry in entries if entry.id == self.run or entry.id.startswith(f"{self.run}/")]
-            if not entries and self.run not in state.board.entries:
-                raise Problem.missing("run", self.run, "list them at /api/v1/runs")
-        chosen = [entry for entry in entries if self._accepts(entry)]
-        return sorted(chosen, key=_rank)
+    def entries(self, state: ServiceState) -> list[Entry]:
+        """Return the jobs of the run or part, whatever else is asked for, those that need a look first.
+
+        Raises:
+            Problem: there is no such run.
+        """
+        board, run = state.board.entries, self.run
+        entries = state.board.derived.get(board, ("jobs", run), lambda: _ranked_jobs(board, run))
+        if run is not None and not entries and run not in board:
+            raise Problem.missing("run", run, "list them at /api/v1/runs")
+        return entries
+
+    def jobs(self, state: ServiceState, among: list[Entry] | None = None) -> list[Entry]:
+        """Return the jobs, those that need a look first; `among`: what `entries` returns, if that is known."""
+        entries = self.entries(state) if among is None else among
+        every = self.model_dump(exclude={"run"}, exclude_none=True) == {}
+        return entries if every else list(filter(self._accepts, entries))
 
     def _accepts(self, entry: Entry) -> bool:
         if self.state is not None and entry.times.state != self.state:
@@ -162,6 +174,12 @@ class JobQuery(BaseModel):
             return False
         if self.subject is not None and self.subject not in subject_names(entry.id):
             return False
+        if self.expression is not None and self.expression != expression_name(entry.id):
+            return False
+        if self.kind is not None:
+            failure = entry.times.failure
+            if entry.times.state != FAILED or failure is None or kind_of(failure) != self.kind:
+                return False
         return self.text is None or self.text.lower() in f"{entry.id}\n{entry.reason}".lower()
 
 
@@ -178,19 +196,30 @@ def plain_name(part: str) -> str:
     return name if name and head[:1] in ("s", "e") and head[1:].isdigit() else part
 
 
-def list_runs(state: ServiceState) -> list[Run]:
-    """Return all runs, the newest first."""
+def expression_name(identity: str) -> str:
+    """Return the name of a capture's folder in a job's id, without number."""
+    return re.sub(r"^(?:e\d{3}|neutral)-(?=.)", "", identity.rpartition("/")[2])
+
+
+def list_runs(state: ServiceState, only: str | None = None) -> list[Run]:
+    """Return all runs, the newest first; or `only` the run of this name, if there is one."""
+    board = state.board.entries
+    runs = state.board.derived.get(board, ("runs",), lambda: _runs(state, board))
+    return runs if only is None else [run for run in runs if run.id == only]
+
+
+def _runs(state: ServiceState, board: Mapping[str, Entry]) -> list[Run]:
     counts: dict[str, dict[str, int]] = {}
     created: dict[str, float] = {}
-    for entry in state.board.entries.values():
+    for entry in board.values():
         own = counts.setdefault(entry.run, {})
         if entry.times.kind == "job":
             own[entry.times.state] = own.get(entry.times.state, 0) + 1
         created[entry.run] = min(created.get(entry.run, entry.times.created), entry.times.created)
-    drivers = state.reader.rows([name for name in counts if name in state.board.entries])
+    drivers = state.reader.rows([name for name in counts if name in board])
     listed = []
     for name, by_state in counts.items():
-        driver, row = state.board.entries.get(name), drivers.get(name)
+        driver, row = board.get(name), drivers.get(name)
         kind = str(row.spec.get("flow", "")) if row is not None else ""
         listed.append(
             Run(
@@ -218,6 +247,13 @@ def find_entry(state: ServiceState, job: str) -> Entry:
 
 _ORDER = (FAILED, RUNNING, INTERRUPTED, DONE, WAITING, CANCELLED)
 _LEVELS = ("wrong", "look")
+
+
+def _ranked_jobs(board: Mapping[str, Entry], run: str | None) -> list[Entry]:
+    """The jobs of a run or part, or of all, those that need a look first."""
+    below = "" if run is None else f"{run}/"
+    jobs = (entry for entry in board.values() if entry.times.kind == "job")
+    return sorted((job for job in jobs if run is None or job.id == run or job.id.startswith(below)), key=_rank)
 
 
 def _rank(entry: Entry) -> tuple[int, int, str]:

@@ -1,0 +1,75 @@
+"""One registration at the gate, and the gate's own error: importing it loads no numeric library."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+from workflows.gate.decisions import DecisionEntry
+from workflows.gate.figures import Assessed, GateFigures
+from workflows.gate.rules import Verdict
+
+Policy = Literal["auto", "person"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class GateItem:
+    """One registration at the gate."""
+
+    name: str  # SUBJECT/CAPTURE, or its key in a store
+    place: str  # folder or URL of the registration
+    assessed: Assessed
+    verdict: Verdict
+    decision: DecisionEntry | None = None  # that holds
+
+    @property
+    def content_id(self) -> str:
+        """Of the registration: what decisions are bound to."""
+        return self.assessed.content_id
+
+    @property
+    def figures(self) -> GateFigures:
+        return self.assessed.figures
+
+    @property
+    def waits(self) -> bool:
+        """Whether a person is asked and has not decided."""
+        return self.decision is None and self.verdict.for_person
+
+    def accepted(self, policy: Policy) -> bool:
+        """Return whether a model may be built from it: a decision beats the verdict.
+
+        Args:
+            policy: "auto": what is to be looked at is used until a person rejects it. "person": it is not used until
+                a person accepts it.
+        """
+        if self.decision is not None:
+            return self.decision.decision == "accept"
+        return self.verdict.level == "accept" or (self.verdict.level == "look" and policy == "auto")
+
+
+@dataclass(frozen=True, kw_only=True)
+class GateError:
+    """The gate's own error, from the accepted that a person was shown: the share that the person rejected."""
+
+    shown: int  # decided by a person
+    rejected: int
+    low: float  # bounds of the share, 95 %, exact [Clopper 1934]
+    high: float
+
+    @property
+    def share(self) -> float:
+        return self.rejected / self.shown if self.shown else math.nan
+
+
+def gate_error(items: Sequence[GateItem]) -> GateError | None:
+    """Return the gate's own error, from the sample of the accepted; None: no person has decided about any of it."""
+    from scipy.stats import beta
+
+    decided = [item.decision for item in items if item.verdict.sampled and item.decision is not None]
+    shown, rejected = len(decided), sum(entry.decision == "reject" for entry in decided)
+    if not shown:
+        return None
+    low = float(beta.ppf(0.025, rejected, shown - rejected + 1)) if rejected else 0.0
+    high = float(beta.ppf(0.975, rejected + 1, shown - rejected)) if rejected < shown else 1.0
+    return GateError(shown=shown, rejected=rejected, low=low, high=high)
