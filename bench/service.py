@@ -52,7 +52,7 @@ def main() -> None:
         _row("queue", f"{len(ids):,} captures, written in {time.perf_counter() - start:.0f} s")
         token = Tokens(ServiceSettings(url=url, folder=folder).state).create("bench", ["operator"])
         start = time.perf_counter()
-        process, port = _start(url, folder)
+        process, port = start(url, folder)
         try:
             _row("start", f"{time.perf_counter() - start:.1f} s")
             _measure(Target(port=port, token=token, url=url, pid=process.pid), ids, options)
@@ -203,7 +203,7 @@ def _change(identity: str, chance: random.Random) -> dict[str, object]:
     return {"id": identity, "status": "SUCCESS", **times, "output": pretended_queue.result_text(chance), "error": None}
 
 
-def _start(url: str, folder: Path) -> tuple["subprocess.Popen[str]", int]:
+def start(url: str, folder: Path) -> tuple["subprocess.Popen[str]", int]:
     """Start `gnmreg serve`; return it and its port."""
     command = [sys.executable, "-m", "workflows.cli", "serve", "--folder", str(folder), "--db", url, "--port", "0"]
     log = (folder / "serve.log").open("w")

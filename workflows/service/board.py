@@ -18,12 +18,13 @@ from typing import Any, TypeVar
 
 from workflows.engine.alive import ended_processes
 from workflows.engine.reader import DONE, FAILED, INTERRUPTED, RUNNING, JobTimes, QueueReader
-from workflows.records.headline import HEADLINES, headline_value, verdict_level
+from workflows.records.headline import HEADLINES, headline_value, verdict_level, verdict_reasons
 
 KEPT = 20_000  # changes that are kept
 OVERLAP_MS = 30_000  # by which queries for changes overlap: transactions become visible later than their time stamps
 RELOAD_S = 60.0  # after which deleted rows are noticed
 MAX_DERIVED = 64  # values that are kept
+MAX_REASON = 500  # letters
 _CHUNK = 500  # rows whose results are read at a time
 log = logging.getLogger("gnmreg.service")
 Value = TypeVar("Value")
@@ -36,7 +37,7 @@ class Entry:
     Attributes:
         times: what the figures of a queue need.
         status: of the registration if the job is done, what became of the job if it failed, else the state.
-        reason: of a failure, or of the registration's status.
+        reason: of a failure, of a verdict that asks for a look, or of the registration's status.
         level: of the registration's verdict; empty without one.
         content_id: of the published result; empty without one.
         thumbnail: whether there is a picture of the head.
@@ -266,7 +267,7 @@ def _entry(times: JobTimes, result: dict[str, Any] | None) -> Entry:
     return Entry(
         times,
         status or DONE,
-        reason,
+        "; ".join(verdict_reasons(figures))[:MAX_REASON] or reason,
         level=verdict_level(figures) or "",
         content_id=content,
         thumbnail=about.get("thumbnail") is True,

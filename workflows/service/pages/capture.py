@@ -17,7 +17,7 @@ from workflows.records.headline import HEADLINES, WRONG, verdict_reasons
 from workflows.service.access import need
 from workflows.service.api.jobs import expression_name, find_entry
 from workflows.service.board import Entry
-from workflows.service.pages.base import look_of_entry, page, text
+from workflows.service.pages.base import LOOKS, look_of, page, text
 from workflows.service.pages.files import report_url, row_of, thumbnail_url
 from workflows.service.problems import Problem
 from workflows.service.results import JobResults, arguments_of, results_of
@@ -48,14 +48,14 @@ def capture_page(state: Service, request: Request, job: str) -> Response:
         "capture.html",
         entry=entry,
         times=entry.times,
-        look=look_of_entry(entry),
+        look=look_of(entry.status) if entry.status in LOOKS else look_of(entry.times.state),
         name=expression_name(entry.id),
         run=entry.run,
         is_registration=entry.times.captures,
         is_of_batch="store" in arguments,
         failure=bool(failure),
         status=entry.status,
-        reason=redact(entry.reason),
+        reason="" if verdict_reasons(shown) else redact(entry.reason),
         rows=parts if any(value for name, value in parts if name != "fix") else [("reason", redact(entry.reason))],
         attempts=failure.get("attempts"),
         verdict=entry.level,
