@@ -18,7 +18,9 @@ from registration.model.landmarks import LandmarkScheme, schemes_beside, shipped
 from registration.storage.mesh_files import SUFFIXES, read_mesh
 from registration.storage.reading import open_file
 
-_CAVITY_M = 0.012  # a vertex that faces another surface within it is inside a mouth, nostril, lid or ear
+# A vertex that faces another surface within it is inside a mouth, nostril, lid or ear.
+_CAVITY_M = 0.012  # of models: vertex groups tell most of it
+_UNGROUPED_CAVITY_M = 0.020  # of meshes without groups: as deep as nostrils
 _SKIN = "skin"
 
 
@@ -60,7 +62,7 @@ def of_model(data: GNMData, schemes: Mapping[str, LandmarkScheme], name: str) ->
         vertices=vertices,
         triangles=triangles,
         schemes={**shipped_schemes(data), **schemes},
-        members=regions.outer_surface(data) & ~_cavities(vertices, triangles),
+        members=regions.outer_surface(data) & ~_cavities(vertices, triangles, _CAVITY_M),
         whole=regions.exterior(data),
         parts=parts,
     )
@@ -83,7 +85,8 @@ def of_mesh(
         unit_m: metres of the vertices' unit, roughly.
     """
     triangles = triangles.astype(np.int64)
-    labels, cavities = connected_parts(triangles), _cavities(unit_m * vertices, triangles)
+    labels = connected_parts(triangles)
+    cavities = _cavities(unit_m * vertices, triangles, _UNGROUPED_CAVITY_M)
     skin = np.zeros(len(vertices), bool)
     skin[triangles[labels == np.bincount(labels).argmax()]] = True
     return LandmarkedMesh(
@@ -119,7 +122,9 @@ def read(path: Path) -> LandmarkedMesh:
     return of_mesh(mesh.vertices, mesh.triangles, schemes_beside(path, mesh.vertices), path.name)
 
 
-def _cavities(vertices: Float[np.ndarray, "V 3"], triangles: Int[np.ndarray, "F 3"]) -> Bool[np.ndarray, "V"]:
+def _cavities(
+    vertices: Float[np.ndarray, "V 3"], triangles: Int[np.ndarray, "F 3"], depth_m: float
+) -> Bool[np.ndarray, "V"]:
     """Vertices that face another surface nearby: inside mouth, nostrils, lids and ears, and lips that touch."""
     outwards = normals(vertices.astype(np.float64), triangles)
-    return RayCaster(vertices, triangles).blocked(vertices, outwards, 2e-4, _CAVITY_M)
+    return RayCaster(vertices, triangles).blocked(vertices, outwards, 2e-4, depth_m)

@@ -4,10 +4,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import trimesh
 
 from registration.errors import InputError
 from registration.geometry.nonrigid_icp import IcpSettings
 from registration.model import regions
+from registration.topology_map.landmarked import of_mesh
 from registration.topology_map.make import MapSettings, map_topologies
 from tests.registration.cranium.smooth_heads import tiny
 from tests.registration.topology_map.small_map import QUICK, pair, small_map
@@ -74,3 +76,11 @@ def test_a_scheme_of_another_length_is_refused():
     with pytest.raises(InputError, match="too few landmarks") as caught:
         map_topologies(known.source, replace(known.target, schemes={"68": shorter}), QUICK)
     assert "68 and 60 points" in caught.value.got
+
+
+@pytest.mark.parametrize(("width_m", "mapped"), [(0.016, False), (0.026, True)])
+def test_nostrils_of_a_mesh_without_groups_are_left_out(width_m, mapped):
+    """The walls of a hollow ball face each other; those of nostrils are up to 2 cm apart along their normals."""
+    ball = trimesh.creation.icosphere(2, width_m / 2)
+    hollow = of_mesh(1000 * np.array(ball.vertices), np.array(ball.faces)[:, ::-1], {}, "hollow", unit_m=1e-3)
+    assert (hollow.members == mapped).all()
