@@ -1,6 +1,7 @@
 """Pages of the stabilization review, each a child process on the loopback interface with a limited life."""
 
 import os
+import shlex
 import signal
 import subprocess
 import sys
@@ -84,7 +85,7 @@ class Reviews:
         if not page.listens.is_set():
             detail = "The set is still being prepared"
             raise Problem(HTTPStatus.SERVICE_UNAVAILABLE, detail, got=page.said, fix="ask again in a minute")
-        fix = "run the command in a terminal: " + " ".join(review_command(run, model)[3:])
+        fix = f"run the command in a terminal: gnmreg {shlex.join(_arguments(run, model))}"
         raise Problem(HTTPStatus.CONFLICT, "The review could not start", got=page.said, fix=fix)
 
     def stop(self) -> None:
@@ -104,8 +105,11 @@ class Reviews:
 
 def review_command(run: Path, model: Path) -> list[str]:
     """Return the command of a review's page."""
-    arguments = ["stabilize", "review", str(run), "--model", str(model), "--skip-failed", "--port", "0"]
-    return [sys.executable, "-m", "workflows.cli", *arguments]
+    return [sys.executable, "-m", "workflows.cli", *_arguments(run, model), "--port", "0"]
+
+
+def _arguments(run: Path, model: Path) -> list[str]:
+    return ["stabilize", "review", str(run), "--model", str(model), "--skip-failed"]
 
 
 def _start(command: Sequence[str]) -> _Page:
