@@ -20,7 +20,7 @@ from dataclasses import dataclass, field, replace
 from functools import partial
 from importlib.metadata import version
 from pathlib import Path, PurePosixPath
-from typing import Any
+from typing import IO, Any
 
 from registration.errors import InputError
 from registration.storage.files import atomic_write_text, naming_full_disk
@@ -134,6 +134,26 @@ class Store:
         if hashlib.sha256(content).hexdigest() != stored.sha256:
             raise Artifact.invalid(where, expected=f"sha256 {stored.sha256}", got="other content")
         return bytes(content)
+
+    def open(self, artifact: Artifact, name: str) -> IO[bytes]:
+        """Open a file of an artifact for reading; it can be positioned.
+
+        Raises:
+            InputError: the artifact names no such file, it is missing, or a link leads it out of the store.
+        """
+        where, path = f"{self.url}/{artifact.key}/{name}", self._path(artifact.key, artifact.attempt, name)
+        refuse = partial(Artifact.invalid, where)
+        if name not in artifact.files:
+            raise refuse(expected="a file of the artifact", got="none")
+        if self.local is not None:
+            if os.path.realpath(path) != path:
+                raise refuse(expected="a file in the store", got="a link")
+            return open_file(Path(path), refuse)
+        try:
+            stream: IO[bytes] = self._fs.open(path, "rb")
+        except FileNotFoundError:
+            raise refuse(expected="a file of the artifact", got="no such file") from None
+        return stream
 
     def produce(self, key: str, *, input_hash: str, make: Callable[[Path], Mapping[str, Any]]) -> Artifact:
         """Return the artifact of a key: the published one if it has this input hash, else a new one.

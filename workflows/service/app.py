@@ -12,7 +12,7 @@ from starlette.middleware import Middleware
 
 from workflows.service import health, login, problems, prometheus, rendering
 from workflows.service.access import need
-from workflows.service.api import actions, captures, events, gate, jobs, reviews, subjects, submissions
+from workflows.service.api import actions, artifacts, captures, events, gate, jobs, reviews, subjects, submissions
 from workflows.service.middleware import Guard
 from workflows.service.pages import all as pages
 from workflows.service.pages.base import for_people
@@ -54,7 +54,7 @@ def create_app(settings: ServiceSettings) -> FastAPI:
     )
     app.state.service = state
     problems.install(app, for_people)
-    for module in (jobs, subjects, actions, events, captures, submissions, reviews, gate):
+    for module in (jobs, subjects, actions, events, captures, submissions, reviews, gate, artifacts):
         app.include_router(module.router, prefix=API)
     for module in (health, prometheus, login, rendering, pages):
         app.include_router(module.router)

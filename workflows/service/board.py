@@ -168,6 +168,19 @@ class Board:
                 return None
             return list(islice(self._changes, number - first + 1, None))
 
+    def jobs_with(self, content_id: str) -> list[str]:
+        """Return the ids of the jobs whose result has a content id."""
+        entries = self.entries
+
+        def make() -> dict[str, list[str]]:
+            found: dict[str, list[str]] = {}
+            for entry in entries.values():
+                if entry.content_id:
+                    found.setdefault(entry.content_id, []).append(entry.id)
+            return found
+
+        return self.derived.get(entries, ("contents",), make).get(content_id, [])
+
     def refresh(self) -> None:
         """Read what changed since the last call."""
         with self._refreshing:

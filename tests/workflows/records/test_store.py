@@ -70,6 +70,18 @@ def test_find_returns_the_published_artifact(store: Store) -> None:
     assert list(store.keys()) == ["run/a"]
 
 
+def test_files_are_opened_at_any_position(store: Store) -> None:
+    artifact = store.produce("run/a", input_hash="hash", make=write)
+    with store.open(artifact, "sub/page.html") as stream:
+        stream.seek(2)
+        assert stream.read() == b"ge"
+    with pytest.raises(InputError, match="artifact"):
+        store.open(artifact, "../artifact.json")
+    overwrite(store, f"run/a/{artifact.attempt}/mesh.ply", None)
+    with pytest.raises(InputError, match="artifact"):
+        store.open(artifact, "mesh.ply").read()
+
+
 def test_the_same_input_hash_returns_the_stored_artifact(store: Store) -> None:
     first = store.produce("a", input_hash="one", make=write)
     assert store.produce("a", input_hash="one", make=must_not_run) == first

@@ -14,6 +14,7 @@ from workflows.farm.batch import batch_jobs, submit_batch
 from workflows.ids import is_remote, redact
 from workflows.service.access import need
 from workflows.service.idempotency import RepeatableRoute, idempotency_key
+from workflows.service.models import find_model
 from workflows.service.places import FIRST, OFFICIAL
 from workflows.service.problems import RESPONSES, Problem
 from workflows.service.state import Service, ServiceState
@@ -182,6 +183,9 @@ def _captures(state: ServiceState, words: list[str]) -> tuple[list[str], dict[st
 def _model(state: ServiceState, name: str) -> str:
     """The place of a model; one of this machine's cache is copied to where workers may read it. Raises Problem."""
     place = state.places.model(name)
+    if place is None and "/" in name:
+        built = find_model(state, name)
+        place = None if built is None else str(built.file)
     if place is None and name in (FIRST, OFFICIAL):
         folder = state.places.models / name
         place = state.submitting.call("store_cached_model", name=name, folder=str(folder))
