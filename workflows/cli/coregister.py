@@ -6,7 +6,9 @@ from typing import Annotated, Literal
 
 from tyro.conf import Positional, arg
 
+from workflows.cli import remote
 from workflows.cli.options import Folder, JobOptions, ModelFile, RunOptions
+from workflows.cli.remote import NO_SERVER, ServerOptions
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -49,6 +51,7 @@ def coregister(
     rounds: RoundOptions = _ROUNDS,
     fit: JobOptions = _FIT,
     farm: RunOptions = _RUN,
+    server: ServerOptions = NO_SERVER,
 ) -> int:
     """Build a head model from a dataset in rounds: register, build, evaluate.
 
@@ -62,7 +65,10 @@ def coregister(
         rounds: Rounds and their evaluation.
         fit: How captures are registered.
         farm: Where the jobs are executed.
+        server: Submit to a service; DATASET, NPZ and DIR are places or names there.
     """
+    if server.server is not None:
+        return remote.coregister(server, str(dataset), str(model), str(out), rounds, fit)
     from coregister.anatomy.assemble import BUILDERS
     from coregister.stopping_rule import StoppingRule
     from registration.progress import console_progress

@@ -13,7 +13,9 @@ from tyro.conf import Positional, arg
 
 from registration.errors import InputError
 from registration.terminal import unescaped
+from workflows.cli import remote
 from workflows.cli.options import NOT_SET, FarmOptions, JobId, JobOptions, Port, RunName, RunOptions
+from workflows.cli.remote import NO_SERVER, NO_UPLOAD, ServerOptions, UploadOptions
 
 if TYPE_CHECKING:
     from workflows.engine.client import QueueClient
@@ -143,6 +145,7 @@ def batch(
     run: Annotated[str | None, arg(metavar="RUN", help_behavior_hint="(default: the name of the store)")] = None,
     fit: JobOptions = _FIT,
     farm: RunOptions = _RUN,
+    server: UploadOptions = NO_UPLOAD,
 ) -> int:
     """Register many independent captures through the queue.
 
@@ -155,7 +158,10 @@ def batch(
             settings or contents changed.
         fit: How the captures are registered.
         farm: Where the jobs are executed.
+        server: Submit to a service; captures that it does not see are uploaded.
     """
+    if server.server is not None:
+        return remote.batch(server, captures, model, out, run, fit)
     from registration.progress import console_progress
     from workflows.engine.process import migrate
     from workflows.engine.reader import QueueReader
@@ -207,6 +213,7 @@ def status(
     watch: bool = False,
     page: Annotated[str | None, arg(metavar="DIR|URL", help_behavior_hint=NOT_SET)] = None,
     listed: ListOptions = _LIST,
+    server: ServerOptions = NO_SERVER,
 ) -> int:
     """Show queue progress: counts, throughput, expected end, workers, failures.
 
@@ -216,7 +223,11 @@ def status(
         watch: Refresh every two seconds until Ctrl-C.
         page: Also write the page and the table of the batch RUN into the store of its results.
         listed: A list of jobs.
+        server: Ask a service instead.
     """
+    if server.server is not None:
+        wanted = {"state": listed.state, "subject": listed.subject, "text": listed.text}
+        return remote.status(server, run, wanted if listed.wanted else None, listed.limit)
     from workflows.engine.reader import QueueReader
     from workflows.farm.status import JobFilter, job_lines, status_lines
 
@@ -242,13 +253,16 @@ def status(
         time.sleep(REFRESH_S)
 
 
-def logs(job: JobId, /, farm: FarmOptions = _FARM) -> int:
+def logs(job: JobId, /, farm: FarmOptions = _FARM, server: ServerOptions = NO_SERVER) -> int:
     """Print a job's state and its output; of a run, a round or a subject, its jobs.
 
     Args:
         job: An id as `gnmreg status --jobs` prints it, or its end if that is unique, such as ann/smile.
         farm: Which farm; its folder must be the one of the machine that executed the job, or shared with it.
+        server: Ask a service instead; it takes whole ids only.
     """
+    if server.server is not None:
+        return remote.logs(server, job)
     from workflows.engine.reader import QueueReader
     from workflows.farm.status import find_jobs, group_lines
     from workflows.ids import check_id
@@ -301,14 +315,19 @@ def debug(
     return 0
 
 
-def retry(run: RunName, /, cancelled: bool = False, farm: FarmOptions = _FARM) -> int:
+def retry(
+    run: RunName, /, cancelled: bool = False, farm: FarmOptions = _FARM, server: ServerOptions = NO_SERVER
+) -> int:
     """Requeue the failed jobs of a run with their dependents; resume a parked run.
 
     Args:
         run: The run, or part of a run.
         cancelled: Also requeue cancelled jobs.
         farm: Which farm.
+        server: Ask a service instead.
     """
+    if server.server is not None:
+        return remote.act(server, "retry", run, "requeued", cancelled=cancelled)
     _require(farm.url, run)
     with _queue(farm.url) as queue:
         requeued = queue.retry(run, failed=True, cancelled=cancelled)
@@ -316,13 +335,16 @@ def retry(run: RunName, /, cancelled: bool = False, farm: FarmOptions = _FARM) -
     return 0
 
 
-def cancel(run: RunName, /, farm: FarmOptions = _FARM) -> int:
+def cancel(run: RunName, /, farm: FarmOptions = _FARM, server: ServerOptions = NO_SERVER) -> int:
     """Cancel a run, or part of it; running jobs are stopped within seconds.
 
     Args:
         run: The run, or part of a run such as RUN/it00/s00007.
         farm: Which farm.
+        server: Ask a service instead.
     """
+    if server.server is not None:
+        return remote.act(server, "cancel", run, "cancelled")
     _require(farm.url, run)
     with _queue(farm.url) as queue:
         print(f"{queue.cancel(run)} cancelled")

@@ -59,7 +59,7 @@ def batch_jobs(
     """
     model, store = resolve_place(model, "--model"), resolve_place(out, "--out")
     shared = {"model": model, "store": store, "options": to_json(to_job(options))}
-    locations, refused = _places([location for word in captures for location in _expand(word)])
+    locations, refused = _places([location for word in captures for location in expand(word)])
     if not locations:
         expected, got = "captures", next((f"{word}: {reason}" for word, reason in refused.items()), "none")
         raise _input_error("There is nothing to register", where="CAPTURE", expected=expected, got=got)
@@ -130,7 +130,8 @@ def made_and_kept(url: str, batch: Batch) -> tuple[int, int]:
     return made, len(results) - made
 
 
-def _expand(word: str) -> list[str]:
+def expand(word: str) -> list[str]:
+    """Return the captures that a word stands for: itself, or the lines of @FILE. Raises InputError."""
     if not word.startswith("@"):
         return [word]
     file = Path(word[1:])

@@ -25,6 +25,11 @@ class Places:
         self.farm = Path(self.roots[0])
         self.captures, self.models, self.results = (self.farm / name for name in OFFERED)
 
+    @property
+    def offered(self) -> list[str]:
+        """Folders and URLs that contain all places which requests may name."""
+        return [str(self.farm / name) for name in OFFERED] + list(self.roots[1:])
+
     def check(self, location: str, where: str) -> str:
         """Return a path or URL, in the form in which it is opened, if jobs may use it.
 
@@ -137,12 +142,11 @@ class Places:
         return path.relative_to(self.farm).parts[:1] in [(name,) for name in OFFERED]
 
     def _foreign(self, where: str, *, got: str) -> Problem:
-        allowed = [str(self.farm / name) for name in OFFERED] + list(self.roots[1:])
         return Problem(
             HTTPStatus.FORBIDDEN,
             "The place is outside those of the service",
             where=where,
-            expected=f"a path or URL below {', '.join(allowed)}",
+            expected=f"a path or URL below {', '.join(self.offered)}",
             got=got,
             fix="upload captures, or start the service with `gnmreg serve --root`",
         )

@@ -60,7 +60,7 @@ def test_every_function_of_the_command_modules_is_a_command() -> None:
     public = {
         function
         for module in modules
-        if module.__name__ not in ("workflows.cli.app", "workflows.cli.arguments", "workflows.cli.options")
+        if module.__name__.rpartition(".")[2] not in ("app", "arguments", "options", "remote")
         for name, function in inspect.getmembers(module, inspect.isfunction)
         if function.__module__ == module.__name__ and not name.startswith("_")
     }

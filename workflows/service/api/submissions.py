@@ -110,6 +110,18 @@ class Submitted(BaseModel):
     left_out: dict[str, str] = Field(default={}, description="capture -> why it has no job, or will fail")
 
 
+class PlaceList(BaseModel):
+    """Places that submissions may name."""
+
+    roots: list[str]
+
+
+@router.get("/places")
+def places(state: Service) -> PlaceList:
+    """List the folders and URLs below which submitted captures, models and results must lie."""
+    return PlaceList(roots=state.places.offered)
+
+
 @router.post("/batches", status_code=202)
 def submit_captures(state: Service, request: BatchRequest, response: Response) -> Submitted:
     """Register captures. Those that cannot be used do not stop the others."""
