@@ -8,6 +8,8 @@ import pytest
 import sqlalchemy as sa
 
 from tests.conftest import FIXTURES
+from tests.workflows import browser
+from tests.workflows.browser import needs_browser
 from tests.workflows.service.conftest import RunningService
 from workflows.engine.client import QueueClient
 from workflows.engine.database import engine, table
@@ -33,13 +35,13 @@ def finish(service: RunningService, identity: str, arguments: dict, result: obje
     service.state.board.refresh()
 
 
-def publish(service: RunningService, key: str, store: str | None = None, text: str = "x" * 100) -> str:
+def publish(service: RunningService, key: str, store: str | None = None, report: str = REPORT) -> str:
     """Publish a result and have a job end with it; return its content id."""
 
     def make(folder: Path) -> dict:
         (folder / "registration").mkdir()
-        (folder / "registration" / "report.html").write_text(REPORT)
-        (folder / "registration" / "mesh.ply").write_text(f"{key} {text}")
+        (folder / "registration" / "report.html").write_text(report)
+        (folder / "registration" / "mesh.ply").write_text(f"{key} {'x' * 100}")
         (folder / "thumbnail.jpg").write_bytes(b"\xff\xd8")
         return {"status": "converged"}
 
@@ -184,3 +186,30 @@ def test_models(service):
     assert submitted["detail"] == "There is nothing to register"
     (out / "coregistration.json").write_text("{")
     assert [model["id"] for model in service.get("/models").json] == ["tiny"]
+
+
+@needs_browser
+def test_scripts_of_a_report_run_and_reach_nothing(service):
+    """As a page embeds it, and in a tab of its own, with the viewer's session in the browser."""
+    sync_api = pytest.importorskip("playwright.sync_api")
+    probe = (
+        "<html><body><script>document.title = 'ran ' + origin; let text = 'sent ';"
+        "try { text = 'cookie ' + document.cookie } catch (e) { text = 'none ' }"
+        "fetch('/api/v1/runs').then(r => r.text(), () => 'refused').then(t => { document.body.append(text + t) })"
+        "</script></body></html>"
+    )
+    content = publish(service, "art/eve/probe", report=probe)
+    place = f"{service.url}/api/v1/artifacts/{content}/registration/report.html"
+    secret = service.state.access.login_link(service.state.tokens.find(service.tokens["viewer"]))
+    with browser.launch(sync_api) as chromium:
+        tab = chromium.new_page()
+        tab.goto(f"{service.url}/login?once={secret}")
+        tab.goto(f"{service.url}/login")
+        tab.evaluate(
+            "place => { const f = document.createElement('iframe'); f.src = place; document.body.append(f) }", place
+        )
+        for frame in (tab.wait_for_selector("iframe").content_frame(), tab):
+            if frame is tab:
+                tab.goto(place)
+            frame.wait_for_selector("text=refused")
+            assert frame.title() == "ran null" and "none refused" in frame.content()
