@@ -14,7 +14,7 @@ class RoundMetrics:
     generalization_mm: float  # of the model that the round built, on held-out subjects
     drift_mm: float  # rms distance between the stable skin of the round's input template and of its output template
     registered: int  # registrations in the model
-    failed: int  # registrations that failed, or were rejected as outliers
+    failed: int  # registrations that failed, were left out by the quality gate, or rejected as outliers
 
 
 @dataclass(frozen=True, kw_only=True)

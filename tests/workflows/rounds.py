@@ -3,6 +3,7 @@
 import json
 import shutil
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -67,6 +68,7 @@ class TrueRegister:
 
     def __init__(self) -> None:
         self.outcomes: dict[str, BaseException | Callable[[np.ndarray], np.ndarray]] = {}  # SUBJECT/CAPTURE
+        self.figures: dict[str, dict[str, object]] = {}  # SUBJECT/CAPTURE -> figures besides the usual ones
         self.outputs: list[Path] = []
 
     def __call__(self, capture: Path, model: Path, out: Path, options: RegisterOptions, **_: object) -> Registration:
@@ -94,6 +96,8 @@ class TrueRegister:
             inputs=inputs,
             config=config,
         )
+        more = self.figures.get("/".join(capture.parts[-2:]), {})
+        result = replace(result, figures={**result.figures, **more})
         save_registration(result, out, "<html></html>")
         self.outputs.append(out)
         return result

@@ -66,7 +66,8 @@ def run_rounds(dataset: Path, out: Path, **options) -> dict:
     first, registration = options.pop("model", MODEL), options.pop("options", RegisterOptions())
     rounds = RoundSettings(**{"rule": TWICE, "components": (2,), "samples": 2, **options})
     plan = start_coregistration(make_plan(dataset, first, out, registration, rounds))
-    scope = Inline("run", run_step((dataset, MODEL.parent, out)), [])
+    roots = (dataset, MODEL.parent, out, *([options["decisions"]] if "decisions" in options else []))
+    scope = Inline("run", run_step(roots), [])
     asyncio.run(coregister(scope, plan=str(plan)))
     return read_record(out)
 
@@ -91,7 +92,7 @@ def test_two_rounds_build_models_without_held_out_subjects(dataset, true_registe
         *("coregistration.json", "plan.json", "index.html"),
         *("held_out", "it00", "it01"),
     }
-    assert {path.name for path in (out / "it00").iterdir()} == {"registrations", "model", "evaluation"}
+    assert {path.name for path in (out / "it00").iterdir()} == {*("registrations", "gate", "model", "evaluation")}
     assert {path.name for path in (out / "it00" / "model").iterdir()} == {
         *("gnm_head.npz", "gnm_head.manifest.json", "gnm_head.expressions.npz", "head_sparse_68.txt"),
         *("index.html", "step.json"),
@@ -134,6 +135,7 @@ def test_python_builds_the_same_model_from_the_same_registrations(dataset, true_
         recipe = None if name == DEFAULT_MODEL_RECIPE else load_model_recipe(name)
         built = build_model(subjects, data, recipe, categories=parsed.categories)
         manifest = json.loads((out / "it00/model/gnm_head.manifest.json").read_text())
+        assert manifest.pop("gate")["left_out"] == {}
         assert built.manifest == manifest and manifest["content_id"] == record["rounds"][0]["build"]["content_id"]
         assert manifest["config"]["name"] == out.name
         contents[name] = manifest["content_id"]
@@ -359,7 +361,8 @@ def test_held_out_subjects_come_from_tags_a_list_or_a_fraction(dataset, tmp_path
 def test_the_command_resumes_and_reports_failures(dataset, true_register, tmp_path, capsys, monkeypatch):
     """The processes are stand-ins that run the flow here; `make demo-batch` starts real processes."""
     monkeypatch.setattr(workflows.farm.plan, "RoundSettings", partial(RoundSettings, samples=2))
-    out, roots = tmp_path / "out", (dataset, MODEL.parent, tmp_path / "out")
+    out = tmp_path / "out"
+    roots = (dataset, MODEL.parent, out, tmp_path / "out.farm")
     arguments = f"coregister {dataset} --model {MODEL} --out {out} --anatomy keep --components 2".split()
     assert main([*arguments, "--folder", str(tmp_path)]) == 2
     assert "There is no queue" in capsys.readouterr().err and not out.exists()

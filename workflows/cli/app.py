@@ -107,6 +107,7 @@ GROUPS: Mapping[str, Mapping[str, Command]] = {
         "cancel": farm.cancel,
         "migrate": farm.migrate,
         "gate verdicts": gate.verdicts,
+        "gate calibrate": gate.calibrate,
         "gate decide": gate.decide,
         "gate verify": gate.verify,
         "gate replay": gate.replay,

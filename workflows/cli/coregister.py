@@ -27,6 +27,10 @@ class RoundOptions:
         components: Numbers of identity components to evaluate models with; the largest is compared between rounds.
         anatomy: Eyes, teeth, tongue and pupils of the first round's model. regenerate: from data of their own, as
             `gnmreg model anatomy` does. keep: as in the first model.
+        gate: Registrations that the quality gate wants a person to look at. auto: models are built from them until a
+            person rejects them. person: the run waits until all of them are decided; then `gnmreg retry`.
+        gate_thresholds: Limits of the gate's rules, as `gnmreg gate calibrate` writes them. By default those of the
+            farm, gate/thresholds.json in its folder, or built-in ones.
     """
 
     iterations: Annotated[int, arg(metavar="K")] = 3
@@ -38,6 +42,8 @@ class RoundOptions:
     ] = None
     components: Annotated[tuple[int, ...], arg(metavar="K", help_behavior_hint="(default: 5 10 20 40)")] = ()
     anatomy: Literal["regenerate", "keep"] = "regenerate"
+    gate: Literal["auto", "person"] = "auto"
+    gate_thresholds: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="(default: the farm's)")] = None
 
 
 _FIT, _ROUNDS, _RUN = JobOptions(), RoundOptions(), RunOptions()
@@ -76,17 +82,24 @@ def coregister(
     from workflows.farm.coregistration import coregister, submit_coregistration
     from workflows.farm.local import local_gpus
     from workflows.farm.plan import RoundSettings, make_plan
+    from workflows.gate.decisions import DecisionLog
+    from workflows.gate.rules import read_thresholds
     from workflows.records.round_files import PAGE
 
+    folder = farm.farm_folder(out)
+    log = DecisionLog.of_farm(folder)
+    asked = farm.local or rounds.gate == "person" or log.exists()  # a farm's workers may not reach its folder
     settings = RoundSettings(
         model_recipe=rounds.model_recipe,
         held_out=_fraction_or_file(rounds.held_out),
         components=rounds.components or None,
         rule=StoppingRule(max_rounds=rounds.iterations, early_stopping=not rounds.all_iterations),
         anatomy=tuple(BUILDERS) if rounds.anatomy == "regenerate" else (),
+        gate=rounds.gate,
+        gate_thresholds=read_thresholds(rounds.gate_thresholds, folder),
+        decisions=log.folder if asked else None,
     )
     plan = make_plan(dataset, model, out, fit.register_options(), settings)
-    folder = farm.farm_folder(out)
     url = farm.url_for(folder)
     if not farm.local:
         print(f"{submit_coregistration(url, plan)} is in the queue; see gnmreg status")

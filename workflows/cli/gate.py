@@ -28,12 +28,13 @@ class GateOptions:
     """The rules of the gate.
 
     Attributes:
-        thresholds: Limits of the rules, as `gnmreg gate calibrate` writes them.
+        thresholds: Limits of the rules, as `gnmreg gate calibrate` writes them. By default those of the farm,
+            gate/thresholds.json in its folder, or built-in ones.
         policy: What becomes of a registration that is for a person. auto: it is used until a person rejects it.
             person: it is not used until a person accepts it.
     """
 
-    thresholds: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="(default: built-in limits)")] = None
+    thresholds: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="(default: the farm's)")] = None
     policy: Literal["auto", "person"] = "auto"
 
 
@@ -54,8 +55,6 @@ def verdicts(runs: Runs, /, out: OptionalFile = None, gate: GateOptions = _GATE,
 
     if out is not None:
         _check_file(out)
-    if not runs:
-        raise InputError("There is no run", where="RUN", expected="one or more runs", got="none", fix="name a run")
     items = _items(runs, gate, farm)
     for item in items:
         decided = f"; {item.decision.who}: {item.decision.decision}" if item.decision else ""
@@ -107,11 +106,53 @@ def decide(
         decision=choice,
         reason=reason,
         who=who or user_name(),
-        thresholds=_thresholds(gate).content_id,
+        thresholds=_thresholds(gate, farm).content_id,
         verdict=item.verdict.level,
     )
     entry = DecisionLog.of_farm(farm.directory).append(ruling)
     print(f"{entry.sequence}: {entry.decision} {entry.name} ({entry.content_id[:_SHORT]})")
+    return 0
+
+
+def calibrate(
+    runs: Runs,
+    /,
+    labels: Annotated[Path, arg(metavar="CSV")],
+    out: Annotated[Path, arg(metavar="JSON")],
+    gate: GateOptions = _GATE,
+    farm: FarmOptions = _FARM,
+) -> int:
+    """Propose thresholds from registrations that a person has labelled good or bad.
+
+    Beside the thresholds a page with the ROC curves of all rules is written.
+
+    Args:
+        runs: Names of runs in the queue, stores, or folders of subjects' registrations or of coregistrations.
+        labels: A table with the columns name and label: a registration's name or content id, and good or bad. Label a
+            random choice of the registrations; fifty are enough if ten of them are bad.
+        out: The file of the thresholds.
+        gate: The rules of the gate; the sample share and the seed of the thresholds are kept.
+        farm: Which farm: its queue.
+    """
+    from dataclasses import replace
+
+    from workflows.gate.calibrate import calibrate, labelled, read_labels
+    from workflows.pages.gate_calibration import render_gate_calibration
+
+    page = out.with_suffix(".html")
+    for file in (out, page):
+        _check_file(file)
+    examples = labelled(_items(runs, gate, farm), read_labels(labels), labels)
+    result = calibrate(examples, replace(_thresholds(gate, farm), name=out.stem))
+    found = result.thresholds.calibration
+    assert found is not None
+    result.thresholds.write(out)
+    _write(page, render_gate_calibration(result.view))
+    print(out)
+    print(
+        f"{100 * found.recall:.0f} % of {found.bad} bad ones and {100 * found.false_alarms:.0f} % of {found.good} good "
+        "ones are not accepted, each judged by thresholds from the other labels"
+    )
     return 0
 
 
@@ -179,10 +220,10 @@ def replay(
     return 0
 
 
-def _thresholds(gate: GateOptions) -> "GateThresholds":
+def _thresholds(gate: GateOptions, farm: FarmOptions) -> "GateThresholds":
     from workflows.gate.rules import read_thresholds
 
-    return read_thresholds(gate.thresholds)
+    return read_thresholds(gate.thresholds, farm.directory)
 
 
 def _items(
@@ -191,7 +232,9 @@ def _items(
     from workflows.gate.decisions import DecisionLog, current, read_log
     from workflows.gate.items import find_registrations, gate_items
 
-    thresholds = _thresholds(gate)
+    if not runs:
+        raise InputError("There is no run", where="RUN", expected="one or more runs", got="none", fix="name a run")
+    thresholds = _thresholds(gate, farm)
     entries = DecisionLog.of_farm(farm.directory).read() if decisions is None else read_log(decisions)
     found = [one for run in runs for one in find_registrations(run, _queue(farm))]
     return gate_items(found, thresholds, current(entries))

@@ -11,7 +11,7 @@ from typing import Any
 
 from workflows.ids import check_location, job_refused, shortened
 
-VERSION = "wf-3"  # change it only with the structure of a workflow: workers take jobs of their own version only
+VERSION = "wf-4"  # change it only with the structure of a workflow: workers take jobs of their own version only
 GPU, SUBJECTS, DRIVER, REBUILD = "gpu", "subjects", "driver", "rebuild"  # the queues
 NEUTRAL_PRIORITY, EXPRESSION_PRIORITY, STABILIZE_PRIORITY = 5, 10, 3  # the lowest number first
 MAX_BYTES = 512 * 1024  # of a job's arguments and of a step's result, as JSON: arrays are passed as files

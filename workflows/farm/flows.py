@@ -24,7 +24,7 @@ from workflows.engine.jobs import (
 from workflows.ids import id_part
 from workflows.records.coregistration import CoregistrationPlan, RoundProducts
 from workflows.records.round_files import FIRST_MODEL, PLAN, model_name
-from workflows.records.step_results import BuildResult, EvaluateResult, HoldOutResult, StabilizeResult
+from workflows.records.step_results import BuildResult, EvaluateResult, GateResult, HoldOutResult, StabilizeResult
 from workflows.steps import table
 
 if TYPE_CHECKING:
@@ -109,6 +109,7 @@ async def coregister(scope: "FlowScope", *, plan: str) -> dict[str, Any]:
         folder = f"{record.out}/{name}"
         run = f"{folder}/registrations"
         await _register(scope, name, record, training, run, model)
+        gated, gate = await _gate(scope, name, record, training, run)
         stabilized = StabilizeResult.from_json(
             await _run_step(
                 scope,
@@ -118,6 +119,7 @@ async def coregister(scope: "FlowScope", *, plan: str) -> dict[str, Any]:
                 names=training,
                 model=model,
                 out=f"{run}/stabilized",
+                **gate,
             ),
             where=f"{name}/stab",
         )
@@ -128,7 +130,7 @@ async def coregister(scope: "FlowScope", *, plan: str) -> dict[str, Any]:
                 table.BUILD,
                 run=run,
                 names=training,
-                stabilized=stabilized.out,
+                made=gate | ({} if stabilized.out is None else {"stabilized": stabilized.out}),
                 dataset=str(record.dataset),
                 previous=model,
                 out=f"{folder}/model",
@@ -152,7 +154,7 @@ async def coregister(scope: "FlowScope", *, plan: str) -> dict[str, Any]:
             ),
             where=f"{name}/evaluate",
         )
-        rounds.append(RoundProducts(name=name, stabilize=stabilized, build=built, evaluate=evaluated))
+        rounds.append(RoundProducts(name=name, gate=gated, stabilize=stabilized, build=built, evaluate=evaluated))
         verdict = await _end_round(scope, name, plan, held_out, rounds)
         if not verdict.proceed:
             break
@@ -164,6 +166,31 @@ def _checked_plan(scope: "FlowScope", plan: str) -> str:
     if PurePosixPath(plan).name != PLAN or not PurePosixPath(plan).is_absolute():
         raise scope.park(f"no path of a {PLAN}")
     return plan
+
+
+async def _gate(
+    scope: "FlowScope", name: str, plan: CoregistrationPlan, names: Sequence[str], run: str
+) -> tuple[GateResult | None, dict[str, str]]:
+    """The gate's result, and the folder of its record as an argument of the steps that use the registrations.
+
+    If registrations wait for a person, and the policy asks for decisions, the step fails and the run is parked.
+    """
+    if plan.gate is None:
+        return None, {}
+    folder = f"{plan.out}/{name}/gate"
+    value = await _run_step(
+        scope,
+        f"{name}/gate",
+        table.GATE,
+        run=run,
+        names=list(names),
+        policy=plan.gate.policy,
+        thresholds=dict(plan.gate.thresholds),
+        decisions=None if plan.gate.decisions is None else str(plan.gate.decisions),
+        out=folder,
+    )
+    gated = GateResult.from_json(value, where=f"{name}/gate")
+    return gated, {"gate": folder}
 
 
 async def _end_round(

@@ -13,8 +13,10 @@ from registration.errors import InputError
 from registration.model import gnm_npz
 from registration.model.gnm_npz import GNMData
 from registration.options import RegisterOptions
-from workflows.records.coregistration import CoregistrationPlan, check_out
+from workflows.gate.rules import GateThresholds
+from workflows.records.coregistration import CoregistrationPlan, GateSettings, check_out
 from workflows.records.dataset import read_dataset, split
+from workflows.records.step_results import Policy
 from workflows.records.training_subjects import has_truths
 from workflows.steps.job_options import to_job
 
@@ -33,6 +35,9 @@ class RoundSettings:
         samples: random heads of each model, for specificity; 0: none.
         rule: when to stop.
         anatomy: parts that the first round regenerates in its model, as `coregister.anatomy.assemble` does.
+        gate: whether models are built from registrations that are for a person before the person has decided.
+        gate_thresholds: of the gate's rules.
+        decisions: folder of the log of decisions; None: there are none.
     """
 
     model_recipe: str | ModelRecipe = DEFAULT_MODEL_RECIPE
@@ -41,6 +46,9 @@ class RoundSettings:
     samples: int = 200
     rule: StoppingRule = field(default_factory=StoppingRule)
     anatomy: tuple[PartName, ...] = ()
+    gate: Policy = "auto"
+    gate_thresholds: GateThresholds = field(default_factory=GateThresholds)
+    decisions: Path | None = None
 
 
 def make_plan(
@@ -82,6 +90,11 @@ def make_plan(
         captures={name: tuple(capture.root.name for capture in source.subjects[name].captures) for name in names},
         without_truth=tuple(name for name in division.held_out if not has_truths(source.subjects[name], data)),
         anatomy=rounds.anatomy,
+        gate=GateSettings(
+            policy=rounds.gate,
+            thresholds=rounds.gate_thresholds.to_json(),
+            decisions=None if rounds.decisions is None else Path(rounds.decisions).resolve(),
+        ),
     )
     _check(plan, data, requested=rounds.components is not None)
     check_out(plan.out)

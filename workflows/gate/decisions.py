@@ -30,9 +30,9 @@ from registration.errors import InputError
 from registration.storage.files import atomic_file, naming_full_disk
 from registration.storage.reading import open_file, read_bytes
 from registration.storage.records import Record
-from workflows.gate.rules import Level
+from workflows.gate.rules import FOLDER, Level
 
-FOLDER, LOG, KEY, PUBLIC_KEY, LOCK = "gate", "decisions.jsonl", "key", "key.pub", "lock"
+LOG, KEY, PUBLIC_KEY, LOCK = "decisions.jsonl", "key", "key.pub", "lock"
 START = "0" * 64  # the previous hash of the first entry
 MAX_BYTES = 2**30  # of a log: more than a million decisions
 MAX_REASON = 2000  # letters

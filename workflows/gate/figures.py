@@ -19,6 +19,7 @@ class FigureKind:
     title: str
     unit: str
     meaning: str
+    noise: float  # least spread of good registrations that a calibration assumes: smaller differences mean nothing
     digits: int = 1
 
     def text(self, value: float) -> str:
@@ -63,70 +64,101 @@ class GateFigures:
 
 FIGURES: Mapping[str, FigureKind] = {
     "scan_mm": FigureKind(
-        title="distance from the scan", unit="mm", meaning="mean distance of the scan's face from the mesh", digits=2
+        title="distance from the scan",
+        unit="mm",
+        meaning="mean distance of the scan's face from the mesh",
+        noise=0.02,
+        digits=2,
     ),
     "landmarks_px": FigureKind(
-        title="landmarks", unit="px", meaning="median distance of the landmarks; the head is 512 px high"
+        title="landmarks", unit="px", meaning="median distance of the landmarks; the head is 512 px high", noise=0.1
     ),
     "worst_landmarks_px": FigureKind(
-        title="landmarks in the worst view", unit="px", meaning="the same in the view where it is largest"
+        title="landmarks in the worst view", unit="px", meaning="the same in the view where it is largest", noise=0.2
     ),
     "silhouette_px": FigureKind(
-        title="silhouette", unit="px", meaning="mean distance of the outlines; the head is 512 px high"
+        title="silhouette", unit="px", meaning="mean distance of the outlines; the head is 512 px high", noise=0.1
     ),
     "worst_silhouette_px": FigureKind(
-        title="silhouette in the worst view", unit="px", meaning="the same in the view where it is largest"
+        title="silhouette in the worst view", unit="px", meaning="the same in the view where it is largest", noise=0.2
     ),
-    "labels_percent": FigureKind(title="labels", unit="%", meaning="pixels whose label is another one"),
+    "labels_percent": FigureKind(title="labels", unit="%", meaning="pixels whose label is another one", noise=0.2),
     "worst_labels_percent": FigureKind(
-        title="labels in the worst view", unit="%", meaning="the same in the view where it is largest"
+        title="labels in the worst view", unit="%", meaning="the same in the view where it is largest", noise=0.4
     ),
-    "normals_deg": FigureKind(title="normals", unit="°", meaning="median angle between the normals"),
+    "normals_deg": FigureKind(title="normals", unit="°", meaning="median angle between the normals", noise=0.2),
     "worst_normals_deg": FigureKind(
-        title="normals in the worst view", unit="°", meaning="the same in the view where it is largest"
+        title="normals in the worst view", unit="°", meaning="the same in the view where it is largest", noise=0.4
     ),
     "colour_levels": FigureKind(
-        title="colour", unit="levels", meaning="mean difference of the colours, of 255 sRGB levels"
+        title="colour", unit="levels", meaning="mean difference of the colours, of 255 sRGB levels", noise=0.3
     ),
     "worst_colour_levels": FigureKind(
-        title="colour in the worst view", unit="levels", meaning="the same in the view where it is largest"
+        title="colour in the worst view", unit="levels", meaning="the same in the view where it is largest", noise=0.6
     ),
     "depth_mm": FigureKind(
-        title="depth", unit="mm", meaning="median distance of the depth maps from the skin", digits=2
+        title="depth", unit="mm", meaning="median distance of the depth maps from the skin", noise=0.02, digits=2
     ),
     "intersections_mm": FigureKind(
-        title="self-intersection", unit="mm", meaning="largest depth of a part in another beyond the template's"
+        title="self-intersection",
+        unit="mm",
+        meaning="largest depth of a part in another beyond the template's",
+        noise=0.1,
     ),
     "intersecting_vertices": FigureKind(
-        title="intersecting vertices", unit="", meaning="vertices that lie too deep in another part", digits=0
+        title="intersecting vertices",
+        unit="",
+        meaning="vertices that lie too deep in another part",
+        noise=10.0,
+        digits=0,
     ),
     "untrusted_percent": FigureKind(
-        title="views not trusted", unit="%", meaning="views that disagree with the others", digits=0
+        title="views not trusted", unit="%", meaning="views that disagree with the others", noise=1.0, digits=0
     ),
-    "warnings": FigureKind(title="warnings", unit="", meaning="warnings about the capture's files", digits=0),
+    "warnings": FigureKind(
+        title="warnings", unit="", meaning="warnings about the capture's files", noise=0.1, digits=0
+    ),
     "motion_mm": FigureKind(
-        title="motion at the end", unit="mm", meaning="by which the fit still moved over its last steps", digits=3
+        title="motion at the end",
+        unit="mm",
+        meaning="by which the fit still moved over its last steps",
+        noise=0.002,
+        digits=3,
     ),
     "identity_sigmas": FigureKind(
-        title="identity", unit="standard deviations", meaning="root mean square of the coefficients", digits=2
+        title="identity",
+        unit="standard deviations",
+        meaning="root mean square of the coefficients",
+        noise=0.03,
+        digits=2,
     ),
     "expression_sigmas": FigureKind(
-        title="expression", unit="standard deviations", meaning="root mean square of the coefficients", digits=2
+        title="expression",
+        unit="standard deviations",
+        meaning="root mean square of the coefficients",
+        noise=0.03,
+        digits=2,
     ),
     "offset_sigmas": FigureKind(
         title="offsets",
         unit="standard deviations",
         meaning="root mean square of the offsets from the model, relative to its spread at each vertex",
+        noise=0.01,
         digits=2,
     ),
-    "size_percent": FigureKind(title="size", unit="%", meaning="difference of the size from the model's"),
+    "size_percent": FigureKind(title="size", unit="%", meaning="difference of the size from the model's", noise=0.5),
     "neutral_offsets_mm": FigureKind(
-        title="difference from the neutral", unit="mm", meaning="root mean square between the offsets", digits=2
+        title="difference from the neutral",
+        unit="mm",
+        meaning="root mean square between the offsets",
+        noise=0.05,
+        digits=2,
     ),
     "neutral_texture": FigureKind(
         title="texture unlike the neutral's",
         unit="",
         meaning="dissimilarity of the textures: 0 equal, about 1 unrelated",
+        noise=0.01,
         digits=2,
     ),
 }

@@ -107,12 +107,24 @@ def _in_folder(folder: Path) -> Iterator[Found]:
     if (folder / PLAN).is_file():
         rounds = sorted(path for path in folder.glob(_ROUND) if path.is_dir())
         folder = rounds[-1] / "registrations" if rounds else folder
-    below = (path for path in folder.iterdir() if not path.name.startswith(".")) if folder.is_dir() else ()
-    for path in sorted(below, key=lambda path: natural_key(path.name)):
+    for path in _below(folder):
         if is_subject_folder(path):
             yield from subject_registrations(path, path.name)
         elif is_registration(path):
             yield Found(name=path.name, place=str(path), manifest=read_manifest(path))
+        else:  # registrations of a subject without a record
+            for one in _below(path):
+                if is_registration(one):
+                    yield Found(name=f"{path.name}/{one.name}", place=str(one), manifest=read_manifest(one))
+
+
+def _below(folder: Path) -> list[Path]:
+    """The folders in a folder, but for hidden ones, in natural order."""
+    below = folder.iterdir() if folder.is_dir() else iter(())
+    return sorted(
+        (path for path in below if path.is_dir() and not path.name.startswith(".")),
+        key=lambda path: natural_key(path.name),
+    )
 
 
 def _in_store(store: Store, below: str = "") -> Iterator[Found]:

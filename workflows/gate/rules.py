@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from pathlib import Path
@@ -11,6 +12,7 @@ from registration.errors import check_seed
 from registration.storage.records import Record
 from workflows.gate.figures import FIGURES, Assessed, GateFigures
 
+FOLDER, THRESHOLDS = "gate", "thresholds.json"  # folder within a farm's, and the file in it
 Level = Literal["accept", "look", "reject"]
 LEVELS: tuple[Level, ...] = ("accept", "look", "reject")  # from good to bad
 LEVEL_TITLES: Mapping[Level, str] = {"accept": "accepted", "look": "for a person", "reject": "rejected"}
@@ -73,7 +75,7 @@ class GateThresholds(
     scan_mm: Limit = _limit(0.4, 2.0)
     landmarks_px: Limit = _limit(5.0, 25.0)
     worst_landmarks_px: Limit = _limit(12.0)
-    silhouette_px: Limit = _limit(1.5, 15.0)
+    silhouette_px: Limit = _limit(3.0, 15.0)
     worst_silhouette_px: Limit = _limit(8.0)
     labels_percent: Limit = _limit(5.0, 40.0)
     worst_labels_percent: Limit = _limit(15.0)
@@ -82,7 +84,7 @@ class GateThresholds(
     colour_levels: Limit = _limit(10.0, 60.0)
     worst_colour_levels: Limit = _limit(25.0)
     depth_mm: Limit = _limit(0.6, 5.0)
-    intersections_mm: Limit = _limit(2.0, 20.0)
+    intersections_mm: Limit = _limit(6.0)
     intersecting_vertices: Limit = _limit(400.0)
     untrusted_percent: Limit = _limit(0.0, 60.0)
     warnings: Limit = _limit(0.0)
@@ -179,12 +181,19 @@ def is_sampled(content_id: str, thresholds: GateThresholds) -> bool:
     return int.from_bytes(digest[:8], "big") < thresholds.sample_share * 2**64
 
 
-def read_thresholds(file: Path | None) -> GateThresholds:
-    """Return the thresholds in a file, or the defaults if none is given.
+def read_thresholds(file: Path | None, farm: Path | None = None) -> GateThresholds:
+    """Return the thresholds in a file; if none is given, those of the farm, `FARM/gate/thresholds.json`; else defaults.
+
+    Args:
+        file: the file; None: none is given.
+        farm: the farm's folder; None: there is no farm.
 
     Raises:
         InputError: the file cannot be read, or a value is out of range.
     """
+    own = None if farm is None else Path(farm) / FOLDER / THRESHOLDS
+    if file is None and own is not None and os.path.lexists(own):
+        file = own
     return GateThresholds() if file is None else GateThresholds.read(Path(file))
 
 

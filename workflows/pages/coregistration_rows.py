@@ -7,8 +7,8 @@ from workflows.records.round_files import HELD_OUT, RoundFiles, model_name
 
 MISSING = "–"
 ROUND_COLUMNS = (
-    *("round", "registered", "failed", "outliers", "identity components", "drift, mm", "generalization, mm"),
-    "specificity, mm",
+    *("round", "registered", "failed", "left out by the gate", "outliers", "identity components", "drift, mm"),
+    *("generalization, mm", "specificity, mm"),
 )
 _STEPS = ("stabilized expressions", "model", "evaluation")  # titles of products, in the order of the steps
 
@@ -54,10 +54,11 @@ def round_row(number: int, row: Mapping[str, Any], record: Mapping[str, Any], co
     captures = [capture for subject in row["register"].values() for capture in subject.values()]
     failed = sum(not capture["usable"] for capture in captures)
     built, model = row["build"], model_name(number)
+    gated = MISSING if row.get("gate") is None else row["gate"]["left_out_count"]
     metrics = [record[name].get(model, {}).get(components) for name in ("generalization_mm", "specificity_mm")]
     return [
         row["name"],
-        *map(str, (len(captures) - failed, failed, len(built["rejected"]), built["components"])),
+        *map(str, (len(captures) - failed, failed, gated, len(built["rejected"]), built["components"])),
         f"{built['drift_mm']:.3f}",
         *(MISSING if value is None else f"{value:.3f}" for value in metrics),
     ]

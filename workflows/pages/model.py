@@ -34,8 +34,38 @@ def render_model_page(data: GNMData, manifest: Mapping[str, Any]) -> str:
         curves=Markup(curves),
         variance_rows=variance_rows,
         rejected_rows=[(row["name"], row["reason"]) for row in manifest["rejected"]],
+        gate=_gate(manifest.get("gate")),
         groups=[(name, list(counts.items())) for name, counts in groups.items() if counts],
     )
+
+
+def _gate(gate: Mapping[str, Any] | None) -> dict[str, Any] | None:
+    """What the page says of the quality gate; None for a model that was built without one."""
+    if gate is None:
+        return None
+    verdicts = gate["verdicts"]
+    waiting = "until a person rejects them" if gate["policy"] == "auto" else "once a person has accepted them"
+    tiles = [
+        (str(gate["accepted"]), "", "registrations used"),
+        (str(verdicts["accept"]), "", "accepted by the rules"),
+        (str(verdicts["look"]), "", f"for a person: used {waiting}"),
+        (str(verdicts["reject"]), "", "rejected by the rules"),
+        (str(len(gate["decisions"])), "", "decided by a person"),
+    ]
+    decided = [
+        (
+            d["name"],
+            d["decision"],
+            d["who"],
+            d["time"][:16].replace("T", " "),
+            d["verdict"],
+            d["reason"],
+            d["content_id"][:12],
+        )
+        for d in gate["decisions"]
+    ]
+    facts = {name: gate[name] for name in ("policy", "thresholds_name", "thresholds", "accepted_id", "log_head")}
+    return {"tiles": tiles, "left_out": list(gate["left_out"].items()), "decided": decided, "facts": facts}
 
 
 def _tiles(manifest: Mapping[str, Any]) -> list[tuple[str, str, str]]:

@@ -3,6 +3,7 @@
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 from coregister.anatomy.part_basis import PartName
 from coregister.next_model.recipes import ModelRecipe
@@ -18,9 +19,20 @@ from workflows.records.step_results import (
     CaptureResult,
     Curves,
     EvaluateResult,
+    GateResult,
     HoldOutResult,
+    Policy,
     StabilizeResult,
 )
+
+
+@dataclass(frozen=True, kw_only=True)
+class GateSettings:
+    """Which registrations models are built from."""
+
+    policy: Policy
+    thresholds: Mapping[str, Any]  # a `GateThresholds` as JSON
+    decisions: Path | None = None  # folder of the log of decisions; None: there are none
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -41,6 +53,7 @@ class CoregistrationPlan(
     captures: Mapping[str, tuple[str, ...]]  # subject -> folders of captures, the neutral's first
     without_truth: tuple[str, ...]  # held-out subjects whose captures have no true meshes
     anatomy: tuple[PartName, ...] = ()  # parts that the first round regenerates in its model
+    gate: GateSettings | None = None  # None: all usable registrations are used
 
     @property
     def seed(self) -> int:
@@ -56,6 +69,7 @@ class RoundProducts:
     stabilize: StabilizeResult
     build: BuildResult
     evaluate: EvaluateResult
+    gate: GateResult | None = None  # in brief; None: there was no gate
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -12,6 +12,8 @@ HELD_OUT = "held_out"
 _ROUND = re.compile(r"it[0-9]{2,}")
 _PRODUCTS = (  # title, path in the folder of a round
     ("stabilized expressions", "registrations/stabilized/index.html"),
+    ("gate's record", "gate/gate.json"),
+    ("verdicts", "gate/verdicts.csv"),
     ("model", "model/index.html"),
     ("model file", "model/gnm_head.npz"),
     ("record of the model", "model/gnm_head.manifest.json"),

@@ -54,6 +54,7 @@ class Selection:
 
     skip_failed: bool = False  # exclude failed registrations instead of refusing the run
     only: Collection[str] | None = None  # names of the subject folders to use; None: all
+    left_out: Collection[str] = ()  # registrations that are not used, as SUBJECT/NAME of the folders; no neutrals
 
 
 def read_run(folder: Path, data: GNMData, selection: Selection = Selection()) -> StabilizationInputs:  # noqa: B008
@@ -71,7 +72,7 @@ def read_run(folder: Path, data: GNMData, selection: Selection = Selection()) ->
     """
     skin, topology = SkullSkin.from_model(data), gnm_npz.topology_hash(data.triangles)
     folders = [path for path in _subject_folders(folder) if selection.only is None or path.name in selection.only]
-    subjects = tuple(_subject(path, selection.skip_failed) for path in folders)
+    subjects = tuple(_subject(path, selection) for path in folders)
     inputs = {"model": gnm_npz.content_hash(data)}
     for subject in subjects:
         identity: np.ndarray | None = None
@@ -136,18 +137,21 @@ def _read(folder: Path) -> SubjectRecord:
     return record
 
 
-def _subject(folder: Path, skip_failed: bool) -> StabilizationSubject:
+def _subject(folder: Path, selection: Selection) -> StabilizationSubject:
     record = _read(folder)
     neutral = record.row(record.neutral)
     if neutral is None or not neutral.usable:
         got = "no such registration" if neutral is None else f"{neutral.status} {neutral.reason}"
         raise _input_error("A subject has no neutral", folder, f"a usable registration {record.neutral!r}", got)
     lost = [row for row in record.rows if not row.usable]
-    if lost and not skip_failed:
+    if lost and not selection.skip_failed:
         others = f", and {len(lost) - 1} more" if len(lost) > 1 else ""
         got = f"{lost[0].name}: {lost[0].status}: {lost[0].reason}{others}"
         raise _input_error("A subject has registrations that failed", folder, "all converged or stopped", got)
-    expressions = tuple((row.name, row.expression) for row in record.rows if row.usable and row != neutral)
+    refused = {row.name for row in record.rows if row.usable and f"{folder.name}/{row.name}" in selection.left_out}
+    expressions = tuple(
+        (row.name, row.expression) for row in record.rows if row.usable and row != neutral and row.name not in refused
+    )
     if not expressions:
         expected = "at least one besides the neutral"
         raise _input_error("A subject has no expression to stabilize", folder, expected, "none")
@@ -156,7 +160,7 @@ def _subject(folder: Path, skip_failed: bool) -> StabilizationSubject:
         subject=record.subject,
         neutral=record.neutral,
         expressions=expressions,
-        excluded=tuple(sorted(row.name for row in lost)),
+        excluded=tuple(sorted({row.name for row in lost} | refused)),
     )
 
 

@@ -2,8 +2,8 @@
 (docs/formats.md)."""
 
 import os
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -62,6 +62,17 @@ class UsableRegistrations:
     neutral: str  # name of its registration's folder
     expressions: Mapping[str, str]  # folder name -> expression label
 
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Folder names of all, the neutral's first."""
+        return (self.neutral, *self.expressions)
+
+    def without(self, names: Collection[str]) -> "UsableRegistrations | None":
+        """Return them without those of these names; None if the neutral is one."""
+        if self.neutral in names:
+            return None
+        return replace(self, expressions={name: label for name, label in self.expressions.items() if name not in names})
+
 
 @dataclass(frozen=True, kw_only=True)
 class SubjectRecord(
@@ -111,6 +122,27 @@ def read_usable(folder: Path) -> UsableRegistrations | None:
     """
     record = read_subject(folder)
     return None if record is None else record.usable
+
+
+def read_usable_subjects(
+    run: Path, names: Sequence[str], left_out: Collection[str] = ()
+) -> dict[str, UsableRegistrations]:
+    """Return subject folder's name -> its usable registrations, of those of the subjects that have any.
+
+    Args:
+        run: folder of the subject folders.
+        names: of the subject folders.
+        left_out: registrations that are not used, as SUBJECT/NAME of the folders.
+
+    Raises:
+        InputError: a record is malformed.
+    """
+    found = {name: usable for name in names if (usable := read_usable(run / name)) is not None}
+    kept = {
+        name: usable.without([one for one in usable.names if f"{name}/{one}" in left_out])
+        for name, usable in found.items()
+    }
+    return {name: usable for name, usable in kept.items() if usable is not None}
 
 
 def read_captures(folder: Path, neutral: str | None = None) -> SubjectCaptures:

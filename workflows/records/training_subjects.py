@@ -1,6 +1,6 @@
 """Subjects that a model is built from or evaluated on: registrations of a run, true meshes of captures."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -21,7 +21,7 @@ from registration.stabilize.subject_meshes import SkullSkin, SubjectMeshes, subj
 from registration.storage.files import atomic_file
 from registration.storage.registration_folder import load_registration, read_manifest
 from workflows.records.held_out import TAG, around_origin
-from workflows.records.subject import NEUTRAL, SubjectCaptures, UsableRegistrations, read_usable
+from workflows.records.subject import NEUTRAL, SubjectCaptures, UsableRegistrations, read_usable, read_usable_subjects
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -37,12 +37,12 @@ class RegisteredSubjects:
     model: GNMData
     stabilized_set: Path | None  # the stabilized set; None: neutrals alone
     tags: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)  # by folder name
+    left_out: Collection[str] = ()  # registrations that are not used, as SUBJECT/NAME of the folders
 
     @cached_property
     def usable(self) -> dict[str, UsableRegistrations]:
         """Folder name -> usable registrations, of the subjects that have any. Raises InputError for broken records."""
-        usable = {name: read_usable(self.run / name) for name in self.names}
-        return {name: registrations for name, registrations in usable.items() if registrations is not None}
+        return read_usable_subjects(self.run, self.names, self.left_out)
 
     @cached_property
     def inputs(self) -> dict[str, str]:

@@ -25,6 +25,7 @@ from workflows.records.dataset import read_dataset
 from workflows.records.step_results import BuildResult, RejectedRegistration
 from workflows.records.training_subjects import RegisteredSubjects
 from workflows.steps.coregistration_page import shown_on_page
+from workflows.steps.gate import read_gate
 from workflows.steps.products import Product
 
 MODEL, PAGE = "gnm_head.npz", "index.html"
@@ -35,7 +36,7 @@ def build_next_model(
     *,
     run: str,
     names: Sequence[str],
-    stabilized: str | None,
+    made: Mapping[str, str],
     dataset: str,
     previous: str,
     out: str,
@@ -47,7 +48,8 @@ def build_next_model(
     Args:
         run: folder of the subject folders.
         names: of the subject folders to use.
-        stabilized: folder of the stabilized set; None: neutrals alone.
+        made: folders of what was made of the registrations: "stabilized", without which neutrals alone are used, and
+            "gate", the gate's record, without which all usable registrations are used.
         dataset: its folder, for tags and categories.
         previous: file of the previous model.
         out: folder of the model.
@@ -63,8 +65,16 @@ def build_next_model(
     """
     source, data = read_dataset(Path(dataset)), gnm_npz.read(Path(previous))
     tags = {name: source.tags(name) for name in names}
-    stabilized_set = None if stabilized is None else Path(stabilized)
-    subjects = RegisteredSubjects(run=Path(run), names=names, model=data, stabilized_set=stabilized_set, tags=tags)
+    stabilized_set = Path(made["stabilized"]) if "stabilized" in made else None
+    gated = read_gate(made.get("gate"))
+    subjects = RegisteredSubjects(
+        run=Path(run),
+        names=names,
+        model=data,
+        stabilized_set=stabilized_set,
+        tags=tags,
+        left_out=frozenset(gated.left_out if gated else ()),
+    )
     recipe = dict(recipe)
     anatomy = recipe.pop("anatomy", None)
     settings = ModelRecipe.from_json(recipe, where="the job's recipe")
@@ -75,6 +85,8 @@ def build_next_model(
     config = {"recipe": hashing.to_jsonable(settings), "categories": source.categories, "tags": tags}
     if anatomy:
         config["anatomy"] = anatomy
+    if gated:  # the log's head changes with decisions about other runs
+        config["gate"] = {name: value for name, value in gated.to_json().items() if name != "log_head"}
     folder = Path(out)
     product = Product(folder, hashing.input_hash(inputs, config), BuildResult)
     if (existing := product.find()) is not None and _is_model(folder / MODEL, existing.content_id):
@@ -85,6 +97,8 @@ def build_next_model(
         regenerated = AnatomySettings(parts=tuple(anatomy["parts"]), seed=anatomy["seed"])
         (progress or NullProgress()).message(f"regenerating {', '.join(regenerated.parts)}")
         built = _with_anatomy(built, regenerated, subjects)
+    if gated:
+        built = replace(built, manifest=built.manifest | {"gate": gated.to_json()})
     result = BuildResult(
         input_hash=product.input_hash,
         model=str(folder / MODEL),

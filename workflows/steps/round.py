@@ -113,7 +113,7 @@ def _metrics(
         generalization_mm=generalization_mm,
         drift_mm=product.build.drift_mm,
         registered=product.build.registered,
-        failed=failed + len(product.build.rejected),
+        failed=failed + len(product.build.rejected) + (product.gate.left_out_count if product.gate else 0),
     )
 
 

@@ -28,8 +28,9 @@ from workflows.pages.stabilization import render_stabilization_page
 from workflows.records.decisions import read_decisions
 from workflows.records.run import STABILIZED, Selection, StabilizationInputs, read_run
 from workflows.records.step_results import StabilizeResult
-from workflows.records.subject import read_usable
+from workflows.records.subject import read_usable_subjects
 from workflows.steps.coregistration_page import shown_on_page
+from workflows.steps.gate import read_gate
 
 LOG = "decisions.jsonl"  # within the run
 Reuse = Literal["same inputs", "any decisions", "none"]
@@ -110,7 +111,13 @@ def stabilize_run(
 
 @shown_on_page()
 def stabilize_subjects(
-    *, run: str, names: Sequence[str], model: str, out: str, progress: Progress | None = None
+    *,
+    run: str,
+    names: Sequence[str],
+    model: str,
+    out: str,
+    gate: str | None = None,
+    progress: Progress | None = None,
 ) -> dict[str, Any]:
     """Stabilize the usable registrations of a run into the set `out`, if there are enough expressions.
 
@@ -119,6 +126,7 @@ def stabilize_subjects(
         names: of the subject folders to use.
         model: file of the model that the captures were registered with.
         out: folder of the stabilized set.
+        gate: folder of the gate's record; None: all usable registrations are used.
         progress: where to report to.
 
     Returns:
@@ -127,8 +135,10 @@ def stabilize_subjects(
     Raises:
         InputError: as `stabilize_run`.
     """
-    usable = {name: read_usable(Path(run) / name) for name in names}
-    counts = {name: len(subject.expressions) for name, subject in usable.items() if subject and subject.expressions}
+    gated = read_gate(gate)
+    left_out = frozenset(gated.left_out if gated else ())
+    usable = read_usable_subjects(Path(run), names, left_out)
+    counts = {name: len(subject.expressions) for name, subject in usable.items() if subject.expressions}
     total = sum(counts.values())
     if total < MIN_SAMPLES:
         return StabilizeResult(out=None, reason=f"{total} expressions of {len(names)} subjects").to_json()
@@ -136,7 +146,7 @@ def stabilize_subjects(
         Path(run),
         model_path=Path(model),
         out=Path(out),
-        selection=Selection(skip_failed=True, only=tuple(counts)),
+        selection=Selection(skip_failed=True, only=tuple(counts), left_out=left_out),
         progress=progress,
     )
     manifest = disk.read_manifest(result.out)

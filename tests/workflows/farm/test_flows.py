@@ -18,9 +18,9 @@ from workflows.engine.jobs import Job
 from workflows.engine.scope import _read as read_plan
 from workflows.engine.serialization import JobFailed
 from workflows.farm.flows import coregister, subject
-from workflows.records.coregistration import CoregistrationPlan
+from workflows.records.coregistration import CoregistrationPlan, GateSettings
 from workflows.records.dataset import Split
-from workflows.records.step_results import BuildResult, EvaluateResult
+from workflows.records.step_results import BuildResult, EvaluateResult, GateResult
 
 
 def failed(reason: str) -> JobFailed:
@@ -84,6 +84,10 @@ class Rounds:
             raise failed("broken")
         if job.step == "hold out":
             return {"input_hash": "h", "file": "/o/held_out.npz", "sources": {}, "lost": []}
+        if job.step == "gate":
+            verdicts = {"accept": 7, "look": 1, "reject": 0}
+            shared = {"policy": "auto", "thresholds": "t", "thresholds_name": "default", "verdicts": verdicts}
+            return GateResult(**shared, accepted=8, accepted_id="s", waiting=1).to_json()
         if job.step == "stabilize":
             return {"out": job.arguments["out"]}
         if job.step == "build":
@@ -147,6 +151,20 @@ def test_each_round_uses_the_previous_model_until_the_verdict_stops(plan: Path) 
     models = {job.id.split("/")[1]: job.arguments["model"] for job in registered}
     assert models == {"held": "/m0", "it00": "/m0", "it01": "/o/it00/model/gnm_head.npz"}
     assert log[-2].arguments["models"]["model 2"] == "/o/it01/model/gnm_head.npz"
+
+
+def test_the_gate_is_asked_before_anything_is_made_of_the_registrations(plan: Path) -> None:
+    settings = GateSettings(policy="person", thresholds={"name": "x"}, decisions=Path("/o.farm/gate"))
+    replace(CoregistrationPlan.read(plan), gate=settings).write(plan)
+    _, log = run_loop(plan, Rounds([False]))
+    steps = [job for job in log if job.step not in ("register", "collect")]
+    assert [job.step for job in steps] == ["hold out", "gate", "stabilize", "build", "evaluate", "end round"]
+    gate, *used = steps[1:4]
+    assert gate.arguments["policy"] == "person" and gate.arguments["decisions"] == "/o.farm/gate"
+    assert used[0].arguments["gate"] == used[1].arguments["made"]["gate"] == "/o/it00/gate"
+    assert used[1].arguments["made"]["stabilized"] == "/o/it00/registrations/stabilized"
+    with pytest.raises(JobFailed, match="parked: it00/gate: failed: broken"):
+        run_loop(plan, Rounds([True], broken=("it00/gate",)))
 
 
 def test_too_many_failures_park_the_run_before_a_model_is_built(plan: Path) -> None:

@@ -9,10 +9,12 @@ from pathlib import Path
 
 import pytest
 
+import workflows.gate.items
 from registration.errors import InputError
 from tests.workflows.gate import made
 from tests.workflows.gate.test_decisions import ruling
 from workflows.cli.app import main
+from workflows.engine.reader import JobRow
 from workflows.gate.decisions import DecisionLog, current
 from workflows.gate.item import gate_error
 from workflows.gate.items import find_registrations, gate_items
@@ -54,6 +56,8 @@ def test_a_folder_of_subjects(run):
     assert [item.accepted("person") for item in found] == [True, False, False, True]
     assert [item.waits for item in found] == [False, True, False, False]
     assert [item.name for item in items(run / "bob")] == ["bob/neutral"]
+    (run / "bob" / "subject.json").unlink()
+    assert [item.name for item in items(run)][-1] == "bob/neutral"  # registrations without a subject's record
     assert [item.name for item in items(run / "bob" / "neutral")] == ["neutral"]
 
 
@@ -183,3 +187,49 @@ def test_thresholds_are_taken_from_a_file(run, tmp_path, capsys):
     assert main(["gate", "verdicts", str(run), "--thresholds", str(tmp_path / "t.json"), "--policy", "person"]) == 0
     assert "3 accept, 1 look, 0 reject; 3 may be used, 1 wait for a person" in capsys.readouterr().out
     assert main(["gate", "verdicts"]) == 2
+    farm = tmp_path / "farm"
+    (farm / "gate").mkdir(parents=True)
+    (tmp_path / "t.json").rename(farm / "gate" / "thresholds.json")  # the farm's own
+    capsys.readouterr()
+    assert main(["gate", "verdicts", str(run), "--folder", str(farm)]) == 0
+    assert "3 accept, 1 look, 0 reject" in capsys.readouterr().out
+
+
+def test_a_run_of_the_queue_is_found_by_its_name(run, tmp_path, monkeypatch):
+    """Of a batch what its jobs published, of a coregistration what they wrote; jobs that are not done are left out."""
+    store = Store(tmp_path / "store")
+
+    def make(folder: Path) -> dict[str, str]:
+        made.write(folder / "registration", **made.figures())
+        return {}
+
+    for key in ("cyd/smile", "cyd/jaw"):
+        store.produce(key, input_hash="h", make=make)
+    shared = {"kind": "job", "executor": None, "result": None, "failure": None, "created": 0.0, "ended": None}
+
+    def job(state: str, **arguments: str) -> JobRow:
+        return JobRow(id="r/x", state=state, spec={"step": "s", "arguments": arguments}, **shared)
+
+    rows = [
+        job("done", capture="/c", store=store.url, key="cyd/smile"),
+        job("waiting", capture="/c", store=store.url, key="cyd/jaw"),
+        job("failed", capture="/c", store=store.url, key="cyd/none"),
+        job("done", capture="/c", out=str(run / "ann" / "smile")),
+        job("done", capture="/c", out=str(run / "ann" / "none")),
+        job("done", run=str(run), out=str(tmp_path)),
+    ]
+
+    class Reader:
+        def __init__(self, url: str) -> None:
+            assert url == "sqlite:///q"
+
+        def listing(self, name: str) -> list[JobRow]:
+            return rows if name == "night" else []
+
+    monkeypatch.setattr(workflows.gate.items, "QueueReader", Reader)
+    found = find_registrations("night", "sqlite:///q")
+    assert [one.name for one in found] == ["cyd/smile", "ann/smile"]
+    with pytest.raises(InputError, match="There are no registrations"):
+        find_registrations("day", "sqlite:///q")
+    with pytest.raises(InputError, match="cannot be used"):
+        find_registrations("../night", "sqlite:///q")

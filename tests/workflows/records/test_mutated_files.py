@@ -45,6 +45,8 @@ from tests.registration.cranium.smooth_heads import auxiliary_model as auxiliary
 from tests.registration.cranium.smooth_heads import tiny
 from tests.registration.topology_map.small_map import small_map
 from tests.workflows.records.plan import PLAN
+from workflows.gate.decisions import DecisionLog, Ruling, read_log, read_public_key
+from workflows.gate.rules import GateThresholds
 from workflows.records.coregistration import CoregistrationPlan, CoregistrationState, initial_state
 from workflows.records.dataset import DatasetRecord
 from workflows.records.dataset_import import DatasetImportRecord, ImportRow
@@ -52,6 +54,7 @@ from workflows.records.decisions import read_decisions
 from workflows.records.face_results import read_result, write_result
 from workflows.records.face_samples import read_samples, write_samples
 from workflows.records.held_out import read_held_out
+from workflows.records.step_results import GateResult
 from workflows.records.store import Store
 from workflows.records.subject import SubjectRecord
 
@@ -78,6 +81,7 @@ def valid(tmp_path_factory: pytest.TempPathFactory) -> Path:
     origin.write(folder / "import.json")
     row = {"dataset": "d" * 64, "region": "mouth", "component": 0, "action": "drop", "reason": ""}
     (folder / "decisions.jsonl").write_text(f"{json.dumps(row)}\n" * 2)
+    write_gate_files(folder)
     picture = np.random.default_rng(0).integers(0, 255, (SIZE[1], SIZE[0], 3), np.uint8)
     for suffix in ("jpg", "tif", "bmp", "webp"):
         cv2.imwrite(str(folder / f"picture.{suffix}"), cv2.GaussianBlur(picture, (0, 0), 4))
@@ -99,6 +103,18 @@ def valid(tmp_path_factory: pytest.TempPathFactory) -> Path:
     for suffix in ("obj", "glb"):
         ball.export(folder / f"ball.{suffix}")
     return folder
+
+
+def write_gate_files(folder: Path) -> None:
+    """The gate's record of a round, its thresholds, and a log of two decisions."""
+    ruling = {"content_id": "c1", "name": "ann/smile", "reason": "", "who": "eve", "thresholds": "t", "verdict": "look"}
+    log = DecisionLog.of_farm(folder)
+    for decision in ("accept", "undo"):
+        log.append(Ruling(decision=decision, **ruling))
+    GateThresholds().write(folder / "thresholds.json")
+    verdicts = {"accept": 1, "look": 0, "reject": 0}
+    shared = {"policy": "auto", "thresholds": "t", "thresholds_name": "default", "accepted_id": "s", "waiting": 0}
+    GateResult(**shared, verdicts=verdicts, accepted=1, left_out={"ann/jaw": "blurred"}).write(folder / "gate.json")
 
 
 def write_face_files(folder: Path) -> None:
@@ -177,6 +193,10 @@ READERS: dict[str, tuple[str, Reader]] = {  # name -> the file that is mutated, 
     "decisions": ("decisions.jsonl", lambda file: read_decisions(file, "d" * 64)),
     "plan": ("plan.json", CoregistrationPlan.read),
     "state": ("coregistration.json", CoregistrationState.read),
+    "gate": ("gate.json", GateResult.read),
+    "thresholds": ("thresholds.json", GateThresholds.read),
+    "gate's decisions": ("gate/decisions.jsonl", read_log),
+    "gate's key": ("gate/key.pub", read_public_key),
     "held out": ("held_out.npz", read_held_out),
     "registered scans": ("registered_scans.npz", read_samples),
     "result of a sample": ("face_result.npz", lambda file: read_result(file, "key")),
@@ -313,7 +333,7 @@ def test_the_readers_include_all_records():
         "Artifact",
         "DatasetImportRecord",
     }
-    known |= {"CoregistrationPlan", "CoregistrationState"}
+    known |= {"CoregistrationPlan", "CoregistrationState", "GateResult"}
     stored = {cls.__name__ for cls in Record.__subclasses__() if cls.__module__.startswith("workflows.records")}
     assert stored - known <= {"StepResult", "StabilizeResult"}  # of steps, written and read in one run
     assert FIXTURES.is_dir()
