@@ -24,6 +24,16 @@ SECURITY_HEADERS = {
     "X-Content-Type-Options": "nosniff",
     "X-Frame-Options": "SAMEORIGIN",
 }
+# Of reports and other pages among products: they run scripts of their own and show what others wrote, so that they get
+# an origin of their own, without this site's session, and no source but themselves.
+SANDBOX = {
+    "Content-Security-Policy": (
+        "sandbox allow-scripts allow-popups; default-src 'none'; script-src 'unsafe-inline' 'wasm-unsafe-eval' blob:; "
+        "style-src 'unsafe-inline'; img-src data: blob:; font-src data:; media-src data: blob:; "
+        "connect-src data: blob:; worker-src blob:; base-uri 'none'; form-action 'none'; frame-ancestors 'self'"
+    ),
+    "Cross-Origin-Opener-Policy": "unsafe-none",  # another one and a sandbox exclude each other in a tab of their own
+}
 _CHANGING = ("POST", "PUT", "PATCH", "DELETE")
 log = logging.getLogger("gnmreg.service.requests")
 

@@ -12,6 +12,7 @@ from starlette.responses import StreamingResponse
 
 from workflows.service.access import need
 from workflows.service.artifacts import find_result
+from workflows.service.middleware import SANDBOX
 from workflows.service.models import find_model, list_models
 from workflows.service.problems import RESPONSES, Problem
 from workflows.service.state import Service
@@ -31,16 +32,6 @@ _TYPES = {
     ".webp": "image/webp",
     ".webm": "video/webm",
     ".glb": "model/gltf-binary",
-}
-# Reports run scripts of their own, and show what others wrote: in a sandbox without this site's origin and cookies,
-# and without any other source than themselves.
-_REPORT = {
-    "Content-Security-Policy": (
-        "sandbox allow-scripts allow-popups; default-src 'none'; script-src 'unsafe-inline' 'wasm-unsafe-eval' blob:; "
-        "style-src 'unsafe-inline'; img-src data: blob:; font-src data:; media-src data: blob:; "
-        "connect-src data: blob:; worker-src blob:; base-uri 'none'; form-action 'none'; frame-ancestors 'self'"
-    ),
-    "Cross-Origin-Opener-Policy": "unsafe-none",  # another one and a sandbox exclude each other in a tab of their own
 }
 _FILE: dict[int | str, dict[str, Any]] = {
     status: {"description": text, "content": {"*/*": {"schema": {"type": "string", "format": "binary"}}}}
@@ -117,7 +108,7 @@ def artifact_file(
     headers = {"Accept-Ranges": "bytes", "ETag": f'"{content_id}"'}
     headers["Cache-Control"] = "private, max-age=31536000, immutable" if found.is_final else "private, no-cache"
     kind = _type(path)
-    headers |= _REPORT if kind.startswith("text/html") else {}
+    headers |= SANDBOX if kind.startswith("text/html") else {}
     start, end = _range(range_, file.size)
     status = HTTPStatus.OK
     if (start, end) != (0, file.size):

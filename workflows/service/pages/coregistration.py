@@ -13,9 +13,9 @@ from workflows.records.round_files import RoundFiles, find_round_files
 from workflows.service.access import need
 from workflows.service.api.reviews import command, review_inputs
 from workflows.service.coregistrations import Coregistration, coregistration, coregistrations, malformed
+from workflows.service.middleware import SANDBOX
 from workflows.service.pages.base import page
 from workflows.service.pages.charts import curves
-from workflows.service.pages.files import SANDBOX
 from workflows.service.problems import Problem
 from workflows.service.state import Service
 
@@ -56,9 +56,8 @@ def product(state: Service, run: str, path: str) -> Response:
     if not file.is_relative_to(folder.resolve()) or not file.is_file():
         raise Problem.missing("file", path)
     attached = "attachment" if name.suffix == ".npz" else "inline"
-    headers = {"Content-Security-Policy": SANDBOX}
     return FileResponse(
-        file, media_type=TYPES[name.suffix], headers=headers, filename=name.name, content_disposition_type=attached
+        file, media_type=TYPES[name.suffix], headers=SANDBOX, filename=name.name, content_disposition_type=attached
     )
 
 

@@ -20,19 +20,13 @@ from workflows.engine.reader import JobRow
 from workflows.ids import check_location, resolve_roots
 from workflows.service.access import need
 from workflows.service.api.jobs import find_entry
+from workflows.service.middleware import SANDBOX
 from workflows.service.problems import Problem
 from workflows.service.results import JobResults, results_of
 from workflows.service.state import Service, ServiceState
 
 router = APIRouter(include_in_schema=False, dependencies=[Depends(need("viewer"))])
 MAX_PAGE_BYTES = 256 * 2**20  # of a report
-# A report has scripts and pictures inside. In the sandbox it has an origin of its own: it reads no session, and sends
-# nothing anywhere.
-SANDBOX = (
-    "sandbox allow-scripts; default-src 'none'; script-src 'unsafe-inline' blob: data:; style-src 'unsafe-inline'; "
-    "img-src data: blob:; font-src data:; connect-src data: blob:; worker-src blob:; form-action 'none'; "
-    "base-uri 'none'; frame-ancestors 'self'"
-)
 _KEEP = {"Cache-Control": "private, max-age=86400, immutable"}  # an address names the content
 _IMAGE = re.compile(rb'<img\b[^>]*?\balt="([^"]*)"[^>]*?\bsrc="data:image/(jpeg|png);base64,([A-Za-z0-9+/=]+)"')
 
@@ -74,7 +68,7 @@ def thumbnail(state: Service, job: str) -> Response:
 def report(state: Service, job: str) -> Response:
     """Return the report of a registration."""
     content = _read(state, results(state, job).report)
-    return Response(content, media_type="text/html", headers={**_KEEP, "Content-Security-Policy": SANDBOX})
+    return Response(content, media_type="text/html", headers={**_KEEP, **SANDBOX})
 
 
 @router.get("/files/picture/{number}/{job:path}")
