@@ -46,6 +46,15 @@ def main() -> int:
     parser.add_argument("--env", action="append", default=[], metavar="NAME=VALUE", help="environment of all steps")
     parser.add_argument("--bind", action="append", default=[], metavar="DIR", help="folders that all steps see")
     options = parser.parse_args()
+    try:
+        return build(options)
+    finally:
+        for folder in options.roots.iterdir() if options.roots.is_dir() else ():
+            unmount(folder, options.bind)
+
+
+def build(options: argparse.Namespace) -> int:
+    """Run all instructions of the Dockerfile."""
     given, extra = (dict(item.split("=", 1) for item in items) for items in (options.arg, options.env))
     arguments: dict[str, str] = {}
     stages: dict[str, Stage] = {}
@@ -92,14 +101,14 @@ def instructions(text: str) -> list[tuple[str, str]]:
 
 def new_stage(folder: Path, source: Stage | None, environment: dict[str, str], binds: list[str]) -> Stage:
     """A stage that begins as a copy of another one, or as the base system."""
-    for bind in binds:
-        subprocess.run(["umount", str(folder / bind.lstrip("/"))], check=False, stderr=subprocess.DEVNULL)
+    unmount(folder, binds)
     shutil.rmtree(folder, ignore_errors=True)
     if source is None:
         subprocess.run(["debootstrap", "--variant=minbase", SUITE, str(folder), MIRROR], check=True)
     else:
         subprocess.run(["cp", "-a", "--one-file-system", str(source.folder), str(folder)], check=True)
     shutil.copy("/etc/resolv.conf", folder / "etc" / "resolv.conf")
+    subprocess.run(["mount", "-t", "proc", "proc", str(folder / "proc")], check=True)
     for bind in binds:
         inside = folder / bind.lstrip("/")
         inside.mkdir(parents=True, exist_ok=True)
@@ -108,6 +117,13 @@ def new_stage(folder: Path, source: Stage | None, environment: dict[str, str], b
     if source is not None:
         stage.environment.update(source.environment)
     return stage
+
+
+def unmount(folder: Path, binds: list[str]) -> None:
+    """Unmount what a stage sees of this machine; stop if that fails, as its files would be deleted with the stage."""
+    for place in ("proc", *(bind.lstrip("/") for bind in binds)):
+        if (folder / place).is_mount():
+            subprocess.run(["umount", str(folder / place)], check=True)
 
 
 def copy(stage: Stage, stages: dict[str, Stage], words: list[str]) -> None:
