@@ -100,6 +100,8 @@ def from_few(labelled: Sequence[Labelled], count: int, seed: int) -> tuple[float
     thresholds = calibrate([labelled[index] for index in chosen[:count].tolist()]).thresholds
     tested = [labelled[index] for index in chosen[count:].tolist()]
     flags, good = flagged(tested, thresholds), np.array([one.good for one in tested])
+    if good.all():
+        raise InputError("No spoiled one is left", where="labels", expected="fewer labels", got=count)
     return float(flags[~good].mean()), float(flags[good].mean())
 
 
@@ -131,7 +133,7 @@ def measure(out: Path, wanted: Sequence[Sample], labels: int) -> None:
     for seed in range(DRAWS):
         try:
             few.append(from_few(labelled, labels, seed))
-        except InputError:  # too few bad ones among them
+        except InputError:  # too few bad ones among them, or no others
             continue
     if few:
         recall, alarms = np.mean(few, 0)
