@@ -156,12 +156,20 @@ def _options(fit: "RegisterOptions") -> dict[str, Any]:
 
 def _rounds(rounds: dict[str, Any]) -> dict[str, Any]:
     """Options of rounds as the API takes them."""
+    from registration.errors import InputError
+
     held_out = rounds.pop("held_out")
+    if (thresholds := rounds.pop("gate_thresholds")) is not None:
+        raise InputError(
+            "Thresholds of the gate cannot be sent",
+            where="--gate-thresholds",
+            expected="those of the farm",
+            got=thresholds,
+            fix="save them as gate/thresholds.json in the farm's folder",
+        )
     try:
         fraction = None if held_out is None else float(held_out)
     except ValueError:
-        from registration.errors import InputError
-
         fix = "tag the subjects' neutrals with held_out = true"
         raise InputError(
             "A list of held-out subjects cannot be sent",

@@ -16,6 +16,8 @@ from registration.storage.files import atomic_directory
 from workflows.farm.coregistration import submit_coregistration
 from workflows.farm.plan import RoundSettings, make_plan
 from workflows.farm.subject import subject_run, submit_subject
+from workflows.gate.decisions import DecisionLog
+from workflows.gate.rules import read_thresholds
 from workflows.service.helper import Conflict
 from workflows.service.places import FIRST, OFFICIAL
 from workflows.steps.job_options import from_job
@@ -76,7 +78,7 @@ def submit_one_subject(
 
 
 def submit_rounds(
-    url: str, run: str, places: Mapping[str, str], options: Mapping[str, Any], rounds: Mapping[str, Any]
+    url: str, run: str, places: Mapping[str, str], options: Mapping[str, Any], rounds: Mapping[str, Any], farm: str
 ) -> dict[str, Any]:
     """Submit a coregistration.
 
@@ -85,7 +87,8 @@ def submit_rounds(
         run: name of the run.
         places: dataset, model and out.
         options: of registrations, as JSON.
-        rounds: iterations, all_iterations, model_recipe, held_out, components and anatomy, as of `RoundOptions`.
+        rounds: iterations, all_iterations, model_recipe, held_out, components, anatomy and gate, as of `RoundOptions`.
+        farm: its folder, with the decisions and the thresholds of the quality gate.
 
     Returns:
         The numbers of captures.
@@ -105,6 +108,9 @@ def submit_rounds(
         components=tuple(components) or None,
         rule=StoppingRule(max_rounds=rounds["iterations"], early_stopping=not rounds["all_iterations"]),
         anatomy=tuple(BUILDERS) if rounds["anatomy"] == "regenerate" else (),
+        gate=rounds["gate"],
+        gate_thresholds=read_thresholds(None, Path(farm)),
+        decisions=DecisionLog.of_farm(Path(farm)).folder,
     )
     plan = make_plan(Path(places["dataset"]), Path(places["model"]), Path(places["out"]), from_job(options), settings)
     try:

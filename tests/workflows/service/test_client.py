@@ -82,6 +82,8 @@ def test_a_coregistration_from_a_laptop(service: RunningService, model, monkeypa
     words = ["coregister", "nowhere", "--model", model, "--out", "rounds7", "--server", service.url]
     assert main(words) == 2
     assert "outside those of the service" in capsys.readouterr().err
+    assert main([*words, "--gate-thresholds", "mine.json"]) == 2
+    assert "Thresholds of the gate cannot be sent" in capsys.readouterr().err
 
 
 def test_refusals_have_all_parts(service: RunningService, monkeypatch, capsys):

@@ -147,13 +147,21 @@ def test_a_coregistration(farm):
         "iterations": 1,
         "components": [1],
         "anatomy": "keep",
+        "gate": "person",
     }
     answer = farm.post("/coregistrations", body)
     assert answer.status == 202, answer.body
     plan = json.loads((farm.folder / "results" / "rounds" / "plan.json").read_text())
     assert plan["rule"]["max_rounds"] == 1 and plan["components"] == [1]
+    assert plan["gate"]["policy"] == "person" and plan["gate"]["decisions"] == str(farm.folder / "gate")
     assert jobs_of(farm, "rounds") == ["rounds"] and answer.json["total"] >= 5
-    for change in ({"model_recipe": "os:getcwd"}, {"components": [3, 2]}, {"held_out": 1.5}, {"dataset": "ann"}):
+    for change in (
+        {"dataset": "ann"},
+        {"model_recipe": "os:getcwd"},
+        {"components": [3, 2]},
+        {"held_out": 1.5},
+        {"gate": "no"},
+    ):
         refused = farm.post("/coregistrations", {**body, "run": "no", **change}).problem
         assert refused["status"] in (403, 422), (change, refused)
     assert not (farm.folder / "results" / "no").exists() and jobs_of(farm, "no") == []

@@ -95,6 +95,10 @@ class CoregistrationRequest(Request):
     held_out: Annotated[float, Field(gt=0.0, lt=1.0)] | None = None
     components: list[Count] = Field(default=[], max_length=100)
     anatomy: Literal["regenerate", "keep"] = "regenerate"
+    gate: Literal["auto", "person"] = Field(
+        default="auto",
+        description="person: models are built when a reviewer has decided on all that the rules leave to one",
+    )
     options: FitOptions = FitOptions()
 
 
@@ -168,7 +172,7 @@ def submit_coregistration(state: Service, request: CoregistrationRequest, respon
         "model": _local(_model(state, request.model), "model"),
         "out": _local(state.places.out(request.out, request.run), "out"),
     }
-    rounds = ("iterations", "all_iterations", "model_recipe", "held_out", "components", "anatomy")
+    rounds = ("iterations", "all_iterations", "model_recipe", "held_out", "components", "anatomy", "gate")
     done = state.submitting.call(
         "submit_rounds",
         url=state.settings.url,
@@ -176,6 +180,7 @@ def submit_coregistration(state: Service, request: CoregistrationRequest, respon
         places=places,
         options=request.options.model_dump(),
         rounds={name: getattr(request, name) for name in rounds},
+        farm=str(state.settings.folder),
     )
     return _submitted(state, response, request.run, places["out"], new=done["total"], **done)
 
