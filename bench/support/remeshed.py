@@ -22,7 +22,14 @@ class Remeshed:
     truth: Float[np.ndarray, "V 3"]  # of the target's vertices, on the source's surface, metres
 
 
-def remeshed(data: GNMData, source: LandmarkedMesh, *, bend_m: float = 5e-3, along: bool = False) -> Remeshed:
+def remeshed(
+    data: GNMData,
+    source: LandmarkedMesh,
+    *,
+    bend_m: float = 5e-3,
+    along: bool = False,
+    landmark_error_m: float = 0.0,
+) -> Remeshed:
     """Make the dual mesh of a model's skin and bend it by up to `bend_m` in waves as long as a head.
 
     Args:
@@ -31,15 +38,17 @@ def remeshed(data: GNMData, source: LandmarkedMesh, *, bend_m: float = 5e-3, alo
         bend_m: largest displacement.
         along: displace in all directions, also along the surface, which leaves no trace on a smooth skull; else away
             from the middle of the head.
+        landmark_error_m: standard deviation of the target's landmarks, along each axis; then they are projected.
     """
     quads = data.quads[source.skin[data.quads].all(1)].astype(np.int64)
     truth = (source.vertices[quads[:, 0]] + source.vertices[quads[:, 2]]) / 2  # on the diagonal that cuts the quad
     triangles, move = _dual_triangles(quads), _waves if along else _swellings
     scale = bend_m / np.linalg.norm(move(truth), axis=1).max()
-    bent, schemes = truth + scale * move(truth), {}
+    bent, schemes, rng = truth + scale * move(truth), {}, np.random.default_rng(0)
     for name, scheme in source.schemes.items():
         points = scheme.points(source.vertices)
-        face, share = closest_points(points + scale * move(points), bent, triangles)[1:]
+        marked = points + scale * move(points) + landmark_error_m * rng.standard_normal(points.shape)
+        face, share = closest_points(marked, bent, triangles)[1:]
         schemes[name] = replace(scheme, indices=triangles[face], weights=share, header={})
     return Remeshed(source=source, target=of_mesh(bent, triangles, schemes, "re-meshed head"), truth=truth)
 

@@ -3,7 +3,8 @@
 Amberg gives each vertex an affine map and penalises differences of neighbours'; affine motions of the whole are free.
 Here the bi-Laplacian of the displacement is penalised, from step to step, with the same free motions and a quarter of
 the unknowns: a factorization of 11,460 vertices takes 0.6 s instead of 7.7. Stiffness is a length: what is smaller
-keeps its shape.
+keeps its shape. Beside it space is bent: one spline in three dimensions, whose energy also decides where points lie
+along the surface. Landmarks decide which of the two is taken.
 See docs/algorithms.md, "Maps between topologies".
 """
 
@@ -13,17 +14,24 @@ from functools import cached_property
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
+from scipy.linalg import cho_factor, cho_solve
 from scipy.sparse import csr_matrix, diags
 from scipy.sparse.linalg import LinearOperator, SuperLU, cg, splu
 
 from registration.geometry.closest_point import ClosestPointQuery, barycentric_points
 from registration.geometry.large_steps import normalised_laplacian, spacing
+from registration.geometry.space_spline import SpaceSpline
 from registration.geometry.topology import boundary_vertices, vertex_areas, vertex_normals
 
 _ON_EDGE = 1e-4  # a barycentric weight below it: the closest point lies on the opposite edge
 _OUTLIER = 2.0  # times the median residual: landmarks that are farther away count little
 _TOLERANCE = 1e-3  # relative, of the linear systems
 _MAX_ITERATIONS = 200  # of a linear system
+_CENTRES = 500  # of a spline: 2 cm apart on a head
+_ROWS = 2000  # vertices that a spline is fitted to
+_SLIDING = 1e-7  # weight of distance along the surface, for splines: more of it would hold points where they came first
+_AFFINE_FLOOR = 1e-12  # m^2: makes a spline without data or landmarks nothing
+_ERRORS = 2.0  # standard errors of the mean: gains below it may be chance
 _FLOOR = 1e-6  # pull of every vertex to where it is, of the weight of data: parts without data have a solution
 
 
@@ -38,6 +46,14 @@ class Rung:
     whole: bool = False  # also with what is left out later, as ears: a stiff mesh cannot fold there, and they anchor it
 
 
+# Reach, m, and facing. Twelve splines: eight of falling stiffness, then points come to rest along the surface.
+_LIMITS = ((0.050, 0.3), (0.032, 0.5), (0.020, 0.5), (0.012, 0.5)) + 8 * ((0.008, 0.5),)
+_LENGTHS = np.r_[np.geomspace(0.060, 0.005, 8), np.full(4, 0.005)]
+_LANDMARKS = np.r_[np.geomspace(10, 0.003, 8), np.full(4, 0.003)]
+SPLINES = tuple(
+    Rung(length_m=float(length), landmarks=float(weight), reach_m=reach, facing=facing, whole=True)
+    for length, weight, (reach, facing) in zip(_LENGTHS, _LANDMARKS, _LIMITS, strict=True)
+)
 LADDER = (
     Rung(length_m=0.150, landmarks=30.0, reach_m=0.050, facing=0.3, whole=True),
     Rung(length_m=0.080, landmarks=20.0, reach_m=0.032, facing=0.5, whole=True),
@@ -52,8 +68,9 @@ LADDER = (
 class IcpSettings:
     """How a mesh is bent."""
 
-    ladder: tuple[Rung, ...] = LADDER
-    steps: int = 3  # of each rung
+    splines: tuple[Rung, ...] = SPLINES  # one step each: space is bent; then the surface, on the ladder's last rung
+    ladder: tuple[Rung, ...] = LADDER  # the surface alone is bent
+    steps: int = 3  # of each rung of the ladder
     tangential: float = 0.001  # weight of distance along the surface, on the ladder; that across it has 1
     rounds: int = 10  # point to plane, at the end
     round_tangential: float = 0.1
@@ -149,21 +166,73 @@ def bend(mesh: Bent, surface: Surface, settings: IcpSettings) -> Float[np.ndarra
         mesh: roughly aligned with the surface.
         surface: what its data vertices are drawn to. Closest points at its border, on faces that are left out, beyond
             the reach, or with another direction are rejected.
-        settings: the ladder and the rounds after it.
+        settings: splines, the ladder, and the rounds after it.
 
     Returns:
         The bent vertices.
     """
-    bent = mesh.vertices
-    for rung in settings.ladder:
+    bent = _bent_surface(mesh, surface, mesh.vertices, settings.ladder, settings)
+    if not settings.splines or not len(mesh.trust):
+        return bent
+    space = _bent_space(mesh, surface, settings.splines)
+    space = _bent_surface(mesh, surface, space, settings.ladder[-1:], settings)
+    return space if _nearer(mesh, space, bent) else bent
+
+
+def _bent_surface(
+    mesh: Bent, surface: Surface, bent: Float[np.ndarray, "V 3"], ladder: tuple[Rung, ...], settings: IcpSettings
+) -> Float[np.ndarray, "V 3"]:
+    """Go down the ladder, then the rounds without landmarks."""
+    for rung in ladder:
         data = mesh.whole if rung.whole else mesh.data
         system = _System.of(mesh, rung.length_m, data, rung.landmarks * _trust(mesh, bent))
         for _ in range(settings.steps):
             bent = bent + system.step(bent, surface, rung, settings.tangential)
-    last = settings.ladder[-1]
     for length_m in np.geomspace(*settings.round_lengths_m, settings.rounds):
         system = _System.of(mesh, length_m, mesh.data, 0 * mesh.trust)
-        bent = bent + system.step(bent, surface, last, settings.round_tangential)
+        bent = bent + system.step(bent, surface, ladder[-1], settings.round_tangential)
+    return bent
+
+
+def _nearer(mesh: Bent, one: Float[np.ndarray, "V 3"], other: Float[np.ndarray, "V 3"]) -> bool:
+    """Whether landmarks come nearer to where they belong in `one`, beyond what their own errors explain.
+
+    The errors are common to both, so that the differences are compared, pair by pair.
+    """
+    residuals = [np.linalg.norm(mesh.landmarks @ bent - mesh.marks, axis=1) for bent in (one, other)]
+    share, gain = mesh.trust / mesh.trust.sum(), residuals[1] - residuals[0]
+    mean = share @ gain
+    return bool(mean > _ERRORS * np.sqrt(np.square(share) @ np.square(gain - mean)))
+
+
+def _bent_space(mesh: Bent, surface: Surface, rungs: tuple[Rung, ...]) -> Float[np.ndarray, "V 3"]:
+    """Bend space with a mesh: the sum of all steps is one spline, from step to step a softer one.
+
+    Distances along the surface cost next to nothing, so that points slide to where space is bent least.
+    """
+    bent = mesh.vertices
+    spline = SpaceSpline.of(mesh.vertices, _CENTRES)
+    marked, rng = np.asarray(mesh.landmarks @ spline.values), np.random.default_rng(0)
+    count = spline.values.shape[1]
+    for rung in rungs:
+        hits = surface.closest(bent)
+        data = mesh.whole if rung.whole else mesh.data
+        kept = np.flatnonzero(data & _kept(hits, normals(bent, mesh.triangles), rung))
+        rows = rng.choice(kept, min(_ROWS, len(kept)), replace=False)
+        area = mesh.areas[rows] * mesh.areas[kept].sum() / mesh.areas[rows].sum()
+        fields, across = spline.values[rows], hits.normals[rows]
+        goal, weight = (hits.points - mesh.vertices)[rows], 1e-4 * rung.landmarks * _trust(mesh, bent)
+        pull = _SLIDING * goal + (1 - _SLIDING) * across * np.einsum("rc,rc->r", across, goal)[:, None]
+        right = fields.T @ (area[:, None] * pull)
+        right += marked.T @ (weight[:, None] * (mesh.marks - mesh.landmarks @ mesh.vertices))
+        own = (marked.T * weight) @ marked + np.diag(rung.length_m**5 * spline.energy + _AFFINE_FLOOR)
+        matrix = np.empty((3, count, 3, count))
+        for i, j in ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2)):
+            coupling = area * ((1 - _SLIDING) * across[:, i] * across[:, j] + _SLIDING * (i == j))
+            block = fields.T @ (coupling[:, None] * fields) + own * (i == j)
+            matrix[i, :, j], matrix[j, :, i] = block, block.T
+        solution = cho_solve(cho_factor(matrix.reshape(3 * count, -1), overwrite_a=True), right.T.ravel())
+        bent = mesh.vertices + spline.values @ solution.reshape(3, count).T
     return bent
 
 

@@ -11,7 +11,7 @@ from tests.conftest import FIXTURES
 from tests.registration.cranium.smooth_heads import tiny
 
 # Triangles of the small model are up to 2 cm large: a vertex that is carried there and back comes less near.
-QUICK = MapSettings(icp=IcpSettings(ladder=LADDER[::2], steps=2), cycle_mm=2.0)
+QUICK = MapSettings(icp=IcpSettings(splines=(), ladder=LADDER[::2], steps=2), cycle_mm=2.0)
 
 
 @cache

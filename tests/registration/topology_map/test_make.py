@@ -47,7 +47,7 @@ def test_the_mask_of_the_groups_travels_to_a_mesh_without_groups():
 
 def test_a_bad_map_is_refused_with_reasons():
     known = pair()
-    stiff = MapSettings(icp=IcpSettings(ladder=QUICK.icp.ladder[:1], rounds=0), least_covered=1.0)
+    stiff = MapSettings(icp=IcpSettings(splines=(), ladder=QUICK.icp.ladder[:1], rounds=0), least_covered=1.0)
     mapped = map_topologies(known.source, known.target, stiff)
     assert not mapped.accepted
     assert any("mm from the surface" in reason for reason in mapped.reasons)
