@@ -9,9 +9,12 @@ import time
 from pathlib import Path
 
 import pytest
+import sqlalchemy as sa
 
-from tests.workflows.farm.harness import QUICK, Farm, alive, children_of
+from bench.support.postgres_server import Server
+from tests.workflows.farm.harness import QUICK, Farm, alive, children_of, open_farm
 from workflows.engine.alive import lock_key
+from workflows.engine.database import checked_url, engine
 from workflows.engine.jobs import FlowJob, Job
 from workflows.engine.metrics import queue_metrics
 from workflows.records.store import Store

@@ -85,7 +85,7 @@ def test_all_kinds_give_the_same_files(tmp_path, folder, kind):
         b"PK\x03\x04" + bytes(100),
         bytes(100),
     ],
-    ids=lambda content: f"{len(content)}-{content[:10]!r}",
+    ids=lambda content: f"{len(content)}",  # no content: a gzip holds the time
 )
 def test_what_is_no_capture_is_refused(tmp_path, content):
     with pytest.raises(InputError, match="The archive is"):
