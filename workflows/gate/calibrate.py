@@ -26,6 +26,7 @@ MIN_GOOD, MIN_BAD = 15, 5  # labels
 MIN_JUDGED = 3  # bad ones that did not fail: failed ones are rejected whatever the limits are
 MAX_FALSE_ALARMS = 0.1  # share of the good ones, at which recall is traded for no more
 _FOLDS = 50  # of the check of the whole calibration, at most
+_MARGIN = 1.25  # of the limit beyond the last score below it
 _REJECT_RATIO = 2.0  # of the limits of rejection and of a look, in spreads
 _MAX_STOPPED = 0.05  # share of the good ones that were stopped, above which that asks for no look
 _FIX = "label more of them: choose at random, and let both labels occur"
@@ -179,16 +180,15 @@ def _left_out_scores(values: Float[np.ndarray, "N R"], good: Bool[np.ndarray, "N
 def _operating_point(scores: Float[np.ndarray, "N"], good: Bool[np.ndarray, "N"]) -> tuple[float, float]:
     """The limit, in spreads, with the best recall minus false alarms, of at most `MAX_FALSE_ALARMS`, and this value.
 
-    Of a gap between two scores, the middle.
+    Of equal ones the lowest: it lies a little above a score, as labelled faults may be much larger than others to come.
     """
-    ordered = np.unique(scores)
-    limits = np.sqrt(np.maximum(ordered[:-1], 0.5) * np.maximum(ordered[1:], 0.5))
-    limits = np.append(limits, 2 * max(ordered[-1], 1.0))
+    ordered = np.maximum(np.unique(scores), 0.5)
+    limits = np.minimum(_MARGIN * ordered, np.append(np.sqrt(ordered[:-1] * ordered[1:]), np.inf))
     alarms = (scores[good][:, None] > limits).mean(0)
     recall = (scores[~good][:, None] > limits).mean(0)
     gain = np.where(alarms <= MAX_FALSE_ALARMS, recall - alarms, -1.0)
     best = np.flatnonzero(gain >= gain.max() - 1e-12)
-    return float(limits[best[len(best) // 2]]), float(gain.max())
+    return float(limits[best[0]]), float(gain.max())
 
 
 def _thresholds(

@@ -116,7 +116,7 @@ FIGURES: Mapping[str, FigureKind] = {
         title="views not trusted", unit="%", meaning="views that disagree with the others", noise=1.0, digits=0
     ),
     "warnings": FigureKind(
-        title="warnings", unit="", meaning="warnings about the capture's files", noise=0.1, digits=0
+        title="warnings", unit="", meaning="warnings about the capture's files", noise=0.3, digits=0
     ),
     "motion_mm": FigureKind(
         title="motion at the end",
