@@ -20,6 +20,7 @@ from registration.cranium.registered import NEUTRAL, cranium_figure, cranium_not
 from registration.evaluate.audit import audit_penetration
 from registration.evaluate.evaluation import RegistrationEvaluation, evaluate_registration, without_scan
 from registration.evaluate.plausibility import plausibility
+from registration.evaluate.residuals import far_landmarks
 from registration.evaluate.verdict import judge
 from registration.evaluate.viewpoint import intersection_figures
 from registration.fit import camera_refinement
@@ -346,10 +347,10 @@ def _evaluate(
             view.name: view.camera.relative_to(inputs.origin) for view in inputs.capture.views if view.name in shown
         }
         intersections = intersection_figures(audit, vertices, cameras)
-        plausible = plausibility(registration, inputs.data, inputs.neutral)
-        registration = replace(
-            registration, figures={**registration.figures, "intersections": intersections, **plausible}
-        )
+        figures = {"intersections": intersections, **plausibility(registration, inputs.data, inputs.neutral)}
+        if (far := far_landmarks(inputs.capture, registration.landmarks)) is not None:
+            figures["far_landmarks"] = far
+        registration = replace(registration, figures={**registration.figures, **figures})
     if inputs.capture.scan is not None and finite:
         progress.message("measuring against the scan")
         evaluation = evaluate_registration(registration, inputs.capture)

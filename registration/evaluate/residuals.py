@@ -7,11 +7,15 @@ import numpy as np
 from jaxtyping import Float
 from torch import Tensor
 
+from registration.capture.pixels import undistort_landmarks
+from registration.capture.triangulation import MIN_CONFIDENCE
 from registration.evaluate.names import RESIDUALS, ResidualKind
 from registration.fit.view_weights import view_errors
-from registration.frames import linear_to_srgb
-from registration.types import Rendered, Targets
+from registration.frames import MM_PER_M, linear_to_srgb
+from registration.types import Capture, Rendered, Targets
 
+FAR_MM = 10.0  # of a landmark from the mesh's, across the line of sight: more than detectors err, and than fits miss
+FAR_SPREADS = 3.0  # of a landmark whose spread is known: it must exceed both
 _LEVELS = 255  # of 8 bit sRGB
 
 
@@ -46,6 +50,34 @@ def view_residuals(
         targets.names[view]: {kind: float(values[view]) for kind, values in means.items() if np.isfinite(values[view])}
         for view in range(count)
     }
+
+
+def far_landmarks(capture: Capture, landmarks: Mapping[str, Float[np.ndarray, "L 3"]]) -> dict[str, float] | None:
+    """Return how many of a capture's landmarks lie far from those of the mesh.
+
+    A robust fit leaves out landmarks that contradict the others, so that medians do not show them.
+
+    Args:
+        capture: its landmarks of confidence above `MIN_CONFIDENCE` count, view by view.
+        landmarks: scheme -> points on the registered mesh, metres, in the world of the capture.
+
+    Returns:
+        `percent` of the counted ones that are more than `FAR_MM` and `FAR_SPREADS` standard deviations away, across the
+        line of sight at the depth of the mesh's point; `counted`. None: no landmark counts.
+    """
+    far, total = 0, 0
+    for view in capture.views:
+        for name in sorted(set(view.landmarks) & set(landmarks)):
+            pixels = undistort_landmarks(view, name)
+            shown_px, depth_m = view.camera.project(landmarks[name])
+            mm_per_px = MM_PER_M * depth_m / view.camera.intrinsics[0, 0]
+            distance_mm = np.linalg.norm(pixels[:, :2] - shown_px, axis=1) * mm_per_px
+            spread_px = np.nan_to_num(view.landmark_spread_px.get(name, np.zeros(len(pixels))))
+            counts = (pixels[:, 2] > MIN_CONFIDENCE) & np.isfinite(distance_mm)
+            limit_mm = np.maximum(FAR_MM, FAR_SPREADS * spread_px * mm_per_px)
+            total += int(counts.sum())
+            far += int((counts & (distance_mm > limit_mm)).sum())
+    return {"percent": 100.0 * far / total, "counted": total} if total else None
 
 
 def residual_figures(views: Mapping[str, Mapping[str, float]], not_trusted: Sequence[str] = ()) -> dict[str, Any]:

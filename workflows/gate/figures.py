@@ -35,6 +35,7 @@ class GateFigures:
     scan_mm: float | None = None
     landmarks_px: float | None = None
     worst_landmarks_px: float | None = None
+    far_landmarks_percent: float | None = None
     silhouette_px: float | None = None
     worst_silhouette_px: float | None = None
     labels_percent: float | None = None
@@ -75,6 +76,9 @@ FIGURES: Mapping[str, FigureKind] = {
     ),
     "worst_landmarks_px": FigureKind(
         title="landmarks in the worst view", unit="px", meaning="the same in the view where it is largest", noise=0.2
+    ),
+    "far_landmarks_percent": FigureKind(
+        title="landmarks far off", unit="%", meaning="landmarks more than 10 mm from those of the mesh", noise=1.0
     ),
     "silhouette_px": FigureKind(
         title="silhouette", unit="px", meaning="mean distance of the outlines; the head is 512 px high", noise=0.1
@@ -210,6 +214,7 @@ def read_figures(figures: Mapping[str, Any]) -> GateFigures:
     return GateFigures(
         **values,
         scan_mm=at("scan_to_mesh", "face", "mean_mm"),
+        far_landmarks_percent=at("far_landmarks", "percent"),
         intersections_mm=_largest([row.get("max_excess_mm") for row in counted]),
         intersecting_vertices=_sum([row.get(BEYOND_KEY) for row in counted]),
         untrusted_percent=100 * untrusted / count if count else None,

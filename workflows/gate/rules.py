@@ -75,6 +75,7 @@ class GateThresholds(
     scan_mm: Limit = _limit(0.4, 2.0)
     landmarks_px: Limit = _limit(5.0, 25.0)
     worst_landmarks_px: Limit = _limit(12.0)
+    far_landmarks_percent: Limit = _limit(10.0, 80.0)
     silhouette_px: Limit = _limit(3.0, 15.0)
     worst_silhouette_px: Limit = _limit(8.0)
     labels_percent: Limit = _limit(5.0, 40.0)

@@ -7,9 +7,9 @@ import pytest
 import torch
 
 from registration.evaluate.names import RESIDUALS
-from registration.evaluate.residuals import residual_figures, view_residuals
+from registration.evaluate.residuals import FAR_MM, far_landmarks, residual_figures, view_residuals
 from registration.frames import srgb_to_linear
-from registration.types import Camera, Pixels, Rendered, Targets
+from registration.types import Camera, Capture, Pixels, Rendered, Targets, View
 
 
 def square_subject() -> tuple[Targets, Rendered]:
@@ -82,3 +82,21 @@ def test_overall_is_the_median_of_the_trusted_views() -> None:
 def test_values_have_units() -> None:
     assert RESIDUALS["normals_deg"].text(2.04) == "2.0°"
     assert RESIDUALS["silhouette_px"].text(0.5) == "0.5\N{NO-BREAK SPACE}px"
+
+
+def test_far_landmarks_count_by_their_distance_at_the_depth_of_the_mesh(tmp_path) -> None:
+    """A camera a metre away with a focal length of 1,000 px: a pixel is a millimetre."""
+    intrinsics = np.array([[1000.0, 0, 320], [0, 1000.0, 240], [0, 0, 1]])
+    camera = Camera(width_px=640, height_px=480, intrinsics=intrinsics, T_cam_world=np.eye(4))
+    points = np.column_stack([np.linspace(-0.1, 0.1, 8), np.zeros(8), np.ones(8)])
+    shown = np.column_stack([camera.project(points)[0], np.ones(8)])
+    shown[0, 0] += FAR_MM - 0.5  # near enough
+    shown[1:4, 1] += FAR_MM + 0.5  # far
+    shown[4] = (0, 0, 0.2)  # not confident
+    shown[5, :2] = np.nan
+    view = View(name="a", camera=camera, image=tmp_path / "a.png", landmarks={"68": shown, "other": shown})
+    capture = Capture(root=tmp_path, subject="s", expression="e", classes=(), views=(view,), scan=None)
+    assert far_landmarks(capture, {"68": points}) == {"percent": 50.0, "counted": 6}
+    wide = replace(view, landmark_spread_px={"68": np.full(8, 4.0)})  # three standard deviations are 12 mm
+    assert far_landmarks(replace(capture, views=(wide,)), {"68": points}) == {"percent": 0.0, "counted": 6}
+    assert far_landmarks(capture, {"dense": points}) is None

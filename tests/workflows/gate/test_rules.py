@@ -22,7 +22,7 @@ def assessed(content_id: str = "a", **figures: object) -> Assessed:
 def test_what_lies_within_all_limits_is_accepted():
     verdict = judge(assessed(), QUIET)
     assert verdict.level == "accept" and not verdict.reasons and not verdict.for_person
-    assert verdict.unmeasured == ("scan_mm", "depth_mm")  # stated, and no reason by themselves
+    assert verdict.unmeasured == ("scan_mm", "far_landmarks_percent", "depth_mm")  # stated, and no reason by themselves
 
 
 def test_a_reason_names_figure_value_limit_and_unit():
