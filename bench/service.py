@@ -47,14 +47,14 @@ def main() -> None:
         folder = Path(name)
         url = options.db or default_url(folder)
         migrate(url)
-        start = time.perf_counter()
+        begin_s = time.perf_counter()
         ids = pretended_queue.fill(url, folder / "results" / RUN, RUN, options.captures)
-        _row("queue", f"{len(ids):,} captures, written in {time.perf_counter() - start:.0f} s")
+        _row("queue", f"{len(ids):,} captures, written in {time.perf_counter() - begin_s:.0f} s")
         token = Tokens(ServiceSettings(url=url, folder=folder).state).create("bench", ["operator"])
-        start = time.perf_counter()
+        begin_s = time.perf_counter()
         process, port = start(url, folder)
         try:
-            _row("start", f"{time.perf_counter() - start:.1f} s")
+            _row("start", f"{time.perf_counter() - begin_s:.1f} s")
             _measure(Target(port=port, token=token, url=url, pid=process.pid), ids, options)
         finally:
             process.terminate()
@@ -72,7 +72,7 @@ class Target:
 
     def get(self, path: str) -> tuple[float, bytes]:
         """Return the seconds until an answer is read, and the answer."""
-        start = time.perf_counter()
+        begin_s = time.perf_counter()
         connection = http.client.HTTPConnection("127.0.0.1", self.port, timeout=60)
         headers = {"Authorization": f"Bearer {self.token}", "Accept": "text/html"}
         connection.request("GET", path, headers=headers)

@@ -63,6 +63,7 @@ def test_no_module_has_the_name_of_a_standard_library_module_and_no_benchmark_im
     assert {module for module in imported if module.split(".")[0] == "tests"} == set()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "arguments", "figure"),
     [
@@ -80,6 +81,7 @@ def test_a_tiny_case_runs_to_its_figures(name, arguments, figure):
     assert figure in done.stdout
 
 
+@pytest.mark.slow
 def test_model_table_compares_the_first_model(tmp_path):
     sizes = ("--people", "2", "--points", "300", "--adam-steps", "20", "--random-heads", "2", "--jobs", "1")
     done = run("model_table", "--out", str(tmp_path), *sizes, "--curve-samples", "0")
@@ -96,6 +98,7 @@ def test_without_identity_writes_a_model(tmp_path):
     assert out.is_file()
 
 
+@pytest.mark.slow
 @needs_shared
 def test_cases_are_tried_and_judged():
     done = run("cases", str(SHARED / "cases"), str(SHARED / "data" / "captures" / "ict_pop_00" / "neutral"), "one_view")

@@ -121,6 +121,7 @@ def own_recipe() -> ModelRecipe:
     return replace(recipe, name="own_recipe", identity=replace(recipe.identity, mirrored=False))
 
 
+@pytest.mark.slow
 def test_python_builds_the_same_model_from_the_same_registrations(dataset, true_register, tmp_path):
     """`build_model` without a recipe, the step of `gnmreg coregister` without one, and each with the same one."""
     data, parsed = gnm_npz.read(MODEL), read_dataset(dataset)

@@ -196,6 +196,7 @@ def _asymmetric(model: GNMData, rng: np.random.Generator, count: int) -> tuple[n
     return _random_heads(model, rng, count) + rng.normal(size=(count, 1, 1)) * bump, bump
 
 
+@pytest.mark.slow
 def test_mirror_images_make_a_symmetric_model(model):
     """Template and span equal their mirror images; every component is symmetric or antisymmetric."""
     rng = np.random.default_rng(8)

@@ -156,6 +156,7 @@ def test_equal_seeds_give_equal_results(registered: Run, again: Run):
     assert motion.max() < 0.01
 
 
+@pytest.mark.slow
 def test_deterministic_runs_are_bitwise_equal(deterministic: list[RegisterProcess]):
     first, second = (process.run().out for process in deterministic)
     with np.load(first / "registration.npz") as a, np.load(second / "registration.npz") as b:

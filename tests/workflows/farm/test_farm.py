@@ -120,6 +120,7 @@ def test_forget_refuses_unfinished_jobs(farm: Farm) -> None:
     farm.wait_for_end("old/it02/a")
 
 
+@pytest.mark.slow
 def test_an_executor_id_is_exclusive_and_sigterm_ends_a_worker(farm: Farm) -> None:
     kept = farm.processes["w1"]
     with pytest.raises(AssertionError, match="Another process has this executor id"):

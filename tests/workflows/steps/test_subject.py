@@ -243,6 +243,7 @@ def threads() -> Iterator[None]:
     dr.set_thread_count(lanes)
 
 
+@pytest.mark.slow
 def test_a_subject_equals_its_captures_registered_by_hand(tmp_path: Path, monkeypatch, threads: None):
     monkeypatch.setitem(RECIPES, "draft", short_draft)
     subject, out, options = tmp_path / "tiny", tmp_path / "out", RegisterOptions(views=3, deterministic=True)

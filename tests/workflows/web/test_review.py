@@ -88,6 +88,7 @@ def test_a_reviewer_steps_subtracts_undoes_and_saves(page, run, model, model_fil
         np.testing.assert_allclose(replay.T_neutral_expression, subject.T_neutral_expression, atol=1e-9)
 
 
+@pytest.mark.slow
 @needs_browser
 def test_a_reviewer_walks_the_work_list_and_is_warned(page):
     sync_api = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
