@@ -72,7 +72,7 @@ class Target:
 
     def get(self, path: str) -> tuple[float, bytes]:
         """Return the seconds until an answer is read, and the answer."""
-        begin_s = time.perf_counter()
+        start = time.perf_counter()
         connection = http.client.HTTPConnection("127.0.0.1", self.port, timeout=60)
         headers = {"Authorization": f"Bearer {self.token}", "Accept": "text/html"}
         connection.request("GET", path, headers=headers)
