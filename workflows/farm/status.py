@@ -70,7 +70,7 @@ def status_lines(reader: QueueReader, run: str | None, logs: Path) -> list[str]:
     lines.append(f"{rate}; {figures.ended_last_hour} ended in the last hour")
     if figures.left_s is not None:
         end = datetime.fromtimestamp(time.time() + figures.left_s).strftime("%Y-%m-%d %H:%M")
-        lines.append(f"expected end: {end}, in {_duration(figures.left_s)}, of the {figures.left} {unit} in the queue")
+        lines.append(f"expected end: {end}, in {duration(figures.left_s)}, of the {figures.left} {unit} in the queue")
     lines += _process_lines(figures, logs)
     lines += remarks(figures)
     if figures.failures:
@@ -173,7 +173,7 @@ def _process_lines(figures: QueueMetrics, logs: Path) -> Iterator[str]:
     for name in figures.processes:
         row = by_executor.get(name)
         if row is not None:
-            yield f"{name}: {row.id}, {stage_of(row, logs)}, for {_duration(time.time() - row.since)}"
+            yield f"{name}: {row.id}, {stage_of(row, logs)}, for {duration(time.time() - row.since)}"
         else:
             yield f"{name}: {'runs' if is_coordinator(name) else 'idle'}"
 
@@ -223,7 +223,7 @@ def _job_row(row: JobRow, logs: Path) -> tuple[str, str, str, str, str]:
     if row.state == FAILED and row.failure:
         stage = f"{row.failure.get('status')}"
     elif row.state == DONE and row.started and row.ended:
-        stage = f"{row.spec.get('step')}, {_duration(row.ended - row.started)}"
+        stage = f"{row.spec.get('step')}, {duration(row.ended - row.started)}"
     elif row.state in (WAITING, CANCELLED):
         stage = str(row.spec.get("step"))
     return row.id, row.state, since, stage, str(place)
@@ -261,7 +261,8 @@ def _by_state(counts: dict[str, int]) -> str:
     return ", ".join(f"{counts[state]} {state}" for state in sorted(counts)) or "none"
 
 
-def _duration(seconds: float) -> str:
+def duration(seconds: float) -> str:
+    """Return a duration in words."""
     if seconds < 90:
         return f"{seconds:.0f} s"
     minutes = round(seconds / 60)

@@ -15,7 +15,7 @@ from workflows.engine.database import checked_url, engine
 @pytest.fixture(scope="session")
 def postgres() -> Iterator[Server]:
     if programs() is None:
-        pytest.fail("no PostgreSQL here: sudo apt-get install -y postgresql")
+        pytest.skip("no PostgreSQL here; make test-durability installs it")
     with server() as running:
         yield running
 

@@ -2,11 +2,9 @@
 
 import base64
 import contextlib
-import itertools
 import json
 import os
 import pickle
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -14,8 +12,7 @@ import pytest
 import sqlalchemy as sa
 from dbos import DBOSClient
 
-from bench.support.postgres_server import Server, programs, server
-from tests.workflows.farm.harness import Farm, open_farm
+from tests.workflows.farm.harness import Farm
 from tests.workflows.farm.test_hostile import Trap
 from workflows.cli.app import main
 from workflows.engine.database import checked_url, engine, table
@@ -24,28 +21,6 @@ from workflows.engine.serialization import APPLICATION, JsonSerializer, Unreadab
 
 OURS = JsonSerializer().name()
 TALK = {"step": "talk", "arguments": {"text": "x"}}
-NUMBERS = itertools.count()
-
-
-@pytest.fixture(scope="module")
-def postgres() -> Iterator[Server]:
-    if programs() is None:
-        pytest.skip("no PostgreSQL here")
-    with server() as running:
-        yield running
-
-
-@pytest.fixture(params=["sqlite", "postgres"])
-def farm(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Farm]:
-    url = None
-    if request.param == "postgres":
-        base = request.getfixturevalue("postgres").url
-        name = f"forged{next(NUMBERS)}"
-        with engine(checked_url(base)).connect().execution_options(isolation_level="AUTOCOMMIT") as connection:
-            connection.execute(sa.text(f"CREATE DATABASE {name}"))
-        url = base.rpartition("/")[0] + f"/{name}"
-    with open_farm(tmp_path, url) as opened:
-        yield opened
 
 
 class Forger:

@@ -9,6 +9,7 @@ from urllib.parse import quote, urlencode
 from fastapi import Request
 from starlette.responses import HTMLResponse, Response
 
+from workflows.farm import status
 from workflows.ids import redact
 from workflows.service.access import Identity
 from workflows.service.board import Entry
@@ -110,16 +111,8 @@ def ago(seconds: float | None) -> str:
 
 
 def duration(seconds: float | None) -> str:
-    """Return a duration in words."""
-    if seconds is None:
-        return "–"
-    if seconds < 90:
-        return f"{max(seconds, 0):.0f} s"
-    minutes = round(seconds / 60)
-    if minutes < 90:
-        return f"{minutes} min"
-    hours, minutes = divmod(minutes, 60)
-    return f"{hours} h {minutes} min" if hours < 48 else f"{hours // 24} days {hours % 24} h"
+    """Return a duration in words; a dash for none."""
+    return "–" if seconds is None else status.duration(max(seconds, 0.0))
 
 
 def text(value: Any) -> str:
