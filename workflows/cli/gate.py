@@ -170,6 +170,14 @@ def verify(farm: FarmOptions = _FARM, repair: bool = False, head: Head = None) -
     from workflows.gate.decisions import START, DecisionLog
 
     log = DecisionLog.of_farm(farm.directory)
+    if not log.exists():
+        raise InputError(
+            "There is no log of decisions",
+            where=log.file,
+            expected="the log of a farm in which something was decided",
+            got="no such file",
+            fix="name the farm's folder with --folder",
+        )
     if repair and (aside := log.repair()) is not None:
         print(f"the unfinished line is in {aside}")
     found = log.verify()

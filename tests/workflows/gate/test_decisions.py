@@ -13,6 +13,7 @@ import pytest
 from registration.errors import InputError
 from tests.conftest import ROOT
 from tests.workflows.gate import made
+from workflows.cli.app import main
 from workflows.gate.decisions import START, DecisionLog, Ruling, current, read_log
 
 
@@ -189,3 +190,8 @@ def test_processes_and_threads_append_at_the_same_time(tmp_path):
     assert len(set(numbers)) == 20
     entries = DecisionLog.of_farm(tmp_path).read()
     assert len(entries) == 60 and len({entry.content_id for entry in entries}) == 60
+
+
+def test_the_command_refuses_a_folder_without_decisions(tmp_path, capsys):
+    assert main(["gate", "verify", "--folder", str(tmp_path)]) == 2
+    assert "There is no log of decisions" in capsys.readouterr().err and not list(tmp_path.iterdir())
