@@ -12,7 +12,7 @@ from registration.errors import InputError
 from registration.storage.reading import parse_json
 from registration.storage.records import read_json
 from workflows.engine.reader import DONE, FAILED, JobRow
-from workflows.gate.decisions import FOLDER, DecisionEntry, DecisionLog, current
+from workflows.gate.decisions import DecisionEntry, DecisionLog, current
 from workflows.gate.figures import Assessed, read_figures
 from workflows.gate.item import GateItem
 from workflows.gate.rules import GateThresholds, judge, read_thresholds
@@ -25,7 +25,6 @@ from workflows.service.results import REGISTRATION, arguments_of, checked_place,
 if TYPE_CHECKING:
     from workflows.service.state import ServiceState
 
-THRESHOLDS = "thresholds.json"  # beside the log of decisions; without it the defaults hold
 MANIFEST = "manifest.json"
 READ_S = 2.0  # for which one request reads manifests; the next ones go on
 _CHUNK = 200  # rows that are read at once
@@ -57,14 +56,14 @@ class GateBook:
     def __init__(self, folder: Path) -> None:
         """`folder`: of the farm. Nothing is read yet."""
         self.log = DecisionLog.of_farm(folder)
-        self._thresholds_file = Path(folder) / FOLDER / THRESHOLDS
+        self._folder = Path(folder)
         self._read: dict[str, _Read] = {}
         self._judged_by = ""  # content id of the thresholds
         self._lock = threading.Lock()
 
     def thresholds(self) -> GateThresholds:
         """Return the limits of the farm. Raises InputError if their file is damaged."""
-        return read_thresholds(self._thresholds_file if self._thresholds_file.is_file() else None)
+        return read_thresholds(None, self._folder)
 
     def decisions(self) -> dict[str, DecisionEntry]:
         """Return content id -> the decision that holds. Raises InputError if the log is damaged."""

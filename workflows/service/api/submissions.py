@@ -56,7 +56,15 @@ class FitOptions(Request):
     cranium: Literal["model", "off"] = "model"
 
 
-class BatchRequest(Request):
+class Submission(Request):
+    """What every submission names."""
+
+    model: Place = Field(description=_MODEL, examples=["first"])
+    out: Place | None = Field(default=None, description=_OUT)
+    options: FitOptions = FitOptions()
+
+
+class BatchRequest(Submission):
     """Captures that are registered independently of one another."""
 
     captures: list[Place] = Field(
@@ -65,30 +73,22 @@ class BatchRequest(Request):
         description="uploads as SUBJECT/NAME or SUBJECT, paths and URLs below the service's roots",
         examples=[["ann/smile", "bob"]],
     )
-    model: Place = Field(description=_MODEL, examples=["first"])
-    out: Place | None = Field(default=None, description=_OUT)
     run: RunName | None = Field(default=None, description="name of the run; None: that of the results")
-    options: FitOptions = FitOptions()
 
 
-class SubjectRequest(Request):
+class SubjectRequest(Submission):
     """A subject's captures: the neutral, then each expression from it."""
 
     subject: Place = Field(description="name of an uploaded subject, or the path of a folder", examples=["ann"])
-    model: Place = Field(description=_MODEL, examples=["first"])
     run: RunName
-    out: Place | None = Field(default=None, description=_OUT)
     neutral: Annotated[str, Field(max_length=200)] | None = Field(default=None, description="the neutral's folder")
-    options: FitOptions = FitOptions()
 
 
-class CoregistrationRequest(Request):
+class CoregistrationRequest(Submission):
     """Rounds of registration and model building over a dataset; as `gnmreg coregister`."""
 
     dataset: Place = Field(description='path of a folder of subjects; "captures": all uploads', examples=["captures"])
-    model: Place = Field(description=_MODEL, examples=["first"])
     run: RunName
-    out: Place | None = Field(default=None, description=_OUT)
     iterations: Annotated[int, Field(ge=1, le=100)] = 3
     all_iterations: bool = False
     model_recipe: Annotated[str, Field(max_length=200)] = "few_registrations"
@@ -99,7 +99,6 @@ class CoregistrationRequest(Request):
         default="auto",
         description="person: models are built when a reviewer has decided on all that the rules leave to one",
     )
-    options: FitOptions = FitOptions()
 
 
 class Submitted(BaseModel):
