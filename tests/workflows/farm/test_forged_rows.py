@@ -12,7 +12,7 @@ import pytest
 import sqlalchemy as sa
 from dbos import DBOSClient
 
-from tests.workflows.farm.harness import Farm
+from tests.workflows.farm.harness import Farm, open_farm
 from tests.workflows.farm.test_hostile import Trap
 from workflows.cli.app import main
 from workflows.engine.database import checked_url, engine, table
