@@ -19,16 +19,11 @@ from jaxtyping import Float
 
 from coregister import joints
 from coregister.next_model import expression, identity
-from coregister.next_model.alignment import (
-    AlignedNeutrals,
-    OutlierStatistics,
-    RejectedSubject,
-    align_neutrals,
-    find_outlier,
-)
+from coregister.next_model.alignment import AlignedNeutrals, RejectedSubject, align_neutrals
 from coregister.next_model.completion import MissingDataCompletion
 from coregister.next_model.displacement_store import DisplacementStore
 from coregister.next_model.expression import CoefficientStatistics, RegionBasis
+from coregister.next_model.expression_outliers import ExpressionStatistics, reject_expressions
 from coregister.next_model.identity import IdentityBasis
 from coregister.next_model.provenance import BuildInputs, build_manifest
 from coregister.next_model.recipes import ModelRecipe, few_registrations
@@ -168,26 +163,24 @@ def _store_expressions(
     kept_names = (training.subjects[k] for k in aligned.kept)
     rotations = dict(zip(kept_names, aligned.T_model_head[:, :3, :3], strict=True))
     complete = MissingDataCompletion(previous, previous.expression_basis, recipe.completion)
-    statistics = OutlierStatistics(previous)
+    statistics = ExpressionStatistics(previous)
     names, owners, labels, values, completed = [], [], [], [], 0
     for subject in subjects:
         if subject.name not in rotations or subject.neutral is None:
             continue
+        rotation = rotations[subject.name]
+        neutral = subject.neutral.vertices.astype(np.float64) @ rotation.T
         for mesh in subject.expressions:
             confidence = np.minimum(mesh.confidence, subject.neutral.confidence)
-            displacement = (mesh.vertices.astype(np.float64) - subject.neutral.vertices) @ rotations[subject.name].T
+            displacement = mesh.vertices.astype(np.float64) @ rotation.T - neutral
             completed += complete.has_missing(confidence)
             displacement = complete(displacement, confidence)
             store.append(displacement)
-            values.append(statistics(displacement, confidence))
+            values.append(statistics(neutral, displacement, confidence, mesh.figures))
             names.append(f"{subject.name}, {mesh.name}")
             owners.append(subject.name)
             labels.append(mesh.label)
-    kept, rejected = np.arange(len(names)), list[RejectedSubject]()
-    while len(kept) and (outlier := find_outlier(np.stack(values)[kept], "the neutral", recipe.alignment)):
-        index, reason = outlier
-        rejected.append(RejectedSubject(name=names[kept[index]], reason=reason))
-        kept = np.delete(kept, index)
+    kept, rejected = reject_expressions(values, labels, names, recipe.alignment)
     counts = Counter(owners[k] for k in kept)
     weights = np.zeros(len(names))
     weights[kept] = [1 / counts[owners[k]] for k in kept]
@@ -195,7 +188,7 @@ def _store_expressions(
         subjects=tuple(owners),
         labels=tuple(labels),
         weights=weights,
-        rejected=tuple(rejected),
+        rejected=rejected,
         completed=completed,
     )
 

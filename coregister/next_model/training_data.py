@@ -29,6 +29,7 @@ class TrainingMesh:
     confidence: Float[np.ndarray, "V"]  # 0 to 1; 0: observed by no camera
     triangles: Int[np.ndarray, "F 3"]
     digest: str = ""  # of the source; empty: of the arrays
+    figures: Mapping[str, float] = field(default_factory=dict)  # of `expression_outliers.REPORTED_FIGURES`
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

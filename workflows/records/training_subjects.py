@@ -1,6 +1,6 @@
 """Subjects that a model is built from or evaluated on: registrations of a run, true meshes of captures."""
 
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -38,6 +38,9 @@ class RegisteredSubjects:
     stabilized_set: Path | None  # the stabilized set; None: neutrals alone
     tags: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)  # by folder name
     left_out: Collection[str] = ()  # registrations that are not used, as SUBJECT/NAME of the folders
+    figures_of: Callable[[Mapping[str, Any]], Mapping[str, float]] | None = (
+        None  # `TrainingMesh.figures` of a manifest's
+    )
 
     @cached_property
     def usable(self) -> dict[str, UsableRegistrations]:
@@ -67,14 +70,16 @@ class RegisteredSubjects:
                 meshes = stabilized.read_subject(self.stabilized_set, numbers[usable.subject])
                 confidence = weights * neutral.confidence
                 for folder, label, vertices in zip(meshes.names, meshes.labels, meshes.vertices, strict=True):
+                    registration = load_registration(self.run / name / folder)
                     expressions.append(
                         TrainingMesh(
                             name=folder,
                             label=label,
                             vertices=transfer_to_unposed(vertices, neutral.vertices, unposed, confidence),
-                            confidence=load_registration(self.run / name / folder).confidence,
+                            confidence=registration.confidence,
                             triangles=neutral.triangles,
                             digest=self.inputs[f"{name}/{folder}"],
+                            figures=self.figures_of(registration.figures) if self.figures_of else {},
                         )
                     )
             yield TrainingSubject(

@@ -12,6 +12,7 @@ from coregister.anatomy.assemble import AnatomySettings, regenerate
 from coregister.anatomy.tongue import TongueSources
 from coregister.next_model import provenance
 from coregister.next_model.build import BuiltModel, build_model
+from coregister.next_model.expression_outliers import REPORTED_FIGURES
 from coregister.next_model.recipes import ModelRecipe
 from coregister.next_model.training_data import TrainingSubject
 from registration.cranium import auxiliary_model
@@ -20,6 +21,7 @@ from registration.model import gnm_npz
 from registration.progress import NullProgress, Progress
 from registration.storage import hashing
 from registration.storage.files import atomic_directory
+from workflows.gate.figures import read_figures
 from workflows.pages.model import render_model_page
 from workflows.records.dataset import read_dataset
 from workflows.records.step_results import BuildResult, RejectedRegistration
@@ -74,6 +76,7 @@ def build_next_model(
         stabilized_set=stabilized_set,
         tags=tags,
         left_out=frozenset(gated.left_out if gated else ()),
+        figures_of=_outlier_figures,
     )
     recipe = dict(recipe)
     anatomy = recipe.pop("anatomy", None)
@@ -113,6 +116,10 @@ def build_next_model(
         (temporary / PAGE).write_text(render_model_page(built.data, built.manifest), encoding="utf-8")
         product.write(result, temporary)
     return result.to_json()
+
+
+def _outlier_figures(figures: Mapping[str, Any]) -> dict[str, float]:
+    return {name: value for name, value in read_figures(figures).known().items() if name in REPORTED_FIGURES}
 
 
 def _with_anatomy(built: BuiltModel, settings: AnatomySettings, subjects: Iterable[TrainingSubject]) -> BuiltModel:
