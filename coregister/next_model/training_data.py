@@ -9,14 +9,17 @@ import torch
 from jaxtyping import Float, Int
 
 from registration.errors import InputError
+from registration.frames import transform_points
 from registration.geometry.rigid import align
 from registration.model.gnm import GNM
 from registration.model.gnm_npz import GNMData, topology_hash
+from registration.stabilize.subject_meshes import SkullSkin
 from registration.storage.hashing import hash_arrays
 from registration.types import Parameters, Registration
 
 NEUTRAL = "neutral"  # the label of neutrals
 _MIN_NEUTRALS = 2
+_ALONE = 0.999  # of the largest skinning weight: a vertex that moves with one joint alone
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -72,22 +75,45 @@ def unpose(registration: Registration, model: GNM) -> Float[np.ndarray, "V 3"]:
     return np.asarray(vertices.numpy(), np.float32)
 
 
-def transfer_to_unposed(
-    expression: Float[np.ndarray, "V 3"],
-    neutral: Float[np.ndarray, "V 3"],
-    unposed_neutral: Float[np.ndarray, "V 3"],
+def skull_weights(data: GNMData) -> Float[np.ndarray, "V"]:
+    """Return areas, m^2, of the skin over the skull that moves with the skull's joint alone; 0 elsewhere.
+
+    Posed and unposed it differs by one rigid motion.
+    """
+    area = SkullSkin.from_model(data).area
+    weight = data.skinning_weights[(data.skinning_weights @ area).argmax()]
+    return np.asarray(area * (weight > _ALONE * weight.max()))
+
+
+def unposed_expression(
+    registration: Registration,
+    stabilized: Float[np.ndarray, "V 3"],
+    T_neutral_expression: Float[np.ndarray, "4 4"],
+    neutral: Registration,
+    model: GNM,
     weights: Float[np.ndarray, "V"],
 ) -> Float[np.ndarray, "V 3"]:
-    """Return the unposed neutral plus the expression's displacement, rotated as the skin over the skull was rotated.
+    """Return an expression with its joints at rest and its skull where the unposed neutral (`unpose`) has it.
+
+    A head that turned on its neck between neutral and expression would add the neck's deformation to the expressions.
+    With the rigid motion G of the skull from the unposed expression to the unposed neutral, which stabilization
+    determines, it is G u + d: u is the unposed expression, d what stabilization removed from single regions.
 
     Args:
-        expression: stabilized, in the frame of the registered neutral, metres.
-        neutral: as registered.
-        unposed_neutral: `unpose` of it.
-        weights: of the vertices that determine the rotation, the skin over the skull.
+        registration: of the expression.
+        stabilized: its vertices in the frame of the registered neutral, metres.
+        T_neutral_expression: the skull's motion: p_neutral = T_neutral_expression @ p_expression.
+        neutral: registration of the subject's neutral.
+        model: with which both were registered.
+        weights: of the vertices, `skull_weights`.
     """
-    rotation = align(neutral[None].astype(np.float64), unposed_neutral.astype(np.float64), weights[None])[0, :3, :3]
-    return np.asarray(unposed_neutral + (expression.astype(np.float64) - neutral) @ rotation.T, np.float32)
+    unposed, unposed_neutral = (unpose(each, model).astype(np.float64) for each in (registration, neutral))
+    posed, posed_neutral = (each.vertices.astype(np.float64) for each in (registration, neutral))
+    T_posed_unposed = align(unposed[None], posed, weights[None])[0]
+    T_unposed_posed = align(posed_neutral[None], unposed_neutral, weights[None])[0]
+    aligned = transform_points(T_unposed_posed @ T_neutral_expression @ T_posed_unposed, unposed)
+    removed = stabilized.astype(np.float64) - transform_points(T_neutral_expression, posed)
+    return np.asarray(aligned + removed @ T_unposed_posed[:3, :3].T, np.float32)
 
 
 def validate_training_set(

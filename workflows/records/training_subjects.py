@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float
 
 from coregister.evaluate.evaluation import HeldOutSubject
-from coregister.next_model.training_data import TrainingMesh, TrainingSubject, transfer_to_unposed, unpose
+from coregister.next_model.training_data import TrainingMesh, TrainingSubject, skull_weights, unpose, unposed_expression
 from registration.capture.scan import read_truth
 from registration.frames import compact
 from registration.model.gnm import GNM
@@ -60,7 +60,7 @@ class RegisteredSubjects:
         return ids
 
     def __iter__(self) -> Iterator[TrainingSubject]:
-        model, weights = GNM(self.model), SkullSkin.from_model(self.model).area
+        model, weights = GNM(self.model), skull_weights(self.model)
         numbers = _subject_numbers(self.stabilized_set)
         for name, usable in self.usable.items():
             neutral = load_registration(self.run / name / usable.neutral)
@@ -68,14 +68,14 @@ class RegisteredSubjects:
             expressions = []
             if self.stabilized_set is not None and usable.subject in numbers:
                 meshes = stabilized.read_subject(self.stabilized_set, numbers[usable.subject])
-                confidence = weights * neutral.confidence
-                for folder, label, vertices in zip(meshes.names, meshes.labels, meshes.vertices, strict=True):
+                columns = meshes.names, meshes.labels, meshes.vertices, meshes.T_neutral_expression
+                for folder, label, vertices, T in zip(*columns, strict=True):
                     registration = load_registration(self.run / name / folder)
                     expressions.append(
                         TrainingMesh(
                             name=folder,
                             label=label,
-                            vertices=transfer_to_unposed(vertices, neutral.vertices, unposed, confidence),
+                            vertices=unposed_expression(registration, vertices, T, neutral, model, weights),
                             confidence=registration.confidence,
                             triangles=neutral.triangles,
                             digest=self.inputs[f"{name}/{folder}"],
