@@ -19,6 +19,7 @@ from registration.cranium.complete import CompletedCranium, CraniumCompletion
 from registration.cranium.registered import NEUTRAL, cranium_figure, cranium_note, write_cranium
 from registration.evaluate.audit import audit_penetration
 from registration.evaluate.evaluation import RegistrationEvaluation, evaluate_registration, without_scan
+from registration.evaluate.folds import fold_figures
 from registration.evaluate.plausibility import plausibility
 from registration.evaluate.residuals import far_landmarks
 from registration.evaluate.verdict import judge
@@ -339,7 +340,7 @@ def _evaluate(
     evaluation: RegistrationEvaluation | None = None
     finite = np.isfinite(registration.vertices).all()
     if finite:
-        progress.message("auditing intersections between parts")
+        progress.message("auditing intersections between parts, and folds")
         vertices = registration.vertices - inputs.origin if inputs.origin.any() else registration.vertices
         audit = audit_penetration(vertices, inputs.data, scale=float(registration.scale))
         shown = {view.name for view in comparison.views}
@@ -347,7 +348,12 @@ def _evaluate(
             view.name: view.camera.relative_to(inputs.origin) for view in inputs.capture.views if view.name in shown
         }
         intersections = intersection_figures(audit, vertices, cameras)
-        figures = {"intersections": intersections, **plausibility(registration, inputs.data, inputs.neutral)}
+        folds = fold_figures(vertices, inputs.data, cameras)
+        figures = {
+            "intersections": intersections,
+            "folds": folds,
+            **plausibility(registration, inputs.data, inputs.neutral),
+        }
         if (far := far_landmarks(inputs.capture, registration.landmarks)) is not None:
             figures["far_landmarks"] = far
         registration = replace(registration, figures={**registration.figures, **figures})

@@ -7,6 +7,7 @@ from typing import Literal
 Level = Literal["good", "look", "wrong"]
 LEVEL_TITLES: Mapping[Level, str] = {"good": "good", "look": "look at it", "wrong": "wrong"}
 TOLERANCE_MM = 0.3
+SHARP_FOLD_DEG = 120.0  # turn of the surface at an edge, beyond which it is a fold
 BEYOND_KEY = f"vertices_beyond_{TOLERANCE_MM}mm"  # of a penetration audit's figures
 
 

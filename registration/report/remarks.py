@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from typing import Any, Protocol, runtime_checkable
 
-from registration.evaluate.names import BEYOND_KEY
+from registration.evaluate.names import BEYOND_KEY, SHARP_FOLD_DEG
 from registration.types import METRIC_TITLES, Status
 
 # Pair of the penetration audit -> what lies where, and where to look.
@@ -78,7 +78,20 @@ def remarks(registration: Assessed) -> list[str]:
         for pair, row in figures.get("intersections", {}).get("pairs", {}).items()
         if row.get(BEYOND_KEY)
     ]
+    lines += [
+        _folds(place, row["edges"], row.get("view"))
+        for place, row in figures.get("folds", {}).get("places", {}).items()
+    ]
     return lines
+
+
+def _folds(place: str, count: int, view: str | None) -> str:
+    edges = "1 edge" if count == 1 else f"{count} edges"
+    where = f": look at it in {view}" if view else ""
+    return (
+        f"The skin turns back on itself by more than {SHARP_FOLD_DEG:g} degrees, as the model's does not, "
+        f"at {edges} of the {place}{where}."
+    )
 
 
 def _scan_in_fit(used: Mapping[str, Any]) -> list[str]:
