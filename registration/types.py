@@ -3,6 +3,7 @@ E expression, J joints, L landmarks, K classes. Units: metres, radians, pixels (
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal
 
@@ -183,12 +184,24 @@ class Pixels:
 
     def image(self, values: Float[Tensor, "P D"], background: float = 0.0) -> Float[Tensor, "N H W D"]:
         """Return images with these values at the listed pixels and `background` elsewhere; differentiable."""
-        image = values.new_full((*self.index.shape, values.shape[-1]), background)
-        return image.index_put((self.view.long(), self.y.long(), self.x.long()), values)
+        image = values.new_full((self.index.numel(), values.shape[-1]), background)
+        return image.index_copy(0, self.position, values).view(*self.index.shape, values.shape[-1])
 
     def of_image(self, image: Shaped[Tensor, "N H W *D"]) -> Shaped[Tensor, "P *D"]:
         """Return an image's values at the listed pixels."""
-        return image[self.view.long(), self.y.long(), self.x.long()]
+        return image.reshape(self.index.numel(), *image.shape[3:]).index_select(0, self.position)
+
+    @cached_property
+    def rows_by_view(self) -> tuple[slice, ...]:
+        """The rows of the list that belong to each view."""
+        ends = self.view.bincount(minlength=len(self.cameras)).cumsum(0).tolist()
+        return tuple(slice(first, end) for first, end in zip([0, *ends], ends, strict=False))
+
+    @cached_property
+    def position(self) -> Int[Tensor, "P"]:
+        """The pixels' positions in the images, one after the other, row by row (int64)."""
+        _, height, width = self.index.shape
+        return (self.view.long() * height + self.y) * width + self.x
 
 
 @dataclass(frozen=True, kw_only=True)

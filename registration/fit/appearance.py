@@ -55,8 +55,9 @@ class Appearance:
 
     def _exposure(self, batch: Targets, views: Sequence[int]) -> tuple[Float[Tensor, "P 3"], Float[Tensor, "P 3"]]:
         """Gain and bias of the camera of every pixel."""
-        exposures = self._exposures[list(views)].index_select(0, batch.pixels.view.long())
-        return exposures[..., 0].exp(), exposures[..., 1]
+        gain, bias = self._exposures[list(views)].unbind(-1)
+        gain, bias = (values.index_select(0, batch.pixels.view) for values in (gain.exp(), bias))
+        return gain, bias
 
     @torch.no_grad()
     def fit_exposures(self, rendered: Rendered, batch: Targets, agree: Bool[Tensor, "P"], views: Sequence[int]) -> None:
@@ -68,16 +69,12 @@ class Appearance:
             agree: pixels where both show the same kind of surface.
             views: the indices of these views.
         """
-        weight = (batch.rgb_weight * agree)[:, None]
-        view = batch.pixels.view.long()
-
-        def total(value: Tensor) -> Tensor:
-            return value.new_zeros(len(views), value.shape[1]).index_add(0, view, value)
-
-        count = total(weight).clamp_min(1e-6)
-        r, t = (total(c * weight) / count for c in (rendered.rgb, batch.rgb))
-        variance = total(rendered.rgb.square() * weight) / count - r.square()
-        covariance = total(rendered.rgb * batch.rgb * weight) / count - r * t
+        weight = batch.rgb_weight * agree
+        sums = [_moments(weight[rows], rendered.rgb[rows], batch.rgb[rows]) for rows in batch.pixels.rows_by_view]
+        count, *moments = (torch.stack(values) for values in zip(*sums, strict=True))
+        count = count.clamp_min(1e-6)[:, None]
+        r, t, square, product = (moment / count for moment in moments)
+        variance, covariance = square - r.square(), product - r * t
         gain_prior, bias_prior = (_NOISE / _GAIN_SIGMA) ** 2, (_NOISE / _BIAS_SIGMA) ** 2
         shrink = bias_prior / (1 + bias_prior)
         gain = (covariance + shrink * r * t + gain_prior) / (variance + shrink * r.square() + gain_prior)
@@ -128,3 +125,11 @@ class Appearance:
         mean = total / density.clamp_min(_MIN_DENSITY)[..., None]
         fill = mean[visible].mean(0) if visible.any() else torch.full_like(mean[0, 0], _GREY)
         self.texture, self.has_texture = torch.where(visible[..., None], mean, fill), True
+
+
+def _moments(
+    weight: Float[Tensor, "P"], r: Float[Tensor, "P 3"], t: Float[Tensor, "P 3"]
+) -> tuple[Float[Tensor, ""], Float[Tensor, "3"], Float[Tensor, "3"], Float[Tensor, "3"], Float[Tensor, "3"]]:
+    """Sums of w, w r, w t, w r^2 and w r t."""
+    weighted = weight[:, None] * r
+    return weight.sum(), weighted.sum(0), weight @ t, (weighted * r).sum(0), (weighted * t).sum(0)

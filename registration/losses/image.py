@@ -6,12 +6,13 @@ of pixels that the subject covers, so that the ratio of the losses does not depe
 
 import torch
 from jaxtyping import Bool, Float
-from kornia.metrics import ssim
 from torch import Tensor
 
+from registration.losses.similarity import dissimilarity
 from registration.types import Rendered, Targets
 
 _ENCODING_FLOOR = 1e-4
+_LEAST_DIFFERENCE = 1e-3  # of a class that is compared: interpolation leaves 1e-7
 _HUBER_DELTA = 0.25  # of a mask or class, which the renderer draws as 0 or 1: the gradient fades close to the target
 
 
@@ -36,7 +37,10 @@ def pixel_agreement(rendered: Rendered, targets: Targets, surfaces: list[int]) -
         surfaces: the classes that are surfaces of their own (eyes, mouth interior); their coverages must differ by less
             than 0.5 in total.
     """
-    difference = (rendered.classes[..., surfaces] - targets.classes[..., surfaces]).detach().abs().sum(-1)
+    ours, theirs = rendered.classes.detach(), targets.classes
+    difference = torch.zeros_like(rendered.mask)
+    for surface in surfaces:  # column by column: a selection of columns would be copied
+        difference += (ours[:, surface] - theirs[:, surface]).abs()
     return (rendered.mask > 0.5) & (difference < 0.5)
 
 
@@ -67,11 +71,9 @@ def rgb_ssim(rendered: Rendered, targets: Targets, agree: Bool[Tensor, "P"]) -> 
     """
     # Pixels that are not compared must not affect the windows' statistics: there both images show the target.
     compared = agree & (targets.rgb_weight > 0)
-    colours = torch.where(compared[:, None], srgb_encoded(rendered.rgb), srgb_encoded(targets.rgb))
-    ours, theirs = (targets.pixels.image(c).permute(0, 3, 1, 2) for c in (colours, srgb_encoded(targets.rgb)))
-    dissimilarity = 1 - ssim(ours, theirs, 11).mean(1)
-    weight = targets.pixels.image((targets.rgb_weight * agree)[:, None])[..., 0]
-    return (dissimilarity * weight).sum() / subject_pixels(targets)
+    theirs = srgb_encoded(targets.rgb)
+    ours = torch.where(compared[:, None], srgb_encoded(rendered.rgb), theirs)
+    return dissimilarity(ours, theirs, targets.rgb_weight * agree, targets.pixels) / subject_pixels(targets)
 
 
 def normals(
@@ -113,8 +115,12 @@ def classes(rendered: Rendered, targets: Targets, class_weights: Float[Tensor, "
         targets: coverage c_t of each class in [0, 1], weights w.
         class_weights: v, of each class.
     """
-    difference = (_huber(rendered.classes - targets.classes) * class_weights).sum(-1)
-    return (difference * targets.class_weight * (rendered.mask.detach() > 0.5)).sum() / subject_pixels(targets)
+    counted = (targets.class_weight > 0) & (rendered.mask.detach() > 0.5)
+    differing = (rendered.classes.detach() - targets.classes).abs().amax(-1) > _LEAST_DIFFERENCE
+    rows = (counted & differing).nonzero()[:, 0]  # most pixels show the class that they should
+    ours, theirs, weight = (v.index_select(0, rows) for v in (rendered.classes, targets.classes, targets.class_weight))
+    difference = (_huber(ours - theirs) * class_weights).sum(-1)
+    return (difference * weight).sum() / subject_pixels(targets)
 
 
 def _huber(difference: Float[Tensor, "*S"]) -> Float[Tensor, "*S"]:

@@ -22,7 +22,6 @@ PACKAGES = (
     "numpy",
     "scipy",
     "opencv-contrib-python-headless",
-    "kornia",
 )
 
 

@@ -188,5 +188,10 @@ def directions(camera: Camera) -> Float[np.ndarray, "H W 3"]:
 
 def _area_means(image: Float[np.ndarray, "H W *D"], width: int, height: int) -> Float[np.ndarray, "h w *D"]:
     """An image at a smaller size, averaged over the area of each of its pixels."""
-    resized = cv2.resize(image.astype(np.float32, copy=False), (width, height), interpolation=cv2.INTER_AREA)
-    return np.asarray(resized.reshape(height, width, *image.shape[2:]))  # OpenCV drops an axis of length 1
+    channels = image.reshape(*image.shape[:2], -1).astype(np.float32, copy=False)
+    means = np.empty((height, width, channels.shape[2]), np.float32)
+    for first in range(0, channels.shape[2], 4):  # as many as OpenCV takes
+        four = np.ascontiguousarray(channels[..., first : first + 4])
+        resized = cv2.resize(four, (width, height), interpolation=cv2.INTER_AREA)
+        means[..., first : first + 4] = resized.reshape(height, width, -1)
+    return means.reshape(height, width, *image.shape[2:])

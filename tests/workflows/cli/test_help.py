@@ -20,7 +20,7 @@ from workflows.cli.options import JobOptions
 from workflows.engine.jobs import GPU, REBUILD
 
 CLI = Path(workflows.cli.__file__).parent
-HEAVY = {"torch", "mitsuba", "drjit", "numpy", "scipy", "cv2", "pycolmap", "kornia", "trimesh", "matplotlib", "viser"}
+HEAVY = {"torch", "mitsuba", "drjit", "numpy", "scipy", "cv2", "pycolmap", "trimesh", "matplotlib", "viser"}
 HEAVY |= {"dbos", "sqlalchemy", "jinja2"}
 
 
