@@ -10,17 +10,19 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import torch
 from jaxtyping import Bool, Float, Int
 
 from coregister.next_model.alignment import MIN_SAMPLES_FOR_OUTLIERS, AlignmentSettings, RejectedSubject
+from registration.evaluate.names import SHARP_FOLD_DEG
 from registration.frames import MM_PER_M
+from registration.geometry.folds import Creases, turn_cosines
 from registration.geometry.large_steps import normalised_laplacian
 from registration.geometry.topology import edges
 from registration.model import regions
 from registration.model.gnm_npz import GNMData
 from registration.stabilize.subject_meshes import SkullSkin
 
-_FOLDED = -0.5  # cosine between the normals of neighbouring faces: 120 degrees
 _RARE_QUANTILE = 0.9  # of all samples: the reference of a label with too few samples for a median of its own,
 _RARE_RATIO = 3.0  # and the multiple of it that an outlier exceeds
 
@@ -59,11 +61,8 @@ class ExpressionStatistics:
         self._exterior = regions.exterior(data)
         self._skull = SkullSkin.from_model(data).area
         self._laplacian = normalised_laplacian(data.triangles, len(self._exterior))
-        self._triangles: Int[np.ndarray, "F 3"] = data.triangles[self._exterior[data.triangles].all(1)]
-        surface = edges(self._triangles)
-        self._edges = surface.vertices
-        self._inner = surface.faces[:, 1] >= 0
-        self._faces = surface.faces[self._inner]
+        self._edges = edges(data.triangles[self._exterior[data.triangles].all(1)]).vertices
+        self._creases = Creases.of(data.triangles, data.template_vertex_positions, self._exterior)
 
     def __call__(
         self,
@@ -76,7 +75,7 @@ class ExpressionStatistics:
 
         Skull: rms motion of the skin over it, mm. Stretch: exp of the rms of log edge lengths over the neutral's, edges
         by their length. Roughness: rms of the displacement's Laplacian, mm. Folds: length of the edges that only the
-        expression folds by more than 120 degrees, mm.
+        expression folds by more than SHARP_FOLD_DEG, mm.
 
         Args:
             neutral: metres, in the frame of the displacement.
@@ -98,21 +97,18 @@ class ExpressionStatistics:
         # At the border of observed skin the Laplacian would contain unobserved neighbours.
         inside = observed & (abs(self._laplacian) @ ~observed == 0)
         roughness = (self._laplacian @ displacement)[inside] if inside.any() else np.zeros((1, 3))
-        folds = self._folded(expression) & ~self._folded(neutral)
-        folds &= observed[self._triangles].all(1)[self._faces].all(1)
+        folds = self._folded(expression) & ~self._folded(neutral) & observed[self._creases.faces].all((1, 2))
         surface = [
             skull,
             stretch,
             MM_PER_M * np.sqrt((roughness**2).sum(1).mean()),
-            MM_PER_M * before[self._inner][folds].sum(),
+            MM_PER_M * np.linalg.norm(np.diff(neutral[self._creases.vertices[folds]], axis=1), axis=2).sum(),
         ]
         return np.array(surface + reported)
 
     def _folded(self, vertices: Float[np.ndarray, "V 3"]) -> Bool[np.ndarray, "_"]:
-        a, b, c = (vertices[self._triangles[:, k]] for k in range(3))
-        normals = np.cross(b - a, c - a)
-        normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-300)
-        return np.asarray((normals[self._faces[:, 0]] * normals[self._faces[:, 1]]).sum(1) < _FOLDED)
+        cosines = turn_cosines(torch.as_tensor(vertices), torch.as_tensor(self._creases.faces))
+        return np.asarray(cosines.numpy() < np.cos(np.radians(SHARP_FOLD_DEG)))
 
 
 def reject_expressions(
