@@ -89,10 +89,12 @@ def align_neutrals(
     mirror = data.mirror_indices if mirrored else None
     kept, rejected = np.arange(len(vertices)), list[RejectedSubject]()
     while True:
-        weights = confidence[kept] * stable
-        T, mean, iterations = generalized_procrustes(vertices[kept], weights, template, settings, mirror)
-        pairs = zip(T, vertices[kept], strict=True)
-        aligned = np.stack([transform_points(t, head).astype(np.float32) for t, head in pairs])
+        heads = vertices[kept] if rejected else vertices  # thousands of heads: no copy without need
+        weights = confidence[kept] * stable.astype(np.float32)
+        T, mean, iterations = generalized_procrustes(heads, weights, template, settings, mirror)
+        aligned = np.empty(heads.shape, np.float32)
+        for index, (t, head) in enumerate(zip(T, heads, strict=True)):
+            aligned[index] = transform_points(t, head)
         rows = zip(aligned, confidence[kept], strict=True)
         values = np.stack([statistics(head - mean, observed) for head, observed in rows])
         outlier = find_outlier(values, "the mean", settings)
@@ -101,13 +103,13 @@ def align_neutrals(
         index, reason = outlier
         rejected.append(RejectedSubject(name=names[kept[index]], reason=reason))
         kept = np.delete(kept, index)
-    squares = ((aligned - mean) ** 2).sum(-1)
+    squares = np.stack([((head - mean) ** 2).sum(-1) @ stable for head in aligned])
     return AlignedNeutrals(
         kept=kept,
         vertices=aligned,
         T_model_head=T,
         mean=mean,
-        residual_mm=MM_PER_M * np.sqrt(squares @ stable / stable.sum()),
+        residual_mm=MM_PER_M * np.sqrt(squares / stable.sum()),
         iterations=iterations,
         rejected=tuple(rejected),
     )
@@ -136,16 +138,18 @@ def generalized_procrustes(
     """
     weighted = np.asarray(weights.any(0))
     rows = np.flatnonzero(weighted if mirror is None else weighted | weighted[mirror])
-    source, row_weights = vertices[:, rows].astype(np.float64), weights[:, rows]
+    source, row_weights = vertices[:, rows], weights[:, rows]
     mirror_rows = None if mirror is None else np.searchsorted(rows, mirror[rows])
-    total = row_weights.sum(0)
+    total = row_weights.sum(0, dtype=np.float64)
     target = _symmetric_mean(template[rows], np.ones_like(total), mirror_rows)[0]
     mean, T, iteration = target, np.tile(np.eye(4), (len(vertices), 1, 1)), 0
     while iteration < settings.max_iterations:
         iteration += 1
         T = align(source, mean, row_weights)
-        aligned = np.einsum("ncd,npd->npc", T[:, :3, :3], source) + T[:, None, :3, 3]
-        head_mean = np.einsum("np,npc->pc", row_weights, aligned) / np.maximum(total, _EPSILON)[:, None]
+        head_mean = np.zeros_like(mean)
+        for t, points, weight in zip(T, source, row_weights, strict=True):
+            head_mean += weight[:, None] * transform_points(t, points.astype(np.float64))
+        head_mean /= np.maximum(total, _EPSILON)[:, None]
         new_mean, mean_weights = _symmetric_mean(head_mean, total, mirror_rows)
         T_template_mean = align(new_mean[None], target, mean_weights[None])[0]
         new_mean, T = transform_points(T_template_mean, new_mean), T_template_mean @ T

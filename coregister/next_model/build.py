@@ -18,7 +18,7 @@ import numpy as np
 from jaxtyping import Float
 
 from coregister import joints
-from coregister.next_model import expression, identity
+from coregister.next_model import expression, identity, size
 from coregister.next_model.alignment import AlignedNeutrals, RejectedSubject, align_neutrals
 from coregister.next_model.completion import MissingDataCompletion
 from coregister.next_model.displacement_store import DisplacementStore
@@ -27,11 +27,12 @@ from coregister.next_model.expression_outliers import ExpressionStatistics, reje
 from coregister.next_model.identity import IdentityBasis
 from coregister.next_model.provenance import BuildInputs, build_manifest
 from coregister.next_model.recipes import ModelRecipe, few_registrations
-from coregister.next_model.training_data import TrainingSet, TrainingSubject, check_rank, validate_training_set
+from coregister.next_model.training_data import TrainingSet, TrainingSubject, validate_training_set
 from registration.cranium.auxiliary_model import CraniumModel
 from registration.cranium.complete import CraniumCompletion, CraniumSettings
 from registration.frames import transform_points
 from registration.geometry.rigid import align
+from registration.model import gnm_npz
 from registration.model.gnm_npz import GNMData
 from registration.stabilize.subject_meshes import SkullSkin
 
@@ -52,6 +53,7 @@ def build_model(
     *,
     categories: Mapping[str, str] | None = None,
     cranium: CraniumModel | None = None,
+    prior: GNMData | None = None,
 ) -> BuiltModel:
     """Build the next model. Deterministic.
 
@@ -62,19 +64,23 @@ def build_model(
         categories: every permitted label of an expression -> its category; None: any label.
         cranium: completes unobserved craniums of neutrals, unless the recipe's `completion.cranium` is off; None: the
             previous model does.
+        prior: the model that the identity basis is shrunk towards: of the same topology, and built from none of the
+            subjects, as the first model of a coregistration is in every round. None: the previous one.
 
     Returns:
         The model, in the topology of the previous one, and its provenance.
 
     Raises:
-        InputError: as `validate_training_set`; more components requested than the samples span; a previous model
-            without the official vertex groups.
+        InputError: as `validate_training_set`, `size.check_recipe` and `size.check_disk`; a previous model without the
+            official vertex groups.
     """
     recipe = recipe or few_registrations()
     training = validate_training_set(subjects, previous, labels=None if categories is None else {*categories})
-    _check_rank(training, previous, recipe)
+    prior = previous if prior is None else prior
+    size.check_recipe(len(training.subjects), training.expression_count, prior, recipe)
+    size.check_disk(training.expression_count, len(previous.template_vertex_positions))
     aligned, completed = _align(training, previous, recipe, cranium)
-    head = identity.build_identity_basis(aligned.vertices, previous, recipe.identity, recipe.memory_gb)
+    head = identity.build_identity_basis(aligned.vertices, previous, recipe.identity, recipe.memory_gb, prior)
     data = _with_identity(previous, head)
     with DisplacementStore(training.expression_count, len(head.template)) as store:
         samples = _store_expressions(subjects, training, aligned, previous, store, recipe)
@@ -85,6 +91,7 @@ def build_model(
             data = _with_expressions(data, bases, coefficients)
     inputs = BuildInputs(
         training=training,
+        prior=gnm_npz.content_hash(prior),
         aligned=aligned,
         head=head,
         bases=bases,
@@ -109,20 +116,10 @@ class _TrainingSamples:
     completed: int  # samples with missing data
 
 
-def _check_rank(training: TrainingSet, previous: GNMData, recipe: ModelRecipe) -> None:
-    head_components = len(previous.vertex_identity_basis) - len(identity.transfer_components(previous))
-    check_rank(
-        len(training.subjects),
-        recipe.identity.max_components,
-        previous=head_components if recipe.identity.shrinkage != 0 else 0,
-        mirrored=recipe.identity.mirrored,
-    )
-
-
 def _align(
     training: TrainingSet, previous: GNMData, recipe: ModelRecipe, cranium: CraniumModel | None
 ) -> tuple[AlignedNeutrals, int]:
-    """Completed and aligned neutrals, and the number of those with missing data."""
+    """Completed and aligned neutrals, and the number of those with missing data. Overwrites the training neutrals."""
     stable, template = SkullSkin.from_model(previous).area, previous.template_vertex_positions.astype(np.float64)
     T_model_head = align(training.neutrals, template, training.confidence * stable)
     complete = MissingDataCompletion(previous, previous.vertex_identity_basis, recipe.completion)
@@ -130,8 +127,9 @@ def _align(
     if cranium is not None and recipe.completion.cranium == "model":
         settings = CraniumSettings(min_confidence=recipe.completion.min_confidence)
         of_cranium = CraniumCompletion(previous, cranium, settings)
-    heads, completed = np.empty_like(training.neutrals), 0
-    rows = zip(T_model_head, training.neutrals, training.confidence, strict=True)
+    # Completed heads take the place of the neutrals, which nobody needs afterwards: thousands are gigabytes.
+    heads, completed = training.neutrals, 0
+    rows = zip(T_model_head, heads, training.confidence, strict=True)
     for index, (T, vertices, confidence) in enumerate(rows):
         head, known = transform_points(T, vertices.astype(np.float64)), confidence
         if of_cranium is not None and (whole := of_cranium(head, confidence)) is not None:

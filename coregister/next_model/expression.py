@@ -1,6 +1,7 @@
 """Expression basis by region: uncentred principal components under soft masks [GNM, Head Expression];
 docs/algorithms.md, "Expression basis"."""
 
+import itertools
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 
@@ -14,6 +15,8 @@ from registration.geometry import pca
 from registration.geometry.topology import vertex_areas
 from registration.model import regions
 from registration.model.gnm_npz import GNMData
+
+_BLOCK = 256  # samples whose coefficients are computed together
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -44,6 +47,7 @@ class RegionBasis:
     variance_ratio: float  # of the region's energy, that the components explain
     shrinkage: float  # as used
     method: str  # of the principal components
+    missed: float  # fraction of the energy that as many other components could explain more, at most; 0: exact
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -134,7 +138,14 @@ def coefficient_statistics(
     skin = regions.skin(data)
     flat = np.concatenate([region.basis[:, skin].reshape(len(region.basis), -1) for region in bases.values()])
     inverse = np.linalg.pinv(flat @ flat.T, rcond=1e-12, hermitian=True)
-    rows = np.stack([inverse @ (flat @ sample[skin].ravel()) for sample in displacements])
+    axes = (inverse @ flat).astype(np.float32).T
+    blocks = iter(displacements)
+    rows = np.concatenate(
+        [
+            np.stack([sample[skin].ravel() for sample in block]).astype(np.float32) @ axes
+            for block in iter(lambda: list(itertools.islice(blocks, _BLOCK)), [])
+        ]
+    ).astype(np.float64)
     fractions = weights / weights.sum()
     mean = fractions @ rows
     deviations = (rows - mean) * np.sqrt(fractions)[:, None]
@@ -197,4 +208,5 @@ def _region_basis(
         variance_ratio=principal.variance_ratio,
         shrinkage=covariance.shrinkage,
         method=principal.method,
+        missed=principal.missed,
     )

@@ -1,4 +1,4 @@
-"""Identity basis: centred principal components of aligned neutral heads, shrunk towards the previous model
+"""Identity basis: centred principal components of aligned neutral heads, shrunk towards a prior model
 [GNM, Head Identity]; docs/algorithms.md, "Covariance shrinkage"."""
 
 from collections.abc import Iterator, Mapping
@@ -8,7 +8,12 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from coregister.next_model import eyelids
-from coregister.next_model.shrinkage import SHRINKAGE_GRID, ShrunkCovariance, cross_validated_shrinkage
+from coregister.next_model.shrinkage import (
+    SHRINKAGE_GRID,
+    SampleParts,
+    ShrunkCovariance,
+    cross_validated_shrinkage,
+)
 from coregister.region_masks import FLIP, mirrored
 from registration.geometry import pca
 from registration.geometry.rigid import fit_twists, motion_fields
@@ -19,6 +24,7 @@ from registration.stabilize.subject_meshes import SkullSkin
 
 _FALLBACK_SHRINKAGE = 0.2  # where there are too few heads to cross-validate
 _MIN_HEADS = 3  # for cross-validation
+_COORDINATES = 400  # at least, in which cross-validation compares models
 _COMPARED_COMPONENTS = 20  # of the models that cross-validation compares, unless `max_components` says
 _ORAL_WEIGHT = 1e-3  # of teeth and tongue in the components: neutrals mostly occlude them
 
@@ -30,7 +36,7 @@ class IdentitySettings:
     Attributes:
         variance_ratio: fraction of the variance that the components must explain, at least.
         max_components: of the basis; None: as many as `variance_ratio` needs.
-        shrinkage: fraction of the variance from the previous model, 0 to 1; None: the value with the smallest residual
+        shrinkage: fraction of the variance from the prior model, 0 to 1; None: the value with the smallest residual
             of excluded subjects (`shrinkage.cross_validated_shrinkage`).
         by_area: weight vertices by area instead of equally.
         mirrored: each head counts one half, its mirror image the other.
@@ -58,15 +64,20 @@ class IdentityBasis:
     head_count: int
     mirrored: bool  # every head has its mirror image beside it
     method: str  # of the principal components
+    missed: float  # fraction of the variance that as many other components could explain more, at most; 0: exact
 
 
 def build_identity_basis(
-    heads: Float[np.ndarray, "N V 3"], data: GNMData, settings: IdentitySettings | None = None, memory_gb: float = 4.0
+    heads: Float[np.ndarray, "N V 3"],
+    data: GNMData,
+    settings: IdentitySettings | None = None,
+    memory_gb: float = 4.0,
+    prior: GNMData | None = None,
 ) -> IdentityBasis:
     """Return template and identity basis of aligned neutrals: components of skin, teeth and tongue, then eyeballs.
 
     The covariance is (1 - p) C + p (tr C / tr P) P (`ShrunkCovariance`): C of the heads about their mean, with N - 1;
-    P = B'B of the previous model's identity components without the rigid motions that alignment removes from heads.
+    P = B'B of the prior model's identity components without the rigid motions that alignment removes from heads.
 
     With `settings.mirrored` the mean is symmetric, and C and P are half those of heads and components and half those of
     their mirror images, since asymmetry is equally likely in both directions. This equals the covariance of symmetric
@@ -82,6 +93,9 @@ def build_identity_basis(
         data: the previous model.
         settings: of the basis.
         memory_gb: available for one covariance matrix, or for what replaces it.
+        prior: the model to shrink towards, of the same topology, built from none of these heads: from one that was
+            built from them, excluded heads would not be excluded, and the share chosen would climb from round to round.
+            None: the previous one.
 
     Raises:
         InputError: the previous model has no vertex groups of eyes.
@@ -93,17 +107,16 @@ def build_identity_basis(
     scale = _vertex_scales(data, settings)[rows]
     head_mean = heads.mean(0, dtype=np.float64)
     mean = head_mean[rows] if mirror is None else (head_mean[rows] + head_mean[mirror] * FLIP) / 2
-    previous = _previous_components(data, rows, settings.mirrored)
-    previous = (previous * scale).reshape(len(previous), 3 * len(rows))
-    deviations = _Deviations(heads, rows, mirror, mean, scale)
-    shrinkage, scores = _choose_shrinkage(deviations, len(heads), previous, settings, int(regions.skin(data).sum()))
-    weights = np.ones(len(heads)) if mirror is None else np.repeat((1, 1 - 1 / len(heads)), len(heads))
-    covariance = ShrunkCovariance(deviations, weights, len(heads) - 1, previous, shrinkage)
+    components = _prior_components(data if prior is None else prior, rows, settings.mirrored)
+    samples = _Samples(heads, rows, mirror, mean, scale, (components * scale).reshape(len(components), -1))
+    shrinkage, scores = _choose_shrinkage(samples, settings, int(regions.skin(data).sum()), memory_gb)
+    covariance = samples.covariance(shrinkage)
     principal = pca.principal_components(
         covariance,
         centred=False,
         variance_ratio=settings.variance_ratio,
         max_components=settings.max_components,
+        groups=samples.groups[: len(covariance)],
         memory_gb=memory_gb,
     )
     basis = np.zeros((len(principal.variance), *data.template_vertex_positions.shape))
@@ -123,6 +136,7 @@ def build_identity_basis(
         head_count=len(heads),
         mirrored=settings.mirrored,
         method=principal.method,
+        missed=principal.missed,
     )
 
 
@@ -145,8 +159,8 @@ def _vertex_scales(data: GNMData, settings: IdentitySettings) -> Float[np.ndarra
     return (np.sqrt(np.maximum(area, 0.01 * mean) / mean) * np.where(skin, 1, _ORAL_WEIGHT))[:, None]
 
 
-def _previous_components(data: GNMData, rows: Int[np.ndarray, "R"], both_parts: bool) -> Float[np.ndarray, "K R 3"]:
-    """The previous model's components of the head in these rows, each without the rigid motion of the stable skin;
+def _prior_components(data: GNMData, rows: Int[np.ndarray, "R"], both_parts: bool) -> Float[np.ndarray, "K R 3"]:
+    """A model's components of the head in these rows, each without the rigid motion of the stable skin;
     with `both_parts` their symmetric and antisymmetric parts."""
     basis = data.vertex_identity_basis[_moves_skin(data)].astype(np.float64)
     stable = SkullSkin.from_model(data).area
@@ -159,8 +173,9 @@ def _previous_components(data: GNMData, rows: Int[np.ndarray, "R"], both_parts: 
     return np.concatenate([basis + mirror_images, basis - mirror_images])[:, rows] / 2
 
 
-class _Deviations:
-    """Scaled deviations of heads from the mean in `rows`; with `mirror`, symmetric, then antisymmetric parts."""
+class _Samples:
+    """Scaled deviations of heads from the mean in `rows`, and the prior's components; with `mirror`, symmetric, then
+    antisymmetric parts of both."""
 
     def __init__(
         self,
@@ -169,8 +184,21 @@ class _Deviations:
         mirror: Int[np.ndarray, "R"] | None,
         mean: Float[np.ndarray, "R 3"],
         scale: Float[np.ndarray, "R 1"],
+        prior: Float[np.ndarray, "K D"],
     ):
         self._heads, self._rows, self._mirror, self._mean, self._scale = heads, rows, mirror, mean, scale
+        self.prior, self.head_count = prior, len(heads)
+        parts = 1 if mirror is None else 2
+        # Symmetric and antisymmetric parts are orthogonal.
+        self.groups = np.concatenate(
+            [np.repeat(np.arange(parts), n // parts) for n in (parts * len(heads), len(prior))]
+        )
+
+    def covariance(self, shrinkage: float) -> ShrunkCovariance:
+        """Return the mixture of heads and prior."""
+        count = self.head_count
+        weights = np.ones(count) if self._mirror is None else np.repeat((1, 1 - 1 / count), count)
+        return ShrunkCovariance(self, weights, count - 1, self.prior, shrinkage)
 
     def __iter__(self) -> Iterator[Float[np.ndarray, "D"]]:
         for sign in (0,) if self._mirror is None else (1, -1):
@@ -183,26 +211,35 @@ class _Deviations:
 
 
 def _choose_shrinkage(
-    deviations: _Deviations,
-    head_count: int,
-    previous: Float[np.ndarray, "K D"],
-    settings: IdentitySettings,
-    skin_count: int,
+    samples: _Samples, settings: IdentitySettings, skin_count: int, memory_gb: float
 ) -> tuple[float, dict[float, float]]:
-    """The shrinkage, and the scores it was chosen by. Holds all samples in memory, in float32."""
+    """The shrinkage, and the scores it was chosen by.
+
+    Models are compared in the coordinates of an even mixture's first components, many more than the models have.
+    """
     if settings.shrinkage is not None:
         return settings.shrinkage, {}
-    if head_count < _MIN_HEADS or not previous.any():
+    if samples.head_count < _MIN_HEADS or not samples.prior.any():
         return _FALLBACK_SHRINKAGE, {}
-    rows = np.concatenate([np.stack([d.astype(np.float32) for d in deviations]), previous.astype(np.float32)])
-    gram = np.zeros((len(rows), len(rows)))
-    for first in range(0, rows.shape[1], 4096):
-        block = rows[:, first : first + 4096].astype(np.float64)
-        gram += block @ block.T
-    parts = 2 if settings.mirrored else 1
-    members = np.split(np.arange(parts * head_count), parts)
     components = settings.max_components or _COMPARED_COMPONENTS
-    rms = cross_validated_shrinkage(gram, members, (True, False)[:parts], components)
+    mixture = pca.principal_components(
+        samples.covariance(0.5),
+        centred=False,
+        max_components=max(_COORDINATES, 3 * components),
+        groups=samples.groups,
+        memory_gb=memory_gb,
+    )
+    axes = (mixture.components / np.sqrt(mixture.variance)[:, None]).T
+    rows = [(deviation @ axes, float(deviation @ deviation)) for deviation in samples]
+    kinds = [
+        SampleParts(
+            coordinates=np.stack([coordinates for coordinates, _ in part]),
+            squares=np.array([square for _, square in part]),
+            centred=number == 0,
+        )
+        for number, part in enumerate(rows[k : k + samples.head_count] for k in range(0, len(rows), samples.head_count))
+    ]
+    rms = cross_validated_shrinkage(kinds, samples.prior @ axes, float((samples.prior**2).sum()), components)
     rms /= np.sqrt(skin_count)
     return SHRINKAGE_GRID[int(rms.argmin())], dict(zip(SHRINKAGE_GRID, rms.tolist(), strict=True))
 

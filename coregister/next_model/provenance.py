@@ -33,6 +33,7 @@ class BuildInputs:
     """Data and intermediate results of a build that its manifest describes. M expressions."""
 
     training: TrainingSet
+    prior: str  # content id of the model that the identity basis is shrunk towards
     aligned: AlignedNeutrals
     head: IdentityBasis
     bases: Mapping[str, RegionBasis]  # of expressions; empty: the previous model's basis is kept
@@ -53,7 +54,7 @@ def build_manifest(inputs: BuildInputs, previous: GNMData, data: GNMData, recipe
         data: the built model.
         recipe: the resolved settings.
     """
-    digests = {**inputs.training.digests, "previous": gnm_npz.content_hash(previous)}
+    digests = {**inputs.training.digests, "previous": gnm_npz.content_hash(previous), "prior": inputs.prior}
     config = {**hashing.to_jsonable(recipe), "categories": inputs.categories}
     manifest: dict[str, Any] = hashing.to_jsonable(
         {
@@ -154,6 +155,7 @@ def _components(basis: IdentityBasis | RegionBasis, variance: np.ndarray) -> dic
         "share_kept": basis.variance_ratio,
         "share_previous": basis.shrinkage,
         "method": basis.method,
+        "could_miss": basis.missed,
         "variance_mm2": MM_PER_M**2 * variance,
     }
 

@@ -3,6 +3,8 @@
 import numpy as np
 from jaxtyping import Float
 
+_SETS = 64  # aligned together: thousands of heads need no memory beside their own
+
 
 def align(
     source: Float[np.ndarray, "S P 3"], target: Float[np.ndarray, "P 3"], weights: Float[np.ndarray, "S P"]
@@ -17,6 +19,9 @@ def align(
     Returns:
         T_target_source of each set; the identity for a set whose weights are all zero.
     """
+    if len(source) > _SETS:
+        batches = (slice(k, k + _SETS) for k in range(0, len(source), _SETS))
+        return np.concatenate([align(source[batch], target, weights[batch]) for batch in batches])
     weights = weights.astype(np.float64)
     total = weights.sum(1)
     share = weights / np.where(total > 0, total, 1)[:, None]

@@ -69,7 +69,7 @@ def test_no_module_has_the_name_of_a_standard_library_module_and_no_benchmark_im
     [
         ("farm_queue", ("--captures", "5", "--seconds", "1", "--settle", "0"), "complete, 2 workers"),
         ("landmark_fit", ("--only", "schur", "--count", "2"), "2 of 2 limits kept"),
-        ("model_building", ("--samples", "60", "--components", "5"), "peak_gb"),
+        ("model_building", ("--neutrals", "6", "--expressions", "8"), "peak_gb"),
         ("renderer", ("--case", "2x48", "--stock"), "stock 2x256"),
         ("service", ("--captures", "60", "--requests", "2", "--viewers", "3", "--seconds", "2"), "0 lost of"),
         ("sampler", ("--only", "collapse", "--count", "400", "--steps", "60"), "status: collapsed"),

@@ -130,7 +130,7 @@ async def coregister(scope: "FlowScope", *, plan: str) -> dict[str, Any]:
                 table.BUILD,
                 run=run,
                 names=training,
-                made=gate | ({} if stabilized.out is None else {"stabilized": stabilized.out}),
+                made=gate | {"first": str(record.model)} | _if_any("stabilized", stabilized.out),
                 dataset=str(record.dataset),
                 previous=model,
                 out=f"{folder}/model",
@@ -201,6 +201,10 @@ async def _end_round(
     value = await _run_step(scope, f"{name}/decide", table.END_ROUND, **arguments)
     verdict: StoppingVerdict = structure(value, StoppingVerdict, where=f"{name}/decide", title="verdict")
     return verdict
+
+
+def _if_any(kind: str, folder: str | None) -> dict[str, str]:
+    return {} if folder is None else {kind: folder}
 
 
 def _anatomy(record: CoregistrationPlan) -> dict[str, Any]:

@@ -8,6 +8,7 @@ from coregister.anatomy.assemble import check_structures
 from coregister.anatomy.part_basis import PartName
 from coregister.evaluate.linear_fit import identity_part
 from coregister.next_model.recipes import DEFAULT_MODEL_RECIPE, ModelRecipe, load_model_recipe
+from coregister.next_model.size import check_recipe
 from coregister.stopping_rule import StoppingRule
 from registration.errors import InputError
 from registration.model import gnm_npz
@@ -68,8 +69,9 @@ def make_plan(
         rounds: model building, evaluation and the stopping rule.
 
     Raises:
-        InputError: `read_dataset`, `split` or `check_out` refuses; there is no such recipe or model; more components
-            than there can be; the model lacks the structure of a part to regenerate. Nothing is computed or written.
+        InputError: `read_dataset`, `split`, `check_recipe` or `check_out` refuses; there is no such recipe or model;
+            more components than there can be; the model lacks the structure of a part to regenerate. Nothing is
+            computed or written.
     """
     options = to_job(options)
     source = read_dataset(dataset)
@@ -112,6 +114,8 @@ def _check(plan: CoregistrationPlan, data: GNMData, requested: bool) -> None:
             expected="whole numbers from 1 in increasing order",
             got=plan.components,
         )
+    captures = [len(plan.captures[name]) for name in plan.split.training]
+    check_recipe(len(captures), sum(captures) - len(captures), data, plan.model_recipe)
     available = len(identity_part(data).basis)
     kept = available if plan.model_recipe.identity.shrinkage != 0 else 0
     limit = min(available, len(plan.split.training) - 1 + kept)

@@ -50,8 +50,10 @@ def build_next_model(
     Args:
         run: folder of the subject folders.
         names: of the subject folders to use.
-        made: folders of what was made of the registrations: "stabilized", without which neutrals alone are used, and
-            "gate", the gate's record, without which all usable registrations are used.
+        made: what else the build takes, by kind: "stabilized", the folder without which neutrals alone are used;
+            "gate", the folder of the gate's record, without which all usable registrations are used; "first", the file
+            of the coregistration's first model, which has seen none of the subjects: identity is shrunk towards it,
+            without it towards the previous model.
         dataset: its folder, for tags and categories.
         previous: file of the previous model.
         out: folder of the model.
@@ -81,7 +83,9 @@ def build_next_model(
     recipe = dict(recipe)
     anatomy = recipe.pop("anatomy", None)
     settings = ModelRecipe.from_json(recipe, where="the job's recipe")
-    inputs = {**subjects.inputs, "previous": gnm_npz.content_hash(data)}
+    first = made.get("first", previous)
+    prior = data if first == previous else gnm_npz.read(Path(first))
+    inputs = {**subjects.inputs, "previous": gnm_npz.content_hash(data), "prior": gnm_npz.content_hash(prior)}
     cranium = auxiliary_model.find(Path(previous), data) if settings.completion.cranium == "model" else None
     if cranium is not None:
         inputs["cranium"] = hashing.hash_fields(cranium)
@@ -95,7 +99,7 @@ def build_next_model(
     if (existing := product.find()) is not None and _is_model(folder / MODEL, existing.content_id):
         return replace(existing, model=str(folder / MODEL)).to_json()
     (progress or NullProgress()).message(f"building a model from {len(subjects.usable)} subjects")
-    built = build_model(subjects, data, settings, categories=source.categories, cranium=cranium)
+    built = build_model(subjects, data, settings, categories=source.categories, cranium=cranium, prior=prior)
     if anatomy:
         regenerated = AnatomySettings(parts=tuple(anatomy["parts"]), seed=anatomy["seed"])
         (progress or NullProgress()).message(f"regenerating {', '.join(regenerated.parts)}")

@@ -3,10 +3,10 @@
 import json
 from dataclasses import fields, replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
-import torch
 
 from bench.support.population import true_neutrals
 from coregister.anatomy.cranium_model import build_cranium_model, under_hair
@@ -14,16 +14,16 @@ from coregister.first_model.build import TargetDisplacements
 from coregister.next_model import provenance
 from coregister.next_model.alignment import align_neutrals
 from coregister.next_model.build import BuiltModel, _align, build_model
+from coregister.next_model.expression import ExpressionSettings
 from coregister.next_model.recipes import ModelRecipe, few_registrations, load_model_recipe, true_meshes
-from coregister.next_model.training_data import TrainingSubject, unpose, validate_training_set
+from coregister.next_model.size import check_disk, check_recipe
+from coregister.next_model.training_data import TrainingSubject, validate_training_set
 from registration.cranium.auxiliary_model import CraniumModel
 from registration.errors import InputError
-from registration.frames import axis_angle_to_matrix, transform_points
+from registration.frames import transform_points
 from registration.geometry import rigid
 from registration.model import gnm_npz, landmarks, regions
-from registration.model.gnm import GNM
 from registration.model.gnm_npz import AXES, GNMData
-from registration.types import Parameters, Registration
 from tests.conftest import SHARED, needs_shared
 from tests.coregister.next_model import samples
 
@@ -137,7 +137,7 @@ def test_the_manifest_contains_inputs_settings_and_metrics(built: BuiltModel, fi
     assert manifest == built.manifest
     assert [s["subject"] for s in manifest["subjects"]] == [s.name for s in subjects] and manifest["rejected"] == []
     assert {s["expressions"] for s in manifest["subjects"]} == {4} and manifest["subjects"][0]["weight_of_each"] == 0.25
-    assert manifest["inputs"]["previous"] == gnm_npz.content_hash(model) and len(manifest["inputs"]) == 8 * 5 + 1
+    assert manifest["inputs"]["previous"] == gnm_npz.content_hash(model) and len(manifest["inputs"]) == 8 * 5 + 2
     assert manifest["identity"]["share_previous"] == 0.2 and 0.99 <= manifest["identity"]["share_kept"] <= 1
     assert manifest["identity"]["samples"] == 16 and manifest["identity"]["weight_of_each"] == 0.5
     assert manifest["identity"]["shares_tried_mm"] == {} and manifest["config"]["identity"]["mirrored"] is True
@@ -196,6 +196,21 @@ def test_shrinkage_is_cross_validated_and_reported(subjects, model):
     assert manifest["components"] == 10 and 0 < scores[manifest["share_previous"]] < scores[0.0] < 10
 
 
+def test_the_share_chosen_does_not_climb_from_round_to_round(subjects, model):
+    """Three rounds with the same registrations: the prior has seen none of the subjects, the previous models have."""
+    neutrals = [replace(subject, expressions=()) for subject in subjects]
+    previous, shares, leaking = model, [], []
+    for _ in range(3):
+        built = build_model(neutrals, previous, with_identity(max_components=10), prior=model)
+        leaking.append(build_model(neutrals, previous, with_identity(max_components=10)).manifest["identity"])
+        shares.append(built.manifest["identity"]["share_previous"])
+        assert built.manifest["inputs"]["prior"] == gnm_npz.content_hash(model)
+        previous = built.data
+    print(shares, [identity["share_previous"] for identity in leaking])
+    assert max(shares) - min(shares) <= 0.05 + 1e-9 and shares[0] == leaking[0]["share_previous"]
+    assert leaking[2]["share_previous"] > shares[2]  # what it would do towards the previous model
+
+
 def test_without_expressions_the_previous_basis_is_kept(subjects, model):
     built = build_model([replace(subject, expressions=()) for subject in subjects], model)
     assert np.array_equal(built.data.expression_basis, model.expression_basis)
@@ -226,9 +241,9 @@ def test_an_auxiliary_model_completes_unobserved_craniums(head_assembly, subject
     for subject in subjects:
         vertices = subject.neutral.vertices + np.float32(0.05) * hair[:, None]
         partial.append(replace(subject, neutral=samples.mesh("neutral", vertices, model, ~hair), expressions=()))
-    training = validate_training_set(partial, model)
 
     def error_mm(recipe: ModelRecipe, cranium: CraniumModel | None) -> float:
+        training = validate_training_set(partial, model)
         aligned, completed = _align(training, model, recipe, cranium)
         assert completed == len(subjects)
         truths = np.stack([subjects[k].neutral.vertices for k in aligned.kept]).astype(np.float64)
@@ -331,43 +346,20 @@ def test_too_few_samples_are_refused(subjects, model):
         build_model([subjects[0], subjects[0]], model)
 
 
-def test_unposing_a_registration(model):
-    function, rng = GNM(model), np.random.default_rng(0)
-    pose = function.neutral()
-    parameters = replace(
-        pose,
-        identity=torch.as_tensor(rng.normal(size=len(pose.identity)).astype(np.float32)),
-        rotations=torch.as_tensor(rng.normal(0, 0.2, pose.rotations.shape).astype(np.float32)),
-        translation=torch.tensor([0.1, -1.0, 0.3]),
-        scale=torch.tensor(1.1),
-    )
-    offsets = torch.as_tensor(rng.normal(0, 1e-3, model.template_vertex_positions.shape).astype(np.float32))
-    at_rest = replace(parameters, rotations=pose.rotations, translation=pose.translation)
-    registration = _registration(parameters, offsets, function)
-    unposed = unpose(registration, function)
-    np.testing.assert_allclose(unposed, function(at_rest, offsets).numpy(), atol=1e-7)
-    # Posing it again gives the registration.
-    joints = parameters.scale * function.joints(parameters.identity)
-    again = function.pose(torch.as_tensor(unposed), joints, axis_angle_to_matrix(parameters.rotations))
-    np.testing.assert_allclose(again + parameters.translation, registration.vertices, atol=2e-6)
-
-
-def _registration(parameters: Parameters, offsets: torch.Tensor, function: GNM) -> Registration:
-    vertices = function(parameters, offsets).numpy()
-    arrays = {name: getattr(parameters, name).numpy() for name in ("identity", "expression", "rotations")}
-    return Registration(
-        status="converged",
-        reason="",
-        **arrays,
-        translation=parameters.translation.numpy(),
-        scale=parameters.scale.numpy(),
-        offsets=offsets.numpy(),
-        vertices=vertices,
-        triangles=function.triangles.numpy().astype(np.int32),
-        confidence=np.ones(len(vertices), np.float32),
-        texture=np.zeros((2, 2, 3), np.float32),
-        corner_uvs=np.zeros((len(function.triangles), 3, 2), np.float32),
-    )
+def test_what_cannot_be_built_is_refused_before_it_is_registered(model, monkeypatch):
+    paper = 5000, 150_000
+    check_recipe(*paper, model, few_registrations())  # a sketch
+    with pytest.raises(InputError, match="no room") as caught:
+        many = ExpressionSettings(max_components={"lower_face_region": 4000})
+        check_recipe(*paper, model, replace(few_registrations(), expressions=many))
+    assert "memory_gb" in caught.value.where and "4000 components" in caught.value.expected
+    with pytest.raises(InputError, match="rank"):
+        check_recipe(4, 0, model, with_identity(max_components=8, shrinkage=0.0))
+    check_disk(10, len(model.template_vertex_positions))
+    monkeypatch.setattr("shutil.disk_usage", lambda _: SimpleNamespace(free=10**9))
+    with pytest.raises(InputError, match="disk") as caught:
+        check_disk(150_000, len(model.template_vertex_positions))
+    assert "39.4 GB" in caught.value.expected and "TMPDIR" in caught.value.fix
 
 
 @needs_shared

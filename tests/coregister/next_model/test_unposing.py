@@ -9,12 +9,13 @@ from scipy.spatial.transform import Rotation
 
 from coregister.next_model.expression import RegionBasis, regional_bases
 from coregister.next_model.training_data import TrainingSubject, skull_weights, unpose, unposed_expression
+from registration.frames import axis_angle_to_matrix
 from registration.model import regions
 from registration.model.gnm import GNM
 from registration.model.gnm_npz import GNMData
 from registration.stabilize.automatic import AlignedExpressions, stabilize_subject
 from registration.stabilize.subject_meshes import SkullSkin, SubjectMeshes
-from registration.types import Registration
+from registration.types import Parameters, Registration
 from tests.coregister.next_model import samples
 
 LABELS = ("smile", "jaw_open", "viseme_ee", "pucker", "brows_up", "sadness")
@@ -32,29 +33,32 @@ def subjects(head_assembly, model) -> list[TrainingSubject]:
     return samples.subjects(head_assembly, model, range(800, 804), LABELS)
 
 
-def _registration(vertices: np.ndarray, turn: np.ndarray, function: GNM, model: GNMData, seed: int) -> Registration:
+def _posed(vertices: np.ndarray, turn: np.ndarray, function: GNM, model: GNMData, seed: int) -> Registration:
     """A registration whose bind pose has these vertices, the head turned on its neck, the body anywhere."""
     rng = np.random.default_rng(seed)
     pose = function.neutral()
     rotations = pose.rotations.clone()
     rotations[HEAD] = torch.as_tensor(turn)
     rotations[0] = torch.as_tensor(rng.normal(0, 0.2, 3))
-    offsets = torch.as_tensor(vertices - model.template_vertex_positions)
     parameters = replace(pose, rotations=rotations, translation=torch.as_tensor(rng.normal(0, 0.1, 3)).float())
+    return _registration(parameters, torch.as_tensor(vertices - model.template_vertex_positions), function)
+
+
+def _registration(parameters: Parameters, offsets: torch.Tensor, function: GNM) -> Registration:
+    vertices = function(parameters, offsets).numpy()
+    arrays = {name: getattr(parameters, name).numpy() for name in ("identity", "expression", "rotations")}
     return Registration(
         status="converged",
         reason="",
-        identity=pose.identity.numpy(),
-        expression=pose.expression.numpy(),
-        rotations=rotations.numpy(),
+        **arrays,
         translation=parameters.translation.numpy(),
-        scale=pose.scale.numpy(),
+        scale=parameters.scale.numpy(),
         offsets=offsets.numpy(),
-        vertices=function(parameters, offsets).numpy(),
-        triangles=model.triangles,
+        vertices=vertices,
+        triangles=function.triangles.numpy().astype(np.int32),
         confidence=np.ones(len(vertices), np.float32),
         texture=np.zeros((2, 2, 3), np.float32),
-        corner_uvs=np.zeros((len(model.triangles), 3, 2), np.float32),
+        corner_uvs=np.zeros((len(function.triangles), 3, 2), np.float32),
     )
 
 
@@ -65,7 +69,7 @@ def _turned(
     rng = np.random.default_rng([int(subject.name[-4:]), 3])
     turns = np.radians(TURN_DEG) * rng.normal(size=(1 + len(LABELS), 3)) / np.sqrt(3)
     neutral, *others = [
-        _registration(mesh.vertices, turn, function, model, seed)
+        _posed(mesh.vertices, turn, function, model, seed)
         for seed, (mesh, turn) in enumerate(zip((subject.neutral, *subject.expressions), turns, strict=True))
     ]
     meshes = SubjectMeshes(
@@ -133,3 +137,24 @@ def test_turns_of_the_neck_do_not_enter_the_lower_face(subjects, function, model
         shares[name] = _neck_energy(basis, model)
     print(shares)
     assert shares["unposed"] <= 0.02
+
+
+def test_unposing_a_registration(model):
+    function, rng = GNM(model), np.random.default_rng(0)
+    pose = function.neutral()
+    parameters = replace(
+        pose,
+        identity=torch.as_tensor(rng.normal(size=len(pose.identity)).astype(np.float32)),
+        rotations=torch.as_tensor(rng.normal(0, 0.2, pose.rotations.shape).astype(np.float32)),
+        translation=torch.tensor([0.1, -1.0, 0.3]),
+        scale=torch.tensor(1.1),
+    )
+    offsets = torch.as_tensor(rng.normal(0, 1e-3, model.template_vertex_positions.shape).astype(np.float32))
+    at_rest = replace(parameters, rotations=pose.rotations, translation=pose.translation)
+    registration = _registration(parameters, offsets, function)
+    unposed = unpose(registration, function)
+    np.testing.assert_allclose(unposed, function(at_rest, offsets).numpy(), atol=1e-7)
+    # Posing it again gives the registration.
+    joints = parameters.scale * function.joints(parameters.identity)
+    again = function.pose(torch.as_tensor(unposed), joints, axis_angle_to_matrix(parameters.rotations))
+    np.testing.assert_allclose(again + parameters.translation, registration.vertices, atol=2e-6)

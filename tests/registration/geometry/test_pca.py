@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from registration.geometry.pca import dense_components, principal_components
+from registration.geometry.pca import dense_components, principal_components, sketch_gb
 
 
 @pytest.mark.parametrize("count, size", [(30, 200), (300, 20)], ids=["products of samples", "products of entries"])
@@ -41,18 +41,14 @@ def _faces(rng: np.random.Generator, count: int = 180, size: int = 240) -> np.nd
     return ((rng.normal(size=(count, 60)) * scales) @ axes + 0.1 * axes[0]).astype(np.float32)
 
 
-@pytest.mark.parametrize("weighted", [False, True], ids=["alike", "weighted"])
 @pytest.mark.parametrize("centred", [False, True], ids=["about zero", "about the mean"])
 @pytest.mark.parametrize("method", METHODS)
-def test_every_method_equals_a_dense_svd(method: str, centred: bool, weighted: bool):
-    rng = np.random.default_rng(1)
-    samples, weights = _faces(rng), rng.uniform(0.2, 2, 180) if weighted else np.ones(180)
+def test_every_method_equals_a_dense_svd(method: str, centred: bool):
+    samples = _faces(np.random.default_rng(1))
     exact = samples.astype(np.float64)
-    mean = weights @ exact / weights.sum() if centred else np.zeros(exact.shape[1])
-    divisor = weights.sum() - (weights**2).sum() / weights.sum() if centred else weights.sum()
-    _, s, vt = np.linalg.svd((exact - mean) * np.sqrt(weights / divisor)[:, None], full_matrices=False)
-    given = weights if weighted else None
-    principal = principal_components(list(samples), centred=centred, max_components=20, weights=given, method=method)
+    mean = exact.mean(0) if centred else np.zeros(exact.shape[1])
+    _, s, vt = np.linalg.svd((exact - mean) / np.sqrt(len(exact) - centred), full_matrices=False)
+    principal = principal_components(list(samples), centred=centred, max_components=20, method=method)
     assert principal.method == method and len(principal.variance) == 20
     np.testing.assert_allclose(principal.mean, mean, atol=1e-7)
     np.testing.assert_allclose(principal.variance, s[:20] ** 2, rtol=1e-4)
@@ -82,8 +78,48 @@ def test_size_and_memory_determine_the_method():
     assert methods == {1: "samples", 1e-5: "randomized"}
     many = [s[:30] for s in samples]
     assert principal_components(many, centred=True, max_components=5).method == "covariance"
-    with pytest.raises(ValueError, match="max_components"):
-        principal_components(samples, centred=True, memory_gb=1e-5)
+
+
+def test_a_sketch_needs_no_number_of_components():
+    """It grows until the variance is explained or the memory is full, and tells what it can have missed."""
+    rng = np.random.default_rng(7)
+    scales = np.exp(-np.arange(400) / 80)
+    samples = list((rng.normal(size=(600, 400)) * scales).astype(np.float32) @ _axes(rng, 400, 500))
+    exact = principal_components(samples, centred=False, variance_ratio=0.995, method="covariance")
+    sketch = principal_components(samples, centred=False, variance_ratio=0.995, method="randomized")
+    assert len(exact.variance) > 128 and abs(len(sketch.variance) - len(exact.variance)) <= 1
+    assert sketch.variance_ratio >= 0.995 and exact.missed == 0
+    full = principal_components(samples, centred=False, method="covariance")
+    # 100 vectors fit: 50 components and as many more.
+    small = principal_components(
+        samples, centred=False, variance_ratio=0.995, method="randomized", memory_gb=sketch_gb(500, 50)
+    )
+    assert len(small.variance) == 50 and small.variance_ratio < 0.9
+    best = full.variance[:50].sum() / full.total
+    assert 0 <= best - small.variance_ratio < 1e-3 < small.missed
+    assert best <= small.variance_ratio + small.missed
+
+
+def _axes(rng: np.random.Generator, count: int, size: int) -> np.ndarray:
+    return np.linalg.qr(rng.normal(size=(size, count)))[0].T.astype(np.float32)
+
+
+def test_products_of_orthogonal_groups_are_not_needed():
+    rng = np.random.default_rng(8)
+    axes = _axes(rng, 60, 100)
+    rows = [a @ axes[k * 30 : (k + 1) * 30] for k in (0, 1) for a in rng.normal(size=(20, 30)) * (1 + k)]
+    order = rng.permutation(40)
+    samples, groups = [rows[k].astype(np.float32) for k in order], (order >= 20).astype(int)
+    whole = principal_components(samples, centred=False, variance_ratio=0.95)
+    parts = principal_components(samples, centred=False, variance_ratio=0.95, groups=groups)
+    np.testing.assert_allclose(parts.variance, whole.variance, rtol=1e-5)
+    np.testing.assert_allclose(parts.components, whole.components, atol=1e-4)
+    # Products between the groups would not have mattered: with wrong ones the result is another.
+    mixed = principal_components(samples, centred=False, variance_ratio=0.95, groups=np.arange(40) % 2)
+    assert np.abs(mixed.variance[:5] / whole.variance[:5] - 1).max() > 0.01
+    for wrong in (groups[:-1], groups):
+        with pytest.raises(ValueError, match="groups"):
+            principal_components(samples, centred=len(wrong) == 40, groups=wrong)
 
 
 def test_centred_samples_have_one_component_less():
@@ -92,11 +128,9 @@ def test_centred_samples_have_one_component_less():
     assert len(principal_components([np.zeros(4, np.float32)] * 3, centred=True).variance) == 0
 
 
-def test_there_must_be_one_weight_a_sample():
-    samples = list(_faces(np.random.default_rng(5), count=7))
-    for count in (6, 8):
-        with pytest.raises(ValueError):
-            principal_components(samples, centred=True, weights=np.ones(count))
+def test_there_must_be_samples():
+    with pytest.raises(ValueError, match="0 samples"):
+        principal_components([], centred=True)
 
 
 @pytest.mark.parametrize("centred", [False, True], ids=["about zero", "about the mean"])
