@@ -110,6 +110,7 @@ def prepare(out: Path, python: str, without: list[str]) -> None:
 
 def parts(out: Path, variant: str) -> list[Part]:
     python = [sys.executable, "-m"]
+    tests = [str(file) for file in sorted((ROOT / "tests").rglob("test_*.py")) if "mark.cuda" in file.read_text()]
     cases = [word for case in RENDERER_CASES for word in ("--case", case)]
 
     def register(recipe: str, on: str) -> Part:
@@ -125,7 +126,7 @@ def parts(out: Path, variant: str) -> list[Part]:
     return [
         Part(
             name="tests",
-            command=[*python, "pytest", "-q", "-m", "cuda", "-p", "no:cacheprovider", "tests/registration"],
+            command=[*python, "pytest", "-q", "-m", "cuda", "-p", "no:cacheprovider", *tests],
             figures=lambda text: text.strip().splitlines()[-1].strip("= "),
         ),
         Part(
