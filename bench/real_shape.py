@@ -28,7 +28,7 @@ from rich.console import Console
 from rich.table import Table
 
 from coregister.evaluate.linear_fit import LinearFit, fit_correspondence, identity_part
-from coregister.evaluate.scan_fit import fit_scan
+from coregister.evaluate.scan_fit import fit_scan, points_on_skin
 from coregister.next_model.build import build_model
 from coregister.next_model.identity import IdentitySettings
 from coregister.next_model.recipes import true_meshes
@@ -94,6 +94,7 @@ def errors_mm(
     observed = regions.head_skin(data) & (registration.confidence >= _MIN_CONFIDENCE)
     part = identity_part(data, observed)
     vertex_fits = fit_correspondence(part, registration.vertices[part.rows], counts)
+    points = points_on_skin(points, registration.vertices, data)
     scan_fits = fit_scan(identity_part(data, regions.exterior(data)), points, vertex_fits)
     return np.array([_means(scan_fits), _means(vertex_fits)])
 

@@ -15,6 +15,7 @@ from registration.model.gnm_npz import GNMData
 REGIONS = ("left_eye_region", "right_eye_region", "lower_face_region")
 FLIP = np.array([-1.0, 1.0, 1.0])  # a mirror image's coordinates
 _BLEND_M = 10e-3  # geodesic width of the transition between regions
+_FADE_M = (30e-3, 60e-3)  # from the face along the outer skin, over which masks fall to zero
 _UPPER = ("forehead", "middle_brow", "left_brow", "right_brow", "left_temple", "right_temple", "left_orbital")
 _UPPER_REGIONS = tuple(f"{name}_region" for name in (*_UPPER, "right_orbital"))
 
@@ -42,14 +43,17 @@ def soft_masks(
 def regional_masks(data: GNMData) -> Float[np.ndarray, "3 V"]:
     """Return the masks of `REGIONS` for a model, by its vertex groups of eye regions; zero off the skin.
 
-    The groups may be hard or soft, overlap or not cover the skin: only their border is used.
+    The groups may be hard or soft, overlap or not cover the skin: only their border is used. Masks sum to one on the
+    face and about it, and fall to zero on the neck, the chest and the scalp, which expressions do not move.
     """
     skin, mirror = regions.skin(data), data.mirror_indices
     vertices = data.template_vertex_positions.astype(np.float64)
     vertices = (vertices + vertices[mirror] * FLIP) / 2
     upper = regions.expression_skin(data)
     edges = edges_of(data.triangles[skin[data.triangles].all(1)]).vertices
-    return _split(vertices, edges, upper | upper[mirror], mirror) * skin
+    away = smoothstep(*_FADE_M, edge_distances(vertices, edges, regions.face(data)))
+    near = np.where(regions.exterior(data), 1 - (away + away[mirror]) / 2, 1)  # linings are far along the surface
+    return _split(vertices, edges, upper | upper[mirror], mirror) * near * skin
 
 
 def _split(

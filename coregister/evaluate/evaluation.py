@@ -21,7 +21,7 @@ from coregister.evaluate.confidence_intervals import (
     bootstrap_statistic_interval,
 )
 from coregister.evaluate.linear_fit import ExpressionPart, LinearPart
-from coregister.evaluate.scan_fit import fit_scan
+from coregister.evaluate.scan_fit import fit_scan, points_on_skin
 from coregister.evaluate.specificity import specificity_mm
 from coregister.tag_groups import tag_group
 from registration.errors import InputError
@@ -291,7 +291,7 @@ class _ModelDistances:
     """Distances of one model from the subjects, added one subject at a time; keeps numbers, not meshes."""
 
     def __init__(self, data: GNMData, settings: EvaluationSettings) -> None:
-        self.settings = settings
+        self.data, self.settings = data, settings
         self.identity, self.whole = linear_fit.identity_part(data), linear_fit.whole_part(data)
         self.outside = linear_fit.identity_part(data, regions.exterior(data))
         self.expressions = linear_fit.expression_parts(data)
@@ -330,7 +330,8 @@ class _ModelDistances:
         self.by_region.append({name: float(distance[m].mean()) for name, m in self.regions.items() if m.any()})
         scan_fits = []
         if subject.scan is not None:
-            scan_fits = fit_scan(self.outside, subject.scan, fits, seed=self.settings.seed)
+            points = points_on_skin(subject.scan, subject.neutral, self.data)
+            scan_fits = fit_scan(self.outside, points, fits, seed=self.settings.seed) if len(points) else []
         self.scans_mm.append([float(fit.distance_mm.mean()) for fit in scan_fits] or [np.nan] * len(self.counts))
         rotation = fits[-1].T_model_world[:3, :3].T
         self._add_expressions((subject.expressions.astype(np.float64) - subject.neutral) @ rotation)

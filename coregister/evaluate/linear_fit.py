@@ -208,10 +208,14 @@ class ExpressionPart:
 
 
 def expression_parts(data: GNMData) -> dict[str, ExpressionPart]:
-    """Return the model's expression components by region of the skin."""
-    parts = {}
+    """Return the model's expression components by region, on the outer skin of the face.
+
+    Masks of files also cover neck, chest, scalp and the inside of eye sockets and mouth, where hardly anything moves or
+    nothing is seen: they would dilute a mean.
+    """
+    parts, face = {}, regions.face(data)
     for region, (members, mask) in regions.expression_regions(data).items():
-        rows = np.flatnonzero(mask > 0)
+        rows = np.flatnonzero((mask > 0) & face)
         basis = data.expression_basis[members][:, rows].astype(np.float64)
         rest = np.zeros((len(rows), 3))
         part = LinearPart(rows=rows, rest=rest, basis=basis, triangles=_part_triangles(data, rows))

@@ -17,6 +17,8 @@ from coregister.evaluate.linear_fit import LinearFit, LinearPart, solve_normal_e
 from registration.frames import MM_PER_M, transform_points
 from registration.geometry.closest_point import barycentric_points, closest_points
 from registration.geometry.rigid import motion_fields
+from registration.model import regions
+from registration.model.gnm_npz import GNMData
 
 _MAX_POINTS = 4000  # of the scan in the fit; distances are reported for all
 _MAX_STEPS = 60
@@ -80,6 +82,27 @@ def fit_scan(
             )
         )
     return fits
+
+
+def points_on_skin(
+    points: Float[np.ndarray, "N 3"], mesh: Float[np.ndarray, "V 3"], data: GNMData
+) -> Float[np.ndarray, "M 3"]:
+    """Return a scan's points that are not on an eyeball, which the skin of a model does not explain.
+
+    Decided on the subject's own mesh, so that all models explain the same points.
+
+    Args:
+        points: of the scan.
+        mesh: the subject's, in the topology of `data`, in the same frame.
+        data: a model.
+    """
+    mesh, points = mesh.astype(np.float64), points.astype(np.float64)
+    exterior, balls = regions.exterior(data), np.any(regions.eyeball_shells(data), axis=0)
+    distance = [
+        closest_points(points, mesh, data.triangles[part[data.triangles].all(1)].astype(np.int64))[0]
+        for part in (exterior, balls)
+    ]
+    return points[distance[0] <= distance[1]]
 
 
 def _levenberg_marquardt(

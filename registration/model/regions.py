@@ -262,6 +262,11 @@ def head_skin(data: GNMData) -> Bool[np.ndarray, "V"]:
     return exterior(data) & ~neck_other(data)
 
 
+def face(data: GNMData) -> Bool[np.ndarray, "V"]:
+    """Outer skin of the face: all that its expressions move by more than a little."""
+    return (group(data, "hockey_mask") > _INSIDE) & exterior(data)
+
+
 def cranium(data: GNMData) -> Bool[np.ndarray, "V"]:
     """Skin of the head around the face mask, with the ears: what hair, a cap or missing cameras may hide."""
     return head_skin(data) & (group(data, "hockey_mask") <= _INSIDE)
@@ -298,8 +303,8 @@ def common_face(data: GNMData) -> dict[str, Bool[np.ndarray, "V"]]:
 
     Only exterior skin: no ears, eyeballs, nostrils, or inside of the mouth. The areas do not cover all of the face.
     """
-    face = (group(data, "hockey_mask") > _INSIDE) & exterior(data)
-    return {"face": face} | {name: _any(data, groups) & face for name, groups in _COMMON_AREAS.items()}
+    members = face(data)
+    return {"face": members} | {name: _any(data, groups) & members for name, groups in _COMMON_AREAS.items()}
 
 
 _FACE_AREAS = ("upper_lip", "lower_lip", "upper_lip_region", "lower_lip_region", "chin_region", "nose_region")

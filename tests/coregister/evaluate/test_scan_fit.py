@@ -7,9 +7,11 @@ from scipy.spatial.transform import Rotation
 
 from coregister.evaluate import linear_fit
 from coregister.evaluate.linear_fit import LinearFit, LinearPart
-from coregister.evaluate.scan_fit import fit_scan
+from coregister.evaluate.scan_fit import fit_scan, points_on_skin
 from registration.frames import transform_points
 from registration.geometry.closest_point import barycentric_points, closest_points
+from registration.geometry.surface_samples import sample_surface
+from registration.model import gnm_npz, regions
 from tests.coregister.spectrum import heads, spectrum_model
 
 
@@ -134,3 +136,25 @@ def test_fits_are_deterministic(model):
     first, second = (fit_scan(part, points, guess, seed=9)[0] for _ in range(2))
     np.testing.assert_array_equal(first.coefficients, second.coefficients)
     assert len(first.distance_mm) == 6000
+
+
+def test_points_on_eyeballs_are_no_skin(model_file):
+    """A scan of skin and eyeballs of a head of the model: the skin is explained exactly, in spite of the eyeballs."""
+    data = gnm_npz.read(model_file)
+    exterior, balls = regions.exterior(data), np.any(regions.eyeball_shells(data), axis=0)
+    part = linear_fit.identity_part(data, exterior)
+    coefficients = np.random.default_rng(3).standard_normal(5)
+    head = data.template_vertex_positions + np.tensordot(coefficients, data.vertex_identity_basis[:5], 1)
+    scan = []
+    for members, count in ((exterior, 3000), (balls, 600)):
+        triangles = data.triangles[members[data.triangles].all(1)].astype(np.int64)
+        samples = sample_surface(head, triangles, count, np.random.default_rng(0))
+        scan.append(barycentric_points(head, triangles, *samples))
+    visible = scan[1][scan[1][:, 2] > head[balls, 2].max() - 0.006]  # the front, between the lids
+    points = np.concatenate([scan[0], visible])
+    left = points_on_skin(points, head, data)
+    assert len(visible) > 30 and np.array_equal(left, scan[0])
+    guess = linear_fit.fit_correspondence(part, head[part.rows], [5])
+    assert (
+        fit_scan(part, left, guess)[0].distance_mm.mean() < 1e-4 < fit_scan(part, points, guess)[0].distance_mm.mean()
+    )

@@ -31,16 +31,28 @@ def bases(displacements, weights, model):
     return regional_bases(displacements, weights, model, ExpressionSettings(variance_ratio=0.999))
 
 
-def test_masks_sum_to_one_on_the_skin_and_mirror(model):
+def test_masks_sum_to_one_on_the_face_and_mirror(model):
     masks, skin = regional_masks(model), regions.skin(model)
-    np.testing.assert_allclose(masks.sum(0)[skin], 1, atol=1e-12)
+    linings = skin & ~regions.exterior(model)
+    np.testing.assert_allclose(masks.sum(0)[regions.face(model) | linings], 1, atol=1e-12)
     assert not masks[:, ~skin].any() and masks.min() >= 0
     np.testing.assert_allclose(masks[1], masks[0][model.mirror_indices], atol=1e-12)
     assert (model.mirror_indices[model.mirror_indices] == np.arange(len(skin))).all()
     # The first model was built with its groups as masks.
     names = ("expression_basis_left_eye", "expression_basis_right_eye", "expression_basis_mouth_nose_ears")
     groups = np.stack([regions.group(model, name) for name in names])
-    assert np.abs(groups - masks)[:, skin].mean() < 0.005
+    assert np.abs(groups - masks)[:, regions.face(model)].mean() < 0.005
+
+
+def test_masks_end_where_expressions_do(displacements, model):
+    """Neck, chest and scalp are in no mask, and hardly any motion is lost with them."""
+    lost = regions.exterior(model) * (1 - regional_masks(model).sum(0))
+    size = np.mean([np.linalg.norm(d, axis=1) for d in displacements], 0)
+    energy = np.mean([(d**2).sum(1) for d in displacements], 0)
+    print(f"energy {energy @ lost**2 / energy.sum():.1e}, up to {1e3 * (size * lost).max():.2f} mm")
+    assert energy @ lost**2 < 1e-3 * energy.sum()
+    chest = regions.neck_other(model) & (model.template_vertex_positions[:, 1] < 0.14)
+    assert not regional_masks(model)[:, chest].any()
 
 
 def test_masks_blend_over_about_ten_millimetres(model):
