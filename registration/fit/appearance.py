@@ -45,19 +45,18 @@ class Appearance:
 
     def apply_exposure(self, rendered: Rendered, batch: Targets, views: Sequence[int]) -> Rendered:
         """Return the rendering with colours as each camera records them: gain times colour plus bias."""
-        gain, bias = self._exposure(batch, views)
-        return replace(rendered, rgb=rendered.rgb * gain + bias)
+        rows = zip(batch.pixels.rows_by_view, *self._exposure(views), strict=True)
+        return replace(rendered, rgb=torch.cat([rendered.rgb[r] * gain + bias for r, gain, bias in rows]))
 
     def corrected(self, batch: Targets, views: Sequence[int]) -> Float[Tensor, "P 3"]:
         """Return the targets' colours as a camera of gain 1 and bias 0 would record them."""
-        gain, bias = self._exposure(batch, views)
-        return (batch.rgb - bias) / gain
+        rows = zip(batch.pixels.rows_by_view, *self._exposure(views), strict=True)
+        return torch.cat([(batch.rgb[r] - bias) / gain for r, gain, bias in rows])
 
-    def _exposure(self, batch: Targets, views: Sequence[int]) -> tuple[Float[Tensor, "P 3"], Float[Tensor, "P 3"]]:
-        """Gain and bias of the camera of every pixel."""
+    def _exposure(self, views: Sequence[int]) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n 3"]]:
+        """Gain and bias of some views' cameras."""
         gain, bias = self._exposures[list(views)].unbind(-1)
-        gain, bias = (values.index_select(0, batch.pixels.view) for values in (gain.exp(), bias))
-        return gain, bias
+        return gain.exp(), bias
 
     @torch.no_grad()
     def fit_exposures(self, rendered: Rendered, batch: Targets, agree: Bool[Tensor, "P"], views: Sequence[int]) -> None:

@@ -10,6 +10,8 @@ from torch import Tensor
 
 from registration.fit.recipes import Rate
 
+_EPSILON = 1e-8  # of the root of the second moment
+
 History = dict[str, list[float]]
 
 
@@ -29,13 +31,21 @@ class AdamBlock:
 
     def __init__(self, tensors: Sequence[Tensor], rate: Rate, betas: tuple[float, float] = (0.8, 0.95)):
         self.tensors = tensors
-        self._rate = rate
-        self._optimizer = torch.optim.Adam(tensors, lr=rate.start, betas=betas)
+        self._rate, self._betas, self._steps = rate, betas, 0
+        self._first, self._second = ([torch.zeros_like(tensor) for tensor in tensors] for _ in range(2))
 
+    @torch.no_grad()
     def step(self, progress: float) -> None:
-        for group in self._optimizer.param_groups:
-            group["lr"] = self._rate.value(progress)
-        self._optimizer.step()
+        # Not torch.optim.Adam, whose first use imports torch's compiler: seconds of every process.
+        self._steps += 1
+        b1, b2 = self._betas
+        rate = self._rate.value(progress) / (1 - b1**self._steps)
+        for tensor, first, second in zip(self.tensors, self._first, self._second, strict=True):
+            if tensor.grad is None:
+                continue
+            first.lerp_(tensor.grad, 1 - b1)
+            second.mul_(b2).addcmul_(tensor.grad, tensor.grad, value=1 - b2)
+            tensor.addcdiv_(first, (second / (1 - b2**self._steps)).sqrt_().add_(_EPSILON), value=-rate)
 
 
 class AdamUniformBlock:

@@ -7,7 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from matplotlib.figure import Figure
 
-from registration.report.charts import LINE_COLOURS, TEXT_COLOUR, chart_style, style_axes, to_svg
+from registration.report.charts import chart_style, style_axes, to_svg
+from registration.report.colours import LINE_COLOURS, TEXT_COLOUR
 
 _COLUMNS = 2  # panels in a row
 _LEVEL = 5  # groups, above which their names are turned

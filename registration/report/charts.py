@@ -1,4 +1,4 @@
-"""Line charts as inline SVG: loss terms of an optimization, and metrics against a number of components."""
+"""Line charts as inline SVG: metrics against a number of components."""
 
 import io
 import math
@@ -10,54 +10,11 @@ import matplotlib
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
-from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
-TEXT_COLOUR, GRID_COLOUR = "#2b2f36", "#d9d9d4"
-LINE_COLOURS = (
-    "#1f77b4",
-    "#d1495b",
-    "#2a9d8f",
-    "#e9a23b",
-    "#6a4c93",
-    "#8c6d46",
-    "#4c956c",
-    "#b56576",
-    "#5c677d",
-    "#9a031e",
-)
+from registration.report.colours import GRID_COLOUR, LINE_COLOURS, TEXT_COLOUR
+
 _COLUMNS = 3  # panels in a row
 _DOTTED = 60  # values of a line, above which they get no dots
-
-
-def loss_curves(history: Mapping[str, Mapping[str, Sequence[float]]]) -> str:
-    """Plot the loss terms of each stage over its steps, on a logarithmic axis, one panel per stage.
-
-    A term has the same colour in all panels. Values that are not positive and finite leave gaps.
-
-    Args:
-        history: stage -> loss term -> its value at each step.
-
-    Returns:
-        An SVG element; empty without any value.
-    """
-    stages = {name: terms for name, terms in history.items() if any(len(values) for values in terms.values())}
-    if not stages:
-        return ""
-    names = list(dict.fromkeys(term for terms in stages.values() for term in terms))
-    colours = {term: LINE_COLOURS[k % len(LINE_COLOURS)] for k, term in enumerate(names)}
-    rows, columns = math.ceil(len(stages) / _COLUMNS), min(len(stages), _COLUMNS)
-    with chart_style():
-        figure = Figure(figsize=(11.4, 2.9 * rows + 0.5), layout="constrained")
-        panels = figure.subplots(rows, columns, squeeze=False).ravel()
-        for panel, (stage, terms) in zip(panels, stages.items(), strict=False):
-            for term, values in terms.items():
-                valid = [v if v is not None and math.isfinite(v) and v > 0 else math.nan for v in values]
-                panel.plot(range(1, len(valid) + 1), valid, color=colours[term], lw=1.4, label=term)
-            _set_log_scale(panel)
-            style_axes(panel, stage, "step")
-        for panel in panels[len(stages) :]:
-            panel.set_visible(False)
-        return to_svg(figure, colours)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -123,15 +80,6 @@ def to_svg(figure: Figure, colours: Mapping[str, str]) -> str:
     figure.savefig(buffer, format="svg", transparent=True, metadata={"Date": None, "Creator": None})
     svg = buffer.getvalue()
     return svg[svg.index("<svg") :]
-
-
-def _set_log_scale(panel: Axes) -> None:
-    panel.set_yscale("log")
-    low, high = panel.get_ylim()
-    panel.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
-    panel.yaxis.set_minor_formatter(NullFormatter())
-    if high < 100 * low:
-        panel.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
 
 
 def style_axes(panel: Axes, title: str, x_label: str) -> None:

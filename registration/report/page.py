@@ -12,9 +12,9 @@ from markupsafe import Markup
 from registration.evaluate.names import RESIDUALS
 from registration.evaluate.residuals import residual_rows
 from registration.frames import linear_to_srgb
-from registration.report.charts import loss_curves
 from registration.report.heat_map import distance_paint, plain_paint, render_painted, scale_limit_mm, texture_paint
 from registration.report.inputs import HeatMap, PictureSection, ReportInputs, distance_heat_map
+from registration.report.loss_curves import loss_curves
 from registration.report.pictures import CLASS_COLOURS, RgbImage, ViewImages, data_uri, view_images
 from registration.report.summary import figure_parts, format_duration
 from registration.report.templates import environment

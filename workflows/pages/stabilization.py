@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 from markupsafe import Markup
 
-from registration.report.charts import loss_curves
 from registration.report.inputs import HeatMap
+from registration.report.loss_curves import loss_curves
 from registration.stabilize.components import HeadGeometry, RegionalComponents
 from registration.stabilize.pipeline import StabilizedSubject
 from registration.stabilize.stabilized_folder import StabilizedManifest

@@ -24,6 +24,18 @@ def test_the_first_adam_step_equals_the_rate():
         torch.testing.assert_close(tensor.detach(), torch.tensor([-size, size, 0.0]), atol=1e-4 * size, rtol=1e-4)
 
 
+def test_adam_equals_torchs():
+    random = torch.Generator().manual_seed(0)
+    ours, theirs = (torch.ones(4, 3, dtype=torch.float64, requires_grad=True) for _ in range(2))
+    block = AdamBlock([ours], Rate(start=0.03, end=0.03))
+    optimizer = torch.optim.Adam([theirs], lr=0.03, betas=(0.8, 0.95))
+    for _ in range(15):
+        ours.grad = theirs.grad = torch.randn(4, 3, generator=random, dtype=torch.float64)
+        block.step(0.5)
+        optimizer.step()
+    torch.testing.assert_close(ours, theirs, rtol=1e-12, atol=1e-12)
+
+
 def paper_updates(gradients: list[torch.Tensor], rate: float, b1: float, b2: float) -> torch.Tensor:
     """[Nicolet 2021]: Adam with the largest second moment of all coordinates, as released (`AdamUniform`)."""
     g1 = g2 = torch.zeros_like(gradients[0])

@@ -12,8 +12,9 @@ from registration.evaluate.audit import audit_penetration
 from registration.evaluate.residuals import residual_figures
 from registration.model.gnm_npz import read
 from registration.report import heat_map as heat_maps
-from registration.report.charts import ChartLine, line_charts, loss_curves
+from registration.report.charts import ChartLine, line_charts
 from registration.report.inputs import ReportInputs, distance_heat_map
+from registration.report.loss_curves import loss_curves
 from registration.report.page import render_report
 from registration.report.remarks import headline, remarks
 from registration.storage.hashing import versions
@@ -164,6 +165,20 @@ def test_loss_curves_have_a_panel_per_stage():
     gaps = {"a": {"x": [float("nan"), 0.0, -1.0, 2.0, 1.0]}, "empty": {"x": []}}
     svg_text = loss_curves(gaps)
     assert ElementTree.fromstring(svg_text) is not None and "empty" not in svg_text
+    (line,) = re.findall(r'<path d="(M[^hH]*?)" stroke="#1f77b4" stroke-width="1.4"', svg_text)
+    places = np.array([point.split() for point in re.split("[ML]", line)[1:]], float)
+    assert line.count("M") == 1 and len(places) == 2  # of the fourth and fifth step
+    assert places[0, 0] < places[1, 0] and places[0, 1] < places[1, 1]  # it falls
+    whole = loss_curves({"a": {"x": [100.0, 10.0, 1.0]}})
+    heights = [
+        float(y)
+        for y in re.findall(
+            r"[ML][\d.]+ ([\d.]+)", re.findall(r'd="([^"]*)" stroke="#1f77b4" stroke-width="1.4"', whole)[0]
+        )
+    ]
+    assert heights[1] == pytest.approx((heights[0] + heights[2]) / 2, abs=0.1)  # a logarithmic axis
+    labels = {element.text for element in ElementTree.fromstring(whole).iter("{http://www.w3.org/2000/svg}text")}
+    assert {"1", "2", "3", "10", "100"} <= labels
     assert loss_curves({}) == "" and loss_curves({"a": {}}) == ""
 
 
