@@ -1,8 +1,8 @@
 """The differentiable renderer without lighting: one Dr.Jit wavefront over chosen pixels of several views.
 
-The forward pass casts one or more rays per pixel and averages them with a box filter. The adjoint has three parts: the
-interior of faces at the hits (`interior.py`, no ray is cast again), silhouettes (`silhouette.py`), and curves in which
-parts of the mesh intersect (`intersection_curves.py`).
+The forward pass sees through one or more points of a pixel and averages them with a box filter. The adjoint has three
+parts: the interior of faces at the hits (`interior.py`, nothing is searched again), silhouettes (`silhouette.py`), and
+curves in which parts of the mesh intersect (`intersection_curves.py`).
 """
 
 from __future__ import annotations  # mi.Float exists only after a variant is set
@@ -19,7 +19,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from registration.geometry.topology import connected_parts, edges
-from registration.render import interior, intersection_curves, normals, silhouette
+from registration.render import interior, intersection_curves, normals, silhouette, visibility
 from registration.render.adjoint import Adjoint, RowSum, unit_of
 from registration.render.cameras import PixelList, upload
 from registration.render.scene import TriangleScene
@@ -147,7 +147,7 @@ class Renderer:
         self._update_vertices(vertices)
         if self._last is not None and self._last[0] is pixels and len(self._pixel_offsets) == 1:
             return self._last[1].hits[0]
-        return self._cast(upload(pixels), _CENTRE)
+        return self._see(rows_of_four(_flat(vertices)), upload(pixels), _CENTRE)
 
     def _update_vertices(self, vertices: Tensor) -> None:
         """Set the vertices; the cached forward pass of other vertices is dropped."""
@@ -169,14 +169,32 @@ class Renderer:
             texture_size=texture_size if texture is None else texture.shape[0],
         )
 
+    def _see(self, positions: mi.Float, pixels: PixelList, offset: tuple[float, float]) -> Hits:
+        """The hits of rays through all pixels; on the CPU without casting them."""
+        seen = visibility.rasterize(self._faces, positions, pixels, offset) if "llvm" in mi.variant() else None
+        if seen is None:
+            return self._cast(pixels, offset)
+        return self._collected(offset, seen.face, seen.depth, seen.b1, seen.b2)
+
     def _cast(self, pixels: PixelList, offset: tuple[float, float], which: mi.UInt32 | None = None) -> Hits:
         hit = self._scene.cast_rays(*pixels.rays(offset, which), mi.Bool(True), coherent=True)
         is_hit = hit.is_valid()
         depth, seen = dr.select(is_hit, hit.t, dr.inf), dr.select(is_hit, hit.prim_index, NO_FACE)
-        b1, b2 = hit.prim_uv.x, hit.prim_uv.y
-        small = None
+        return self._collected(offset, seen, depth, hit.prim_uv.x, hit.prim_uv.y, which)
+
+    def _collected(
+        self,
+        offset: tuple[float, float],
+        seen: mi.UInt32,
+        depth: mi.Float,
+        b1: mi.Float,
+        b2: mi.Float,
+        which: mi.UInt32 | None = None,
+    ) -> Hits:
+        """The hits of pixels, all or those of some, as lists."""
+        is_hit, small = seen != NO_FACE, None
         if self._parts is not None:
-            small = is_hit & (dr.gather(mi.UInt32, self._parts, hit.prim_index, is_hit) != 0)
+            small = is_hit & (dr.gather(mi.UInt32, self._parts, seen, is_hit) != 0)
         dr.eval(is_hit, depth, seen, b1, b2, small)
         lane = dr.compress(is_hit)
         face, b1, b2 = (dr.gather(type(values), values, lane) for values in (seen, b1, b2))
@@ -203,7 +221,7 @@ class Renderer:
         """Return the state for the adjoint and the groups of channels, each flat; no colour without a texture."""
         facing = silhouette.facing(mesh, pixels)
         dr.eval(facing)
-        hits = [self._cast(pixels, offset) for offset in self._pixel_offsets]
+        hits = [self._see(mesh.positions, pixels, offset) for offset in self._pixel_offsets]
         finer, weights = self._cast_finer(pixels, hits)
         state = ForwardState(
             mesh=mesh,
