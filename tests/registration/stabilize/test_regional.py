@@ -116,3 +116,35 @@ def test_bad_samples_and_decisions_are_refused(head, injected):
     for region, component in (("knee", 0), ("nose", 99)):
         with pytest.raises(InputError, match="does not exist"):
             decided_actions(injected.components, [Decision(region=region, component=component, action="keep")])
+
+
+def test_motion_is_shared_if_nose_and_neck_both_share_it(head):
+    """A motion of mouth and nose alone, as of a sneer, is no head motion, however similar the nose's is."""
+    rng = np.random.default_rng(1)
+    field = np.tensordot(np.r_[0.02, 0.01, 0.01, 0.001, 0.002, 0.001], motion_fields(head.points), 1)
+    labels = [f"label {k % 4}" for k in range(40)]
+    for still, shared in ((("neck_back",), False), ((), True)):
+        moved = field.copy()
+        for name in still:
+            moved[head.regions[name]] = 0
+        displaced = (rng.normal(size=(40, 1, 1)) * moved).astype(np.float32)
+        mouth = next(part for part in regional_components(list(displaced), labels, head) if part.region == "mouth")
+        assert mouth.rigidity[0] > 0.9 and mouth.label_independence[0] > 0.7
+        assert mouth.flagged[0] == shared and (mouth.shared_motion[0] > 0.9) == shared
+        assert shared or mouth.shared_motion[0] < 0.1
+
+
+def test_what_labels_explain_is_not_subtracted(head):
+    """Of a component that is subtracted, each label's own part is expression and stays."""
+    rng = np.random.default_rng(2)
+    group = np.arange(80) % 4
+    chance, of_label = rng.normal(size=80), np.array([-6.0, -2.0, 3.0, 5.0])[group]
+    twist = np.r_[0.004, 0.002, 0.003, 0.0005, 0.0002, 0.0004]
+    field = np.tensordot(twist, motion_fields(head.points), 1)
+    displaced = ((chance + of_label)[:, None, None] * field).astype(np.float32)
+    labels = [f"label {k}" for k in group]
+    parts = regional_components(list(displaced), labels, head)
+    actions = decided_actions(parts, [keep_labels(part.region, 0) for part in parts])
+    removed = compute_corrections(parts, actions, labels, head).twists @ twist / (twist @ twist)
+    assert np.abs(removed - chance).std() < 0.3
+    assert abs(np.corrcoef(removed, of_label)[0, 1]) < 0.2
