@@ -142,6 +142,8 @@ class HeadAssembly:
     ) -> tuple[Float[np.ndarray, "V 3"], Float[np.ndarray, "J 3"]]:
         """Build a person's neutral head, aligned with the template.
 
+        The eyes look ahead whatever the head's shape: eyeballs are translated, never turned [GNM, Head Identity].
+
         Args:
             person: weights of MakeHuman's targets.
             targets: displacement of the base mesh (B, 3) by target name, metres; all of the person's targets.
@@ -151,10 +153,12 @@ class HeadAssembly:
         """
         base = self.source.vertices + sum(weight * targets[name] for name, weight in person.weights.items())
         delta, joint_delta = self.identity_displacement(base - self.base)
-        vertices, joints = self.template + delta, self.joints + joint_delta
+        vertices, joints = self.align(self.template + delta, self.joints + joint_delta)
+        for name, centre, rest in zip(("left_eye", "right_eye"), joints[2:], self.eye_centres, strict=True):
+            vertices[self.slices[name]] = self.parts[name].vertices + (centre - rest)
         skin = self.slices["skin"]
         vertices[skin] = push_out_of_eyes(self._lids_on_eyes(vertices[skin], joints[2:]), joints[2:])
-        return self.align(vertices, joints)
+        return vertices, joints
 
     @cached_property
     def stable_skin(self) -> Bool[np.ndarray, "N"]:

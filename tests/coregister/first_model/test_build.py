@@ -323,3 +323,12 @@ def test_a_failed_build_leaves_no_files(counted, monkeypatch, tmp_path):
     with pytest.raises(InputError):
         bootstrap.bootstrap()
     assert not any(file.is_file() for file in tmp_path.rglob("*"))
+
+
+def test_identity_moves_eyes_without_turning_them(model):
+    """The gaze is straight ahead, whatever the head's shape [GNM, Head Identity]."""
+    head = [k for k, name in enumerate(model.identity_names) if name.startswith("head")]
+    for ball in regions.eyeballs(model):
+        motion = model.vertex_identity_basis[head][:, ball].astype(np.float64)
+        assert np.abs(motion).max() > 1e-3
+        assert np.abs(motion - motion.mean(1, keepdims=True)).max() < 1e-7
