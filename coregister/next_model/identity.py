@@ -5,6 +5,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
+import torch
 from jaxtyping import Bool, Float, Int
 
 from coregister.next_model import eyelids
@@ -15,9 +16,10 @@ from coregister.next_model.shrinkage import (
     cross_validated_shrinkage,
 )
 from coregister.region_masks import FLIP, mirrored
+from registration.errors import InputError
 from registration.geometry import pca
 from registration.geometry.rigid import fit_twists, motion_fields
-from registration.geometry.topology import vertex_areas
+from registration.geometry.topology import vertex_areas, vertex_normals
 from registration.model import regions
 from registration.model.gnm_npz import GNMData
 from registration.stabilize.subject_meshes import SkullSkin
@@ -39,6 +41,8 @@ class IdentitySettings:
         shrinkage: fraction of the variance from the prior model, 0 to 1; None: the value with the smallest residual
             of excluded subjects (`shrinkage.cross_validated_shrinkage`).
         by_area: weight vertices by area instead of equally.
+        along_skin: weight of displacement along the skin, relative to displacement across it: above 0, at most 1. A
+            surface changes only by the latter, and registrations know the former less.
         mirrored: each head counts one half, its mirror image the other.
         eyelids_follow: keep the eyelids on the eyeballs, to first order (`eyelids.eyelids_on_eyeballs`).
     """
@@ -47,8 +51,24 @@ class IdentitySettings:
     max_components: int | None = None
     shrinkage: float | None = None
     by_area: bool = True
+    along_skin: float = 1.0
     mirrored: bool = True
     eyelids_follow: bool = True
+
+    def __post_init__(self) -> None:
+        """Refuse a metric in which displacements along the skin do not count at all.
+
+        Raises:
+            InputError: `along_skin` is out of range.
+        """
+        if not 0 < self.along_skin <= 1:
+            raise InputError(
+                "The weight along the skin is out of range",
+                where="along_skin of the identity settings",
+                expected="above 0, at most 1",
+                got=self.along_skin,
+                fix="give 1 for all directions alike, or less",
+            )
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -104,11 +124,11 @@ def build_identity_basis(
     left, right = regions.eyeballs(data)
     rows = np.flatnonzero(~(left | right))
     mirror = data.mirror_indices[rows] if settings.mirrored else None
-    scale = _vertex_scales(data, settings)[rows]
+    metric = VertexMetric.of_template(data, settings, rows)
     head_mean = heads.mean(0, dtype=np.float64)
     mean = head_mean[rows] if mirror is None else (head_mean[rows] + head_mean[mirror] * FLIP) / 2
     components = _prior_components(data if prior is None else prior, rows, settings.mirrored)
-    samples = _Samples(heads, rows, mirror, mean, scale, (components * scale).reshape(len(components), -1))
+    samples = _Samples(heads, rows, mirror, mean, metric, metric.scaled(components).reshape(len(components), -1))
     shrinkage, scores = _choose_shrinkage(samples, settings, int(regions.skin(data).sum()), memory_gb)
     covariance = samples.covariance(shrinkage)
     principal = pca.principal_components(
@@ -120,7 +140,7 @@ def build_identity_basis(
         memory_gb=memory_gb,
     )
     basis = np.zeros((len(principal.variance), *data.template_vertex_positions.shape))
-    basis[:, rows] = principal.components.reshape(len(basis), len(rows), 3) / scale
+    basis[:, rows] = metric.restored(principal.components.reshape(len(basis), len(rows), 3))
     template = data.template_vertex_positions.astype(np.float64)
     template[rows] = mean
     template, basis = _with_eyeballs(template, basis, data, settings.eyelids_follow)
@@ -147,6 +167,44 @@ def transfer_components(data: GNMData) -> Int[np.ndarray, "_"]:
 
 def _moves_skin(data: GNMData) -> Bool[np.ndarray, "K"]:
     return np.abs(data.vertex_identity_basis[:, regions.skin(data)]).max(axis=(1, 2), initial=0) > 0
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class VertexMetric:
+    """What displacements of R vertices count in the components: x' W x, W = s^2 (n n' + t^2 (I - n n')) for each.
+
+    Coordinates W^(1/2) x have the usual length. With the scale s, the normal n and the weight t along the skin.
+    """
+
+    scale: Float[np.ndarray, "R 1"]
+    normals: Float[np.ndarray, "R 3"]  # unit
+    along: Float[np.ndarray, "R 1"]
+
+    @classmethod
+    def of_template(cls, data: GNMData, settings: IdentitySettings, rows: Int[np.ndarray, "R"]) -> "VertexMetric":
+        """Return the metric of a model's template: of the outer skin by its normals, of other parts in all directions
+        alike."""
+        template = torch.from_numpy(data.template_vertex_positions.astype(np.float64))
+        normals = vertex_normals(template, torch.from_numpy(data.triangles.astype(np.int64))).numpy()
+        if settings.mirrored:  # symmetric, so that symmetric and antisymmetric displacements stay orthogonal
+            normals = normals + normals[data.mirror_indices] * FLIP
+            normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
+        along = np.where(regions.exterior(data), settings.along_skin, 1.0)[:, None]
+        return cls(scale=_vertex_scales(data, settings)[rows], normals=normals[rows], along=along[rows])
+
+    def scaled(self, displacements: Float[np.ndarray, "*K R 3"]) -> Float[np.ndarray, "*K R 3"]:
+        """Return W^(1/2) x."""
+        return self._stretched(displacements, self.along) * self.scale
+
+    def restored(self, scaled: Float[np.ndarray, "*K R 3"]) -> Float[np.ndarray, "*K R 3"]:
+        """Return W^(-1/2) x."""
+        return self._stretched(scaled, 1 / self.along) / self.scale
+
+    def _stretched(
+        self, x: Float[np.ndarray, "*K R 3"], along: Float[np.ndarray, "R 1"]
+    ) -> Float[np.ndarray, "*K R 3"]:
+        across = (x * self.normals).sum(-1, keepdims=True) * self.normals
+        return across + along * (x - across)
 
 
 def _vertex_scales(data: GNMData, settings: IdentitySettings) -> Float[np.ndarray, "V 1"]:
@@ -183,10 +241,10 @@ class _Samples:
         rows: Int[np.ndarray, "R"],
         mirror: Int[np.ndarray, "R"] | None,
         mean: Float[np.ndarray, "R 3"],
-        scale: Float[np.ndarray, "R 1"],
+        metric: VertexMetric,
         prior: Float[np.ndarray, "K D"],
     ):
-        self._heads, self._rows, self._mirror, self._mean, self._scale = heads, rows, mirror, mean, scale
+        self._heads, self._rows, self._mirror, self._mean, self._metric = heads, rows, mirror, mean, metric
         self.prior, self.head_count = prior, len(heads)
         parts = 1 if mirror is None else 2
         # Symmetric and antisymmetric parts are orthogonal.
@@ -203,7 +261,7 @@ class _Samples:
     def __iter__(self) -> Iterator[Float[np.ndarray, "D"]]:
         for sign in (0,) if self._mirror is None else (1, -1):
             for head in self._heads:
-                yield ((self._part(head, sign) - (self._mean if sign >= 0 else 0)) * self._scale).ravel()
+                yield self._metric.scaled(self._part(head, sign) - (self._mean if sign >= 0 else 0)).ravel()
 
     def _part(self, head: Float[np.ndarray, "V 3"], sign: int) -> Float[np.ndarray, "R 3"]:
         vertices = head[self._rows].astype(np.float64)

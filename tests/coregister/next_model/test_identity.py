@@ -4,14 +4,16 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import torch
 from scipy.linalg import subspace_angles
 
 from coregister.next_model import eyelids
 from coregister.next_model.alignment import align_neutrals
-from coregister.next_model.identity import IdentityBasis, IdentitySettings, build_identity_basis
+from coregister.next_model.identity import IdentityBasis, IdentitySettings, VertexMetric, build_identity_basis
 from coregister.region_masks import FLIP, mirrored
+from registration.errors import InputError
 from registration.geometry.rigid import fit_twists, motion_fields
-from registration.geometry.topology import vertex_areas
+from registration.geometry.topology import vertex_areas, vertex_normals
 from registration.model import regions
 from registration.model.gnm_npz import GNMData
 from registration.stabilize.subject_meshes import SkullSkin
@@ -254,3 +256,45 @@ def test_mirror_images_of_a_symmetric_models_heads_have_no_effect(model):
     components, expected_components = _skin(result.basis, model), _skin(basis, model)
     assert np.degrees(subspace_angles(components.T, expected_components.T)).max() < 0.1
     np.testing.assert_allclose(result.variance, np.linalg.svd(expected_components, compute_uv=False) ** 2, rtol=0.01)
+
+
+def test_displacements_along_the_skin_may_count_less(model):
+    """A mode along the skin is larger than one across it, and first or second by the metric."""
+    rng = np.random.default_rng(9)
+    exterior, points = regions.exterior(model), model.template_vertex_positions.astype(np.float64)
+    normals = vertex_normals(torch.from_numpy(points), torch.from_numpy(model.triangles.astype(np.int64))).numpy()
+    wave = np.cos(points[:, 1:2] / 0.03) * exterior[:, None]
+    across, along = 1e-3 * wave * normals, 2e-3 * wave * np.cross(normals, (0.0, 1.0, 0.0))
+    coefficients = samples.whitened(rng, 12, 2)
+    heads = (points + np.tensordot(coefficients, np.stack([across, along]), 1)).astype(np.float32)
+    firsts = {}
+    for weight in (1.0, 0.2):
+        settings = IdentitySettings(
+            shrinkage=0.0, max_components=2, along_skin=weight, mirrored=False, by_area=False, eyelids_follow=False
+        )
+        head = build_identity_basis(heads, model, settings)
+        normal_part = (head.basis * normals).sum(-1)[:, exterior]
+        firsts[weight] = (normal_part**2).sum(1)[0] / (head.basis[0, exterior] ** 2).sum()
+        # Whatever the metric, two components represent both modes.
+        flat = head.basis[:, exterior].reshape(2, -1).T
+        for mode in (across, along):
+            target = mode[exterior].ravel()
+            rest = target - flat @ np.linalg.lstsq(flat, target, rcond=None)[0]
+            assert np.linalg.norm(rest) < 1e-3 * np.linalg.norm(target)
+    assert firsts[1.0] < 0.1 and firsts[0.2] > 0.9
+    for weight in (0.0, 1.5):
+        with pytest.raises(InputError, match="along the skin"):
+            IdentitySettings(along_skin=weight)
+
+
+def test_parts_stay_orthogonal_with_a_metric_along_the_skin(model):
+    """Symmetric and antisymmetric parts, whose products are not computed."""
+    rng = np.random.default_rng(10)
+    heads = samples.heads(model, rng.normal(size=(5, len(samples.head_components(model)))))
+    heads[:, :, 0] += 0.02 * np.maximum(heads[:, :, 0], 0) * rng.normal(size=(5, 1))
+    settings = IdentitySettings(shrinkage=0.0, along_skin=0.3, variance_ratio=1.0, eyelids_follow=False)
+    rows = np.flatnonzero(~np.any(regions.eyeballs(model), axis=0))
+    head = build_identity_basis(heads.astype(np.float32), model, settings)
+    scaled = VertexMetric.of_template(model, settings, rows).scaled(head.basis[:, rows]).reshape(len(head.basis), -1)
+    products = scaled @ scaled.T
+    np.testing.assert_allclose(products, np.diag(head.variance), atol=1e-4 * head.variance[0])
