@@ -77,3 +77,19 @@ def test_pixels_that_are_not_compared_give_no_confidence():
     none = torch.zeros_like(targets.rgb_weight)
     blind = replace(targets, rgb_weight=none, normal_weight=none)
     assert (vertex_confidence(VERTICES, TRIANGLES, [(blind, rendered)]) == 0).all()
+
+
+def test_a_view_counts_by_the_cosine_of_its_incidence():
+    """The centre as a camera beside the square's axis sees it, alone and with one that looks straight and disagrees."""
+    tilt = np.radians(60)
+    turn = np.array([[np.cos(tilt), 0, np.sin(tilt)], [0, 1, 0], [-np.sin(tilt), 0, np.cos(tilt)]])
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = turn, [0, 0, 3.0]
+    aside = replace(camera(), T_cam_world=pose)
+    targets, rendered = rendered_views(1)
+    alone = replace(targets, pixels=Pixels.full([aside])), rendered
+    assert vertex_confidence(VERTICES, TRIANGLES, [alone])[4] == pytest.approx(0.5 / (1 + 0.5), rel=1e-3)
+    straight = rendered_views(1, angle=np.radians(15))  # which agrees by half
+    assert vertex_confidence(VERTICES, TRIANGLES, [alone, straight])[4] == pytest.approx(
+        (0.5 * 1 + 1 * 0.5) / (1 + 1.5), rel=1e-3
+    )

@@ -135,6 +135,22 @@ def test_hidden_texels_are_not_compared(problem):
     assert hidden < 0.02 and visible > 2 * hidden
 
 
+def test_a_view_counts_by_its_squared_cosine_and_its_resolution(problem):
+    """On the ball the normal is the direction from its centre."""
+    loss = problem.loss(SIZE_PX)
+    vertices = torch.as_tensor(problem.truth, dtype=torch.float32)
+    points = loss._points(vertices).double().numpy()
+    for camera in problem.batch.pixels.cameras:
+        seen, weight = (values.numpy() for values in loss._visible_points(camera, vertices))
+        to_camera = camera.centre - points[seen]
+        distance = np.linalg.norm(to_camera, axis=1)
+        cosine = (points[seen] * to_camera).sum(1) / np.linalg.norm(points[seen], axis=1) / distance
+        depth = camera.project(points[seen])[1]
+        px_per_mm = np.sqrt(camera.intrinsics[0, 0] * camera.intrinsics[1, 1]) / depth / 1000
+        assert len(seen) > 1000 and cosine.min() < 0.35 and cosine.max() > 0.99
+        np.testing.assert_allclose(weight, (cosine * px_per_mm) ** 2, rtol=0.05)
+
+
 def test_visibility_is_updated_with_the_mesh(problem):
     """Visibility is determined again when the mesh has moved: rotated by 180 degrees, the back is in front."""
     loss = problem.loss(SIZE_PX)
