@@ -61,6 +61,7 @@ class ExpressionStatistics:
         self._exterior = regions.exterior(data)
         self._skull = SkullSkin.from_model(data).area
         self._laplacian = normalised_laplacian(data.triangles, len(self._exterior))
+        self._neighbours = abs(self._laplacian)
         self._edges = edges(data.triangles[self._exterior[data.triangles].all(1)]).vertices
         self._creases = Creases.of(data.triangles, data.template_vertex_positions, self._exterior)
 
@@ -95,9 +96,11 @@ class ExpressionStatistics:
         logs = np.log(np.maximum(after[seen], 1e-9) / np.maximum(before[seen], 1e-9))
         stretch = np.exp(np.sqrt(np.average(logs**2, weights=before[seen])))
         # At the border of observed skin the Laplacian would contain unobserved neighbours.
-        inside = observed & (abs(self._laplacian) @ ~observed == 0)
+        inside = observed & (self._neighbours @ ~observed == 0)
         roughness = (self._laplacian @ displacement)[inside] if inside.any() else np.zeros((1, 3))
-        folds = self._folded(expression) & ~self._folded(neutral) & observed[self._creases.faces].all((1, 2))
+        folds = np.flatnonzero(self._folded(expression, self._creases.faces))
+        faces = self._creases.faces[folds]
+        folds = folds[observed[faces].all((1, 2)) & ~self._folded(neutral, faces)]
         surface = [
             skull,
             stretch,
@@ -106,8 +109,9 @@ class ExpressionStatistics:
         ]
         return np.array(surface + reported)
 
-    def _folded(self, vertices: Float[np.ndarray, "V 3"]) -> Bool[np.ndarray, "_"]:
-        cosines = turn_cosines(torch.as_tensor(vertices), torch.as_tensor(self._creases.faces))
+    @staticmethod
+    def _folded(vertices: Float[np.ndarray, "V 3"], faces: Int[np.ndarray, "E 2 3"]) -> Bool[np.ndarray, "E"]:
+        cosines = turn_cosines(torch.as_tensor(vertices), torch.as_tensor(faces))
         return np.asarray(cosines.numpy() < np.cos(np.radians(SHARP_FOLD_DEG)))
 
 
