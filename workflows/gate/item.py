@@ -1,6 +1,7 @@
 """One registration at the gate, and the gate's own error: importing it loads no numeric library."""
 
 import math
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
@@ -10,6 +11,7 @@ from workflows.gate.figures import Assessed, GateFigures
 from workflows.gate.rules import Verdict
 
 Policy = Literal["auto", "person"]
+_OF_ROUND = re.compile(r"[^/]+/(?P<part>it[0-9]{2,}|held)/s[0-9]{5}-[^/]+/[^/]+")  # id of a registration's job
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -73,3 +75,17 @@ def gate_error(items: Sequence[GateItem]) -> GateError | None:
     low = float(beta.ppf(0.025, rejected, shown - rejected + 1)) if rejected else 0.0
     high = float(beta.ppf(0.975, rejected + 1, shown - rejected)) if rejected < shown else 1.0
     return GateError(shown=shown, rejected=rejected, low=low, high=high)
+
+
+def of_last_round(jobs: Sequence[str]) -> list[str]:
+    """Return which registrations of a run are at the gate: of a coregistration those of its last round, else all.
+
+    Args:
+        jobs: ids of the run's jobs that register captures.
+    """
+    found = [_OF_ROUND.fullmatch(job) for job in jobs]
+    parts = [match["part"] for match in found if match is not None]
+    if len(parts) < len(jobs):
+        return list(jobs)
+    last = max((part for part in parts if part != "held"), key=lambda part: int(part[2:]), default="held")
+    return [job for job, part in zip(jobs, parts, strict=True) if part == last]

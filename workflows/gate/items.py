@@ -10,7 +10,7 @@ from registration.storage.registration_folder import MANIFEST, RegistrationManif
 from workflows.engine.reader import DONE, FAILED, JobRow, QueueReader
 from workflows.gate.decisions import DecisionEntry
 from workflows.gate.figures import assess
-from workflows.gate.item import GateItem
+from workflows.gate.item import GateItem, of_last_round
 from workflows.gate.rules import GateThresholds, judge
 from workflows.ids import check_id
 from workflows.records.round_files import PLAN
@@ -150,15 +150,16 @@ def _published(store: Store, key: str) -> Found | None:
 def _in_queue(run: str, url: str) -> Iterator[Found]:
     """The registrations of a run's jobs that have ended, also of those that failed with a registration."""
     stores: dict[str, Store] = {}
-    for job in QueueReader(url).listing(check_id(run)):
-        if job.kind != "job" or job.state not in (DONE, FAILED):
+    jobs = {job.id: job for job in QueueReader(url).listing(check_id(run)) if "capture" in _arguments(job)}
+    for job in (jobs[identity] for identity in of_last_round(list(jobs))):
+        if job.state not in (DONE, FAILED):
             continue
         arguments = _arguments(job)
         if "store" in arguments and "key" in arguments:
             store = stores.setdefault(arguments["store"], Store(arguments["store"]))
             if (one := _published(store, check_id(arguments["key"]))) is not None:
                 yield one
-        elif {"capture", "out"} <= arguments.keys() and is_registration(Path(arguments["out"])):
+        elif "out" in arguments and is_registration(Path(arguments["out"])):
             place = Path(arguments["out"])
             name = f"{place.parent.name}/{place.name}"
             yield Found(name=name, place=str(place), manifest=read_manifest(place))

@@ -11,10 +11,11 @@ from typing import TYPE_CHECKING, Any
 from registration.errors import InputError
 from registration.storage.reading import parse_json
 from registration.storage.records import read_json
+from registration.terminal import printable
 from workflows.engine.reader import DONE, FAILED, JobRow
 from workflows.gate.decisions import DecisionEntry, DecisionLog, current
 from workflows.gate.figures import Assessed, read_figures
-from workflows.gate.item import GateItem
+from workflows.gate.item import GateItem, of_last_round
 from workflows.gate.rules import GateThresholds, judge, read_thresholds
 from workflows.ids import check_id, is_remote
 from workflows.records.store import Store
@@ -110,17 +111,8 @@ class GateBook:
 
 def _registrations(state: "ServiceState", run: str) -> list[Entry]:
     """The jobs of a run that have registered a capture."""
-    entries = [entry for entry in state.board.entries.values() if entry.run == run and entry.times.captures]
-    rounds = {part for entry in entries if (part := entry.id.split("/")[1])[:2] == "it" and part[2:].isdigit()}
-    last = max(rounds, default="")
-    driver = state.board.entries.get(run)
-    of_rounds = (
-        last
-        and driver is not None
-        and driver.times.kind == "flow"
-        and all(entry.id.split("/")[1] in (*rounds, "held") for entry in entries)
-    )
-    chosen = [entry for entry in entries if not of_rounds or entry.id.split("/")[1] == last]
+    entries = {key: one for key, one in state.board.entries.items() if one.run == run and one.times.captures}
+    chosen = [entries[job] for job in of_last_round(list(entries))]
     return [
         entry
         for entry in chosen
@@ -146,9 +138,9 @@ def _item(state: "ServiceState", row: JobRow, run: str, thresholds: GateThreshol
         is_neutral=not isinstance(inputs, dict) or "neutral" not in inputs,
         figures=read_figures(figures if isinstance(figures, dict) else {}),
     )
-    return GateItem(
-        name=row.id.removeprefix(f"{run}/"), place=place, assessed=assessed, verdict=judge(assessed, thresholds)
-    )
+    stored = "store" in arguments_of(row)
+    name = row.id.removeprefix(f"{run}/") if stored else printable("/".join(Path(place).parts[-2:]))  # as `gnmreg gate`
+    return GateItem(name=name, place=place, assessed=assessed, verdict=judge(assessed, thresholds))
 
 
 def _manifest(state: "ServiceState", row: JobRow) -> tuple[str, Any]:

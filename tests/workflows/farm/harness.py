@@ -18,6 +18,8 @@ from workflows.engine.process import migrate
 from workflows.engine.reader import QueueReader
 
 QUICK = {"poll_s": 0.3, "release_s": 1.0, "uptime_s": 0.0}
+LIGHT = {"steps": "tests.workflows.farm.steps", "flows": "tests.workflows.farm.flows"}
+TRUE_ROUNDS = dict.fromkeys(LIGHT, "tests.workflows.farm.true_steps")
 
 
 def interruptible() -> None:
@@ -28,9 +30,12 @@ def interruptible() -> None:
 class Farm:
     """A queue and its processes, named by their executor ids."""
 
-    def __init__(self, folder: Path, url: str, timeouts: dict[str, float] | None = None) -> None:
+    def __init__(
+        self, folder: Path, url: str, timeouts: dict[str, float] | None = None, work: dict[str, str] = LIGHT
+    ) -> None:
+        """`work`: the modules with `STEPS` and with `FLOWS`."""
         self.folder, self.url = folder, url
-        self.settings: dict[str, Any] = {"timeouts": timeouts or QUICK}
+        self.settings: dict[str, Any] = {"timeouts": timeouts or QUICK, **work}
         self.processes: dict[str, subprocess.Popen[bytes]] = {}
         self.trace = folder / "trace.txt"
         migrate(url)
@@ -108,8 +113,10 @@ class Farm:
 
 
 @contextmanager
-def open_farm(folder: Path, url: str | None = None, timeouts: dict[str, float] | None = None) -> Iterator[Farm]:
-    farm = Farm(folder, url or f"sqlite:///{folder / 'queue.sqlite'}", timeouts)
+def open_farm(
+    folder: Path, url: str | None = None, timeouts: dict[str, float] | None = None, work: dict[str, str] = LIGHT
+) -> Iterator[Farm]:
+    farm = Farm(folder, url or f"sqlite:///{folder / 'queue.sqlite'}", timeouts, work)
     try:
         yield farm
     finally:

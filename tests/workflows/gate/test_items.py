@@ -5,6 +5,7 @@ import hashlib
 import json
 import os
 from dataclasses import replace
+from itertools import count
 from pathlib import Path
 
 import pytest
@@ -16,7 +17,7 @@ from tests.workflows.gate.test_decisions import ruling
 from workflows.cli.app import main
 from workflows.engine.reader import JobRow
 from workflows.gate.decisions import DecisionLog, current
-from workflows.gate.item import gate_error
+from workflows.gate.item import gate_error, of_last_round
 from workflows.gate.items import find_registrations, gate_items
 from workflows.gate.rules import GateThresholds
 from workflows.gate.table import accepted_id, to_csv
@@ -207,8 +208,10 @@ def test_a_run_of_the_queue_is_found_by_its_name(run, tmp_path, monkeypatch):
         store.produce(key, input_hash="h", make=make)
     shared = {"kind": "job", "executor": None, "result": None, "failure": None, "created": 0.0, "ended": None}
 
+    ids = count()
+
     def job(state: str, **arguments: str) -> JobRow:
-        return JobRow(id="r/x", state=state, spec={"step": "s", "arguments": arguments}, **shared)
+        return JobRow(id=f"night/{next(ids)}", state=state, spec={"step": "s", "arguments": arguments}, **shared)
 
     rows = [
         job("done", capture="/c", store=store.url, key="cyd/smile"),
@@ -233,3 +236,11 @@ def test_a_run_of_the_queue_is_found_by_its_name(run, tmp_path, monkeypatch):
         find_registrations("day", "sqlite:///q")
     with pytest.raises(InputError, match="cannot be used"):
         find_registrations("../night", "sqlite:///q")
+
+
+def test_of_a_coregistration_the_last_round_is_at_the_gate():
+    rounds = [f"week/{part}/s00000-ann/{name}" for part in ("held", "it02", "it00", "it10") for name in ("a", "b")]
+    assert of_last_round(rounds) == rounds[-2:]
+    assert of_last_round(rounds[:2]) == rounds[:2]  # nothing but the held-out subjects yet
+    assert of_last_round(["night/it00/smile", *rounds]) == ["night/it00/smile", *rounds]
+    assert of_last_round([]) == []
