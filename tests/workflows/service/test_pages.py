@@ -285,11 +285,13 @@ def test_decisions_are_bound_to_what_was_seen_and_can_be_undone(farm):
 
 def test_a_parked_run_can_go_on_when_nothing_waits(farm):
     assert "Continue the run" not in see(farm, f"/gate/{RUN}", "operator").text
+    assert "Continue the run" not in see(farm, "/coregistrations/week7", "operator").text
     times = {"started_at_epoch_ms": 1, "completed_at": 2, "executor_id": "c0", "output": None}
     error = json.dumps({"error": {"status": "parked", "reason": "the gate"}})
     pretended_queue.write(farm.state.settings.url, [{"id": "week7", "status": "ERROR", "error": error, **times}])
     farm.state.board.refresh()
     assert "Continue the run" in see(farm, "/gate/week7", "operator").text
+    assert "Continue the run" in see(farm, "/coregistrations/week7", "operator").text
     assert "Continue the run" not in see(farm, "/gate/week7", "reviewer").text
 
 

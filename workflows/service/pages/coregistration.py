@@ -127,10 +127,6 @@ def _models(found: Coregistration) -> list[dict[str, Any]]:
     return rows
 
 
-def _origin(built: Mapping[str, Any]) -> str:
-    return f"{built['registered']} registrations, {len(built['rejected'])} left out"
-
-
 def _at(table: Mapping[str, Mapping[str, float]], name: str, components: str) -> str:
     value = table.get(name, {}).get(components)
     return "–" if value is None else f"{value:.3f}"
