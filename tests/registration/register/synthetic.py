@@ -4,7 +4,7 @@ Identity, expression, joints, pose in a rotated world, offsets, texture and came
 images come from the renderer with many rays per pixel, the fit's from one.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -65,16 +65,23 @@ class Truth:
     gains: Float[np.ndarray, "N"]
 
 
-def make(root: Path, expression: str = "neutral") -> Truth:
-    """Write the capture `root` of one expression."""
+def make(
+    root: Path,
+    expression: str = "neutral",
+    subject: str = "tiny",
+    identity: Float[np.ndarray, "I"] = IDENTITY,
+    cameras: Sequence[int] = range(len(RIG)),
+    **tags: object,
+) -> Truth:
+    """Write the capture `root` of one expression of a subject, seen by some of the cameras."""
     data = read(MODEL)
-    parameters, offsets = _known(data, expression)
+    parameters, offsets = _known(data, expression, identity)
     vertices = GNM(data)(parameters, torch.as_tensor(offsets, dtype=torch.float32)).numpy()
     scheme = read_scheme(FIXTURES / "head_sparse_68.txt", vertices)
-    cameras = [_camera(*row, number) for number, row in enumerate(RIG)]
-    images = _images(data, vertices, cameras)
+    seen_by = [_camera(*RIG[number], number) for number in cameras]
+    images = _images(data, vertices, seen_by)
     views = []
-    for number, (camera, image) in enumerate(zip(cameras, images, strict=True)):
+    for number, camera, image in zip(cameras, seen_by, images, strict=True):
         points = scheme.points(vertices)
         is_visible = visible(points, vertices, data.triangles, camera, 2e-3)
         landmarks = np.column_stack([camera.project(points)[0], np.where(is_visible, 1.0, 0.2)])
@@ -82,22 +89,24 @@ def make(root: Path, expression: str = "neutral") -> Truth:
     write_capture(
         root,
         views,
-        CaptureDescription(subject="tiny", expression=expression, classes=LABELS),
+        CaptureDescription(subject=subject, expression=expression, classes=LABELS, tags=tags),
         scan=_scan(data, vertices),
         truth=vertices,
         bits=16,
     )
-    return Truth(root=root, parameters=parameters, offsets=offsets, vertices=vertices, gains=GAINS)
+    return Truth(root=root, parameters=parameters, offsets=offsets, vertices=vertices, gains=GAINS[list(cameras)])
 
 
-def _known(data: GNMData, expression: str) -> tuple[Parameters, Float[np.ndarray, "V 3"]]:
+def _known(
+    data: GNMData, expression: str, identity: Float[np.ndarray, "I"]
+) -> tuple[Parameters, Float[np.ndarray, "V 3"]]:
     """The parameters, and smooth offsets of a millimetre or two on the skin."""
     rotations = np.zeros((len(data.joint_names), 3))
     rotations[0] = WORLD.as_rotvec()
     rotations[1] = HEAD_TURN[expression]
     root_joint = data.template_joint_positions[0]
     parameters = Parameters(
-        identity=torch.tensor(IDENTITY, dtype=torch.float32),
+        identity=torch.tensor(identity, dtype=torch.float32),
         expression=torch.tensor(EXPRESSIONS[expression]),
         rotations=torch.tensor(rotations, dtype=torch.float32),
         translation=torch.tensor(

@@ -1,6 +1,5 @@
 """The client, `--server`, and the commands of docs/service.md against a real service."""
 
-import re
 import shutil
 import subprocess
 import sys
@@ -12,6 +11,7 @@ from registration.errors import InputError
 from tests.conftest import FIXTURES, ROOT
 from tests.workflows.conftest import add
 from tests.workflows.service.conftest import RunningService
+from tests.workflows.service.document import blocks
 from workflows.cli.app import main
 from workflows.service.client import ServiceClient, ServiceRefusal, read_token
 
@@ -33,13 +33,6 @@ def laptop(capture, tmp_path, monkeypatch) -> Path:
         add(capture, tmp_path / subject / "rest", "neutral", subject)
     monkeypatch.chdir(tmp_path)
     return tmp_path
-
-
-def blocks(section: str) -> str:
-    """The commands in a section of docs/service.md."""
-    text = (ROOT / "docs" / "service.md").read_text("utf-8")
-    part = text.split(f"\n## {section}\n")[1].split("\n## ")[0]
-    return "\n".join(re.findall(r"```sh\n(.*?)```", part, re.DOTALL))
 
 
 @pytest.mark.skipif(shutil.which("curl") is None, reason="no curl")
