@@ -1,4 +1,4 @@
-"""What the helper does for uploads: the doctor's checks, which decode images."""
+"""What a library process does for uploads: the doctor's checks, which decode images."""
 
 from pathlib import Path
 from typing import Any

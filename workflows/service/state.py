@@ -16,8 +16,8 @@ from workflows.service.access import Access
 from workflows.service.audit import AuditLog
 from workflows.service.board import Board
 from workflows.service.gate_book import GateBook
-from workflows.service.helper import Helper
 from workflows.service.idempotency import Answers
+from workflows.service.library_process import LibraryProcess
 from workflows.service.places import Places
 from workflows.service.reviews import Reviews
 from workflows.service.settings import RESULTS, ServiceSettings
@@ -66,7 +66,7 @@ class ServiceState:
         self.settings = settings
         self.places = Places(settings)
         self.uploads = Uploads(settings)
-        self.submitting = Helper("workflows.service.submitting")
+        self.submitting = LibraryProcess("workflows.service.submitting")
         self.answers = Answers(settings.state)
         self.tokens = Tokens(settings.state)
         self.audit = AuditLog(settings.state)

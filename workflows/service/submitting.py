@@ -1,4 +1,4 @@
-"""What the helper does for submissions: the checks that need the library."""
+"""What a library process does for submissions: the checks that need the library."""
 
 import shutil
 from collections.abc import Mapping, Sequence
@@ -18,7 +18,7 @@ from workflows.farm.plan import RoundSettings, make_plan
 from workflows.farm.subject import subject_run, submit_subject
 from workflows.gate.decisions import DecisionLog
 from workflows.gate.rules import read_thresholds
-from workflows.service.helper import Conflict
+from workflows.service.library_process import Conflict
 from workflows.service.places import FIRST, OFFICIAL
 from workflows.steps.job_options import from_job
 

@@ -20,7 +20,7 @@ from registration.storage.files import exchange
 from registration.storage.records import Record
 from workflows.ids import check_id
 from workflows.service.archives import digest_of_files, files_of, unpack
-from workflows.service.helper import Helper
+from workflows.service.library_process import LibraryProcess
 from workflows.service.problems import Problem
 from workflows.service.settings import CAPTURES, ServiceSettings
 
@@ -71,7 +71,7 @@ class Uploads:
         self.limits = settings.uploads
         self._records = settings.state / CAPTURES
         self._incoming = self.folder / _INCOMING
-        self._helper = Helper("workflows.service.examining")
+        self._library = LibraryProcess("workflows.service.examining")
 
     def start(self) -> None:
         """Delete what uploads have left that ended with their process."""
@@ -81,7 +81,7 @@ class Uploads:
 
     def stop(self) -> None:
         """Stop the doctor."""
-        self._helper.stop()
+        self._library.stop()
 
     def names(self, subject: str | None = None) -> list[tuple[str, str]]:
         """Return subject and name of all captures, sorted."""
@@ -128,7 +128,7 @@ class Uploads:
         digests = unpack(incoming.archive, unpacked, self.limits)
         incoming.archive.unlink()
         root = _root(unpacked, incoming)
-        found = self._helper.call("examine", folder=str(root), name=incoming.title)
+        found = self._library.call("examine", folder=str(root), name=incoming.title)
         if found["errors"]:
             raise _refusal(found["errors"])
         prefix = root.relative_to(unpacked).as_posix()

@@ -1,4 +1,4 @@
-"""Child processes for work that needs the whole library: the service itself stays small, and survives what they do."""
+"""A child process for work that needs the whole library: the service stays small, and survives what the work does."""
 
 import importlib
 import traceback
@@ -14,7 +14,7 @@ from workflows.service.problems import Problem
 TIMEOUT_S = 600.0
 
 
-class Helper:
+class LibraryProcess:
     """One child process, started with the first call and again after it died. Calls wait for one another."""
 
     def __init__(self, module: str) -> None:
