@@ -8,7 +8,7 @@ from typing import Any
 
 from registration.errors import InputError
 from registration.storage.records import read_json
-from workflows.ids import check_location, is_remote, resolve_roots
+from workflows.ids import is_remote
 from workflows.records.round_files import MANIFEST, PLAN, model_name
 from workflows.service.problems import Problem
 from workflows.service.results import arguments_of
@@ -43,7 +43,7 @@ def coregistration(state: ServiceState, run: str) -> Coregistration:
     if row is None or row.spec.get("flow") != "coregister":
         raise Problem.missing("coregistration", run, "see the overview")
     try:
-        plan = check_location(arguments_of(row).get("plan"), resolve_roots(state.settings.all_roots), "plan")
+        plan = state.places.of_row(arguments_of(row).get("plan"), "plan")
         if is_remote(plan) or Path(plan).name != PLAN:
             raise Problem.missing("plan", run)
         folder = Path(plan).parent

@@ -21,7 +21,7 @@ from workflows.ids import check_id, is_remote
 from workflows.records.store import Store
 from workflows.service.board import Entry
 from workflows.service.problems import Problem
-from workflows.service.results import REGISTRATION, arguments_of, checked_place, results_of
+from workflows.service.results import REGISTRATION, arguments_of, results_of
 
 if TYPE_CHECKING:
     from workflows.service.state import ServiceState
@@ -146,7 +146,7 @@ def _item(state: "ServiceState", row: JobRow, run: str, thresholds: GateThreshol
 def _manifest(state: "ServiceState", row: JobRow) -> tuple[str, Any]:
     """Where the registration is, and its manifest. Raises InputError or Problem."""
     arguments = arguments_of(row)
-    if "store" in arguments and is_remote(url := checked_place(state, arguments["store"], "store")):
+    if "store" in arguments and is_remote(url := state.places.of_row(arguments["store"], "store")):
         store = Store(url)
         artifact = store.find(check_id(arguments.get("key", "")))
         if artifact is None:

@@ -3,6 +3,7 @@
 from collections.abc import Iterator
 from http import HTTPStatus
 from pathlib import Path
+from typing import Any
 
 from registration.errors import InputError
 from registration.terminal import printable
@@ -45,6 +46,25 @@ class Places:
         if not self._is_offered(place):
             raise self._foreign(where, got=repr(printable(location)[:200]))
         return place
+
+    def of_row(self, place: Any, where: str) -> str:
+        """Return a path or URL of a queue's row, in the form in which it is opened: others can write to the queue.
+
+        Raises:
+            Problem: 404 if it lies outside the roots.
+            InputError: it is malformed.
+        """
+        try:
+            return check_location(place, self.roots, where)
+        except OutsideRoots as error:
+            raise Problem(
+                HTTPStatus.NOT_FOUND,
+                "The results are outside the folders of the service",
+                where=where,
+                expected=error.expected,
+                got=error.got,
+                fix="start the service with --root and their folder",
+            ) from None
 
     def allows(self, location: str) -> bool:
         """Return whether `check` accepts a location."""

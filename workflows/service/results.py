@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from registration.errors import InputError
 from workflows.engine.reader import JobRow
-from workflows.ids import OutsideRoots, check_id, check_location, is_remote, resolve_roots
+from workflows.ids import check_id, is_remote
 from workflows.records.store import ATTEMPT, Store
 from workflows.service.problems import Problem
 
@@ -49,7 +49,7 @@ def results_of(state: "ServiceState", row: JobRow) -> JobResults | None:
         if "store" in arguments:
             return _stored(state, row, arguments)
         if "capture" in arguments and "out" in arguments:
-            place = checked_place(state, arguments["out"], "out")
+            place = state.places.of_row(arguments["out"], "out")
             return None if is_remote(place) else JobResults(registration=Path(place), thumbnail=None)
     except InputError as error:
         raise Problem.of_input(error, HTTPStatus.NOT_FOUND) from None
@@ -57,7 +57,7 @@ def results_of(state: "ServiceState", row: JobRow) -> JobResults | None:
 
 
 def _stored(state: "ServiceState", row: JobRow, arguments: Mapping[str, Any]) -> JobResults | None:
-    store = Store(checked_place(state, arguments["store"], "store"))
+    store = Store(state.places.of_row(arguments["store"], "store"))
     key = check_id(arguments.get("key", ""))
     if store.local is None:
         return None
@@ -70,18 +70,3 @@ def _stored(state: "ServiceState", row: JobRow, arguments: Mapping[str, Any]) ->
         return None
     folder = store.local / key / attempt
     return JobResults(registration=folder / REGISTRATION, thumbnail=folder / THUMBNAIL)
-
-
-def checked_place(state: "ServiceState", place: Any, where: str) -> str:
-    """Return a path or URL of a row in the form in which it is opened. Raises Problem if it is outside the roots."""
-    try:
-        return check_location(place, resolve_roots(state.settings.all_roots), where)
-    except OutsideRoots as error:
-        raise Problem(
-            HTTPStatus.NOT_FOUND,
-            "The results are outside the folders of the service",
-            where=where,
-            expected=error.expected,
-            got=error.got,
-            fix="start the service with --root and their folder",
-        ) from None

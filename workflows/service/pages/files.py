@@ -17,7 +17,6 @@ from starlette.responses import Response
 from registration.errors import InputError
 from registration.storage.reading import read_bytes
 from workflows.engine.reader import JobRow
-from workflows.ids import check_location, resolve_roots
 from workflows.service.access import need
 from workflows.service.api.jobs import find_entry
 from workflows.service.middleware import SANDBOX
@@ -121,7 +120,7 @@ def _read(state: ServiceState, file: Path, max_bytes: int = MAX_PAGE_BYTES) -> b
     """The content of a result's file, which must not lead elsewhere by a link. Raises Problem."""
     refuse = partial(InputError, "The file cannot be read", where=file.name, fix="see the job's log")
     try:
-        place = check_location(str(file), resolve_roots(state.settings.all_roots), file.name)
+        place = state.places.of_row(str(file), file.name)
         return read_bytes(Path(place), refuse, max_bytes=max_bytes)
-    except InputError:
+    except (InputError, Problem):
         raise Problem.missing("file", file.name, "see the job's log") from None
