@@ -66,10 +66,7 @@ def verdicts(runs: Runs, /, out: OptionalFile = None, gate: GateOptions = _GATE,
     accepted, waiting = sum(item.accepted(gate.policy) for item in items), sum(item.waits for item in items)
     print(f"{len(items)} registrations: {shown}; {accepted} may be used, {waiting} wait for a person")
     if (error := gate_error(items)) is not None:
-        print(
-            f"of {error.shown} accepted ones that a person was shown, {error.rejected} were rejected: "
-            f"{error.share:.1%} of the accepted are wrong (95 %: {error.low:.1%} to {error.high:.1%})"
-        )
+        print(error.text)
     if out is not None:
         _write(out, to_csv(items, gate.policy))
     return 0

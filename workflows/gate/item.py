@@ -11,6 +11,7 @@ from workflows.gate.figures import Assessed, GateFigures
 from workflows.gate.rules import Verdict
 
 Policy = Literal["auto", "person"]
+TAIL = 0.025  # on either side of an interval of 95 %
 _OF_ROUND = re.compile(r"[^/]+/(?P<part>it[0-9]{2,}|held)/s[0-9]{5}-[^/]+/[^/]+")  # id of a registration's job
 
 
@@ -63,18 +64,48 @@ class GateError:
     def share(self) -> float:
         return self.rejected / self.shown if self.shown else math.nan
 
+    @property
+    def text(self) -> str:
+        """What people are told."""
+        return (
+            f"of {self.shown} accepted ones that a person was shown, {self.rejected} were rejected: "
+            f"{self.share:.1%} of the accepted are wrong (95 %: {self.low:.1%} to {self.high:.1%})"
+        )
+
 
 def gate_error(items: Sequence[GateItem]) -> GateError | None:
     """Return the gate's own error, from the sample of the accepted; None: no person has decided about any of it."""
-    from scipy.stats import beta
-
     decided = [item.decision for item in items if item.verdict.sampled and item.decision is not None]
     shown, rejected = len(decided), sum(entry.decision == "reject" for entry in decided)
     if not shown:
         return None
-    low = float(beta.ppf(0.025, rejected, shown - rejected + 1)) if rejected else 0.0
-    high = float(beta.ppf(0.975, rejected + 1, shown - rejected)) if rejected < shown else 1.0
+    low = _share_at(rejected - 1, shown, 1 - TAIL) if rejected else 0.0
+    high = _share_at(rejected, shown, TAIL) if rejected < shown else 1.0
     return GateError(shown=shown, rejected=rejected, low=low, high=high)
+
+
+def _share_at(most: int, shown: int, probability: float) -> float:
+    """The share of wrong ones with which at most so many of those shown are wrong with a probability: bisected."""
+    low, high = 0.0, 1.0
+    for _ in range(50):
+        share = (low + high) / 2
+        low, high = (share, high) if _at_most(most, shown, share) > probability else (low, share)
+    return (low + high) / 2
+
+
+def _at_most(most: int, shown: int, share: float) -> float:
+    """The probability that at most so many of those shown are wrong: the binomial distribution."""
+    logs = math.log(share), math.log1p(-share)
+    return sum(
+        math.exp(
+            math.lgamma(shown + 1)
+            - math.lgamma(k + 1)
+            - math.lgamma(shown - k + 1)
+            + k * logs[0]
+            + (shown - k) * logs[1]
+        )
+        for k in range(most + 1)
+    )
 
 
 def of_last_round(jobs: Sequence[str]) -> list[str]:

@@ -7,8 +7,10 @@ import os
 from dataclasses import replace
 from itertools import count
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
+from scipy.stats import beta
 
 import workflows.gate.items
 from registration.errors import InputError
@@ -130,6 +132,17 @@ def test_the_gates_own_error_comes_from_the_sample(run, tmp_path):
     assert error is not None and (error.shown, error.rejected, error.share) == (2, 1, 0.5)  # two are accepted
     assert 0.01 < error.low < 0.02 and 0.98 < error.high < 0.99  # of the exact interval of 1 in 2
     assert gate_error(gate_items(find_registrations(str(run)), QUIET, current(log.read()))) is None
+
+
+@pytest.mark.parametrize(("rejected", "shown"), [(0, 1), (1, 1), (0, 40), (3, 40), (39, 40), (500, 1000), (2, 50_000)])
+def test_the_interval_of_the_error_is_exact(rejected, shown):
+    """Clopper and Pearson's, as the beta distribution gives it."""
+    entry = SimpleNamespace(decision="reject"), SimpleNamespace(decision="accept")
+    shown_one = [SimpleNamespace(verdict=SimpleNamespace(sampled=True), decision=one) for one in entry]
+    error = gate_error([shown_one[0]] * rejected + [shown_one[1]] * (shown - rejected))
+    low = beta.ppf(0.025, rejected, shown - rejected + 1) if rejected else 0.0
+    high = beta.ppf(0.975, rejected + 1, shown - rejected) if rejected < shown else 1.0
+    assert (error.low, error.high) == pytest.approx((low, high), abs=1e-9)
 
 
 def test_the_table_holds_no_formula_and_the_set_has_one_id(run):

@@ -13,10 +13,17 @@ from workflows.engine.client import MAX_PRIORITY, QueueClient
 from workflows.engine.jobs import DRIVER, FlowJob, Job
 from workflows.farm.status import require_part
 from workflows.service.access import need
+from workflows.service.idempotency import RepeatableRoute, idempotency_key
 from workflows.service.problems import RESPONSES, Problem
 from workflows.service.state import Service, ServiceState
 
-router = APIRouter(tags=["actions"], dependencies=[Depends(need("operator"))], responses=RESPONSES, max_body_size=2**16)
+router = APIRouter(
+    tags=["actions"],
+    dependencies=[Depends(need("operator")), Depends(idempotency_key)],
+    responses=RESPONSES,
+    route_class=RepeatableRoute,
+    max_body_size=2**16,
+)
 Part = Annotated[str, Field(max_length=800, examples=["monday"], description="a run, a part of one, or a job")]
 
 

@@ -1,5 +1,6 @@
 """Routes of the quality gate: what waits for a person, decisions, their log."""
 
+from dataclasses import asdict
 from http import HTTPStatus
 from typing import Annotated, Literal
 
@@ -9,7 +10,7 @@ from pydantic import BaseModel, Field
 from registration.errors import InputError
 from workflows.engine.reader import FAILED
 from workflows.gate.decisions import MAX_REASON, DecisionEntry, Ruling
-from workflows.gate.item import GateItem, Policy
+from workflows.gate.item import GateItem, Policy, gate_error
 from workflows.service.access import Identity, need
 from workflows.service.api.jobs import Limit, Offset, find_entry
 from workflows.service.gate_book import GateRun
@@ -57,6 +58,15 @@ class GateRow(BaseModel):
     accepted: bool = Field(description="whether a model may be built from it")
 
 
+class Error(BaseModel):
+    """How many of the accepted are wrong, from the sample of them that a person was shown."""
+
+    shown: int
+    rejected: int
+    low: float = Field(description="bounds of the share, 95 %")
+    high: float
+
+
 class GatePage(BaseModel):
     """A part of the registrations of a run."""
 
@@ -65,6 +75,7 @@ class GatePage(BaseModel):
     unread: int = Field(description="registrations that are not read yet: ask again")
     counts: dict[str, int]
     thresholds: str = Field(description="content id")
+    error: Error | None = Field(description="the rules' own; null: no person was shown one of the accepted")
     items: list[GateRow]
 
 
@@ -111,6 +122,7 @@ def items(
         unread=gate.unread,
         counts=counts(gate),
         thresholds=gate.thresholds.content_id,
+        error=None if (error := gate_error(list(gate.items.values()))) is None else Error(**asdict(error)),
         items=[_row(job, item, policy) for job, item in chosen[offset : offset + limit]],
     )
 

@@ -10,7 +10,7 @@ from starlette.responses import Response
 
 from registration.errors import InputError
 from workflows.gate.figures import FIGURES
-from workflows.gate.item import GateItem
+from workflows.gate.item import GateItem, gate_error
 from workflows.service.access import need
 from workflows.service.api.gate import Shown, can_continue, counts, fits, gate_run
 from workflows.service.api.jobs import expression_name, list_runs
@@ -72,6 +72,7 @@ def review(
         run=run,
         show=show,
         counts=counts(gate),
+        error=gate_error(list(gate.items.values())),
         total=len(gate.items),
         unread=gate.unread,
         job=shown,
