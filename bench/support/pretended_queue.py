@@ -77,24 +77,40 @@ def fill(url: str, folder: Path, run: str, captures: int, *, shares: Shares = Sh
 def result_text(chance: random.Random) -> str:
     """Return the outcome of a registration as a row has it."""
     bad = chance.random() < 0.05
-    residuals = {
-        "silhouette_px": chance.lognormvariate(-0.9, 0.25),
-        "normals_deg": chance.lognormvariate(1.1, 0.2) * (3 if bad else 1),
-        "colour_levels": chance.lognormvariate(1.6, 0.2),
-        "landmarks_px": chance.lognormvariate(0.7, 0.3),
-    }
     verdict = {"level": "look", "reasons": ["normals are off in the images"]} if bad else {"level": "good"}
     scan = {"mean_mm": chance.lognormvariate(-1.9, 0.2), "median_mm": 0.1, "p95_mm": chance.lognormvariate(-0.6, 0.2)}
     about = {
         "status": "stopped" if bad and chance.random() < 0.5 else "converged",
         "reason": "vertices moved by 0.003 mm over the last tenth of the last stage",
-        "figures": {"verdict": verdict, "residuals": {"overall": residuals}, "scan_to_mesh": {"face": scan}},
+        "figures": {
+            "verdict": verdict,
+            "residuals": {"overall": _residuals(chance, bad)},
+            "scan_to_mesh": {"face": scan},
+        },
         "seconds": 28.5,
         "thumbnail": True,
     }
     content = f"{chance.getrandbits(256):064x}"
     result = {"key": "", "content_id": content, "about": about, "attempt": ATTEMPT, "made": True}
     return json.dumps({"status": "done", "reason": "", "seconds": 30.0, "result": result})
+
+
+def write_manifests(folder: Path, keys: Iterable[str], seed: int = 0) -> None:
+    """Write the manifests of registrations that jobs have published; six views each.
+
+    Args:
+        folder: of the results.
+        keys: of the jobs below it, SUBJECT/CAPTURE.
+        seed: of what is random.
+    """
+    chance = random.Random(seed)
+    for key in keys:
+        views = {f"cam{view:02d}": _residuals(chance, bad=False) for view in range(6)}
+        figures = {"residuals": {"overall": _residuals(chance, bad=chance.random() < 0.05), "views": views}}
+        manifest = {"content_id": f"{chance.getrandbits(256):064x}", "status": "converged", "figures": figures}
+        place = folder / key / ATTEMPT / "registration" / "manifest.json"
+        place.parent.mkdir(parents=True)
+        place.write_text(json.dumps(manifest))
 
 
 def write(url: str, changes: Iterable[dict[str, Any]]) -> None:
@@ -117,6 +133,15 @@ def pretend_workers(url: str, names: Sequence[str]) -> list[FileLocks]:
     for lock, name in zip(locks, names, strict=True):
         lock.take(name)
     return locks
+
+
+def _residuals(chance: random.Random, bad: bool) -> dict[str, float]:
+    return {
+        "silhouette_px": chance.lognormvariate(-0.9, 0.25),
+        "normals_deg": chance.lognormvariate(1.1, 0.2) * (3 if bad else 1),
+        "colour_levels": chance.lognormvariate(1.6, 0.2),
+        "landmarks_px": chance.lognormvariate(0.7, 0.3),
+    }
 
 
 def _whole(change: dict[str, Any]) -> dict[str, Any]:

@@ -87,6 +87,7 @@ class ServiceState:
     def stop(self) -> None:
         """End threads and child processes."""
         self.board.stop()
+        self.gate.stop()
         self.uploads.stop()
         self.reviews.stop()
         self.submitting.stop()

@@ -10,15 +10,14 @@ from pydantic import BaseModel, Field
 from registration.errors import InputError
 from workflows.engine.reader import FAILED
 from workflows.gate.decisions import MAX_REASON, DecisionEntry, Ruling
-from workflows.gate.item import GateItem, Policy, gate_error
+from workflows.gate.item import GateItem, Policy
 from workflows.service.access import Identity, need
 from workflows.service.api.jobs import Limit, Offset, find_entry
-from workflows.service.gate_book import GateRun
+from workflows.service.gate_book import GateRun, Shown, fits
 from workflows.service.problems import RESPONSES, Problem
 from workflows.service.state import Service, ServiceState
 
 router = APIRouter(tags=["gate"], dependencies=[Depends(need("viewer"))], responses=RESPONSES)
-Shown = Literal["waiting", "decided", "accept", "look", "reject", "all"]
 Reviewer = Annotated[Identity, Depends(need("reviewer"))]
 
 
@@ -120,9 +119,9 @@ def items(
         total=len(chosen),
         offset=offset,
         unread=gate.unread,
-        counts=counts(gate),
+        counts=dict(gate.counts),
         thresholds=gate.thresholds.content_id,
-        error=None if (error := gate_error(list(gate.items.values()))) is None else Error(**asdict(error)),
+        error=None if gate.error is None else Error(**asdict(gate.error)),
         items=[_row(job, item, policy) for job, item in chosen[offset : offset + limit]],
     )
 
@@ -157,7 +156,7 @@ def decide(state: Service, request: Request, identity: Reviewer, given: Decision
         entry = state.gate.log.append(ruling)
     except InputError as error:
         raise Problem.of_input(error, HTTPStatus.CONFLICT if given.decision == "undo" else HTTPStatus(422)) from None
-    waiting = len(gate_run(state, run).waiting())
+    waiting = gate_run(state, run).counts["waiting"]
     return Decided(entry=_entry(entry), waiting=waiting, can_continue=can_continue(state, run, gate.unread + waiting))
 
 
@@ -180,21 +179,6 @@ def can_continue(state: ServiceState, run: str, waiting: int) -> bool:
     """Return whether a run has been parked and no registration of it waits for a person."""
     driver = state.board.entries.get(run)
     return waiting == 0 and driver is not None and driver.times.kind == "flow" and driver.times.state == FAILED
-
-
-def counts(gate: GateRun) -> dict[str, int]:
-    """Return how many registrations a filter shows."""
-    kinds: tuple[Shown, ...] = ("waiting", "decided", "accept", "look", "reject")
-    return {kind: sum(fits(item, kind) for item in gate.items.values()) for kind in kinds}
-
-
-def fits(item: GateItem, show: Shown) -> bool:
-    """Return whether a filter shows a registration."""
-    if show == "waiting":
-        return item.waits
-    if show == "decided":
-        return item.decision is not None
-    return show in ("all", item.verdict.level)
 
 
 def _row(job: str, item: GateItem, policy: Policy) -> GateRow:

@@ -10,11 +10,11 @@ from starlette.responses import Response
 
 from registration.errors import InputError
 from workflows.gate.figures import FIGURES
-from workflows.gate.item import GateItem, gate_error
+from workflows.gate.item import GateItem
 from workflows.service.access import need
-from workflows.service.api.gate import Shown, can_continue, counts, fits, gate_run
+from workflows.service.api.gate import can_continue, gate_run
 from workflows.service.api.jobs import expression_name, list_runs
-from workflows.service.gate_book import GateRun
+from workflows.service.gate_book import GateRun, Shown, fits
 from workflows.service.pages.base import page
 from workflows.service.pages.files import picture_url, pictures, row_of
 from workflows.service.problems import Problem
@@ -22,7 +22,7 @@ from workflows.service.results import results_of
 from workflows.service.state import Service, ServiceState
 
 router = APIRouter(include_in_schema=False, dependencies=[Depends(need("viewer"))])
-MAX_RUNS, RUN_S = 12, 0.25  # runs on the first page, and for how long the registrations of each are read
+MAX_RUNS, RUN_S = 12, 0.01  # runs on the first page, and for how long it waits for each
 VIEWS = 3  # of the cameras
 LISTED = 60  # registrations that are listed beside the one that is shown
 LOGGED = 40
@@ -39,7 +39,7 @@ def gate_page(state: Service, request: Request) -> Response:
         for run in list_runs(state)[:MAX_RUNS]:
             gate = state.gate.of_run(state, run.id, RUN_S)
             if gate.items or gate.unread:
-                runs.append({"id": run.id, "counts": counts(gate), "unread": gate.unread, "total": len(gate.items)})
+                runs.append({"id": run.id, "counts": gate.counts, "unread": gate.unread, "total": len(gate.items)})
         log = state.gate.log.read()[::-1][:LOGGED]
     except InputError as error:
         log, problem = (), error.line
@@ -71,8 +71,8 @@ def review(
         "gate_review.html",
         run=run,
         show=show,
-        counts=counts(gate),
-        error=gate_error(list(gate.items.values())),
+        counts=gate.counts,
+        error=gate.error,
         total=len(gate.items),
         unread=gate.unread,
         job=shown,
@@ -86,7 +86,7 @@ def review(
         found=len(chosen),
         at=at + 1,
         last=_last_decision(state, request, gate),
-        can_continue=can_continue(state, run, gate.unread + len(gate.waiting())),
+        can_continue=can_continue(state, run, gate.unread + gate.counts["waiting"]),
     )
 
 
