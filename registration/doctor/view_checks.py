@@ -19,6 +19,7 @@ _STOPS = 1.2  # by which a view is brighter than those beside it and than most
 _SATURATED, _FEW_SATURATED = 0.3, 0.05  # shares of the subject that are white
 _WHITE = 0.97
 _BLACK = 1e-3
+_MIN_SKIN = 0.05  # of the subject, below which its light is not known
 _MARGIN = 0.1  # of the image: how far outside the centre of the subject may lie
 
 
@@ -75,11 +76,15 @@ def _folds(camera: Camera) -> bool:
 
 
 def exposure_warnings(capture: Capture, samples: Sequence[ViewSample]) -> list[Finding]:
-    """Views that are much brighter or darker than those beside them, or white where others are not."""
-    found = [(view, sample) for view, sample in zip(capture.views, samples, strict=True) if sample.grey is not None]
+    """Views that are much brighter or darker than those beside them, or white where others are not.
+
+    Skin is compared where labels show it: of few views the dark hair of one is not beside that of another.
+    """
+    greys = [_grey_of_skin(capture, sample) for sample in samples]
+    found = [(view, grey) for view, grey in zip(capture.views, greys, strict=True) if grey is not None]
     if len(found) < 2:
         return []
-    values = [sample.grey[sample.subject] for _, sample in found if sample.grey is not None]
+    values = [grey for _, grey in found]
     light = [float(np.median(srgb_to_linear(grey))) if len(grey) else 1.0 for grey in values]
     stops = np.log2(np.array(light) + _BLACK)
     white = np.array([float((grey > _WHITE).mean()) if len(grey) else 0.0 for grey in values])
@@ -97,6 +102,14 @@ def exposure_warnings(capture: Capture, samples: Sequence[ViewSample]) -> list[F
         return []
     line = f"views of another exposure: {listed(warned)}; the fit gives each camera a gain, but white and black pixels "
     return [Finding.warning("exposure", line + "are lost: develop the images alike, or leave these views out")]
+
+
+def _grey_of_skin(capture: Capture, sample: ViewSample) -> Float[np.ndarray, "P"] | None:
+    """The grey values of a view's skin, of the subject without labels; None: no image, or nearly no skin."""
+    if sample.grey is None or sample.labels is None or "skin" not in capture.classes:
+        return None if sample.grey is None else sample.grey[sample.subject]
+    skin = sample.subject & (sample.labels == capture.classes.index("skin"))
+    return sample.grey[skin] if skin.sum() > _MIN_SKIN * sample.subject.sum() else None
 
 
 def unseen_warnings(capture: Capture, centre: Float[np.ndarray, "3"] | None) -> list[Finding]:

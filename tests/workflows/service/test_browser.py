@@ -225,7 +225,7 @@ def build_the_next_model(served: Served, tab: Any, see: Any, decided: DecisionEn
     found = {entry["name"]: (entry["decision"], entry["who"]) for entry in gate["decisions"]}
     accepted = dict.fromkeys(("ann/rest", "ann/smile", "bob/rest"), ("accept", "console"))
     assert found == accepted | {"bob/smile": ("reject", "console")}
-    assert gate["log_head"] == DecisionLog.of_farm(served.folder).head.sha256
+    assert gate["log_head"] == DecisionLog.of_farm(served.folder).verify().sha256
     (held,) = (entry for entry in gate["decisions"] if entry["name"] == decided.name)
     assert (held["sequence"], held["content_id"]) == (decided.sequence, decided.content_id)
     tab.goto(f"{served.url}/coregistrations/{ROUNDS}")

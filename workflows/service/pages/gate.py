@@ -1,6 +1,7 @@
 """The pages of the quality gate: which runs wait for a person, and one registration after the other with pictures."""
 
 import re
+import time
 from collections.abc import Sequence
 from typing import Annotated, Any
 from urllib.parse import quote, urlencode
@@ -22,7 +23,7 @@ from workflows.service.results import results_of
 from workflows.service.state import Service, ServiceState
 
 router = APIRouter(include_in_schema=False, dependencies=[Depends(need("viewer"))])
-MAX_RUNS, RUN_S = 12, 0.01  # runs on the first page, and for how long it waits for each
+MAX_RUNS, RUNS_S = 12, 0.2  # runs on the first page, and for how long it waits for all of them
 VIEWS = 3  # of the cameras
 LISTED = 60  # registrations that are listed beside the one that is shown
 LOGGED = 40
@@ -34,10 +35,10 @@ _NEUTRAL = ("neutral", "rest")
 @router.get("/gate")
 def gate_page(state: Service, request: Request) -> Response:
     """Show the runs at the gate, and the last decisions."""
-    runs, problem = [], ""
+    runs, problem, until_s = [], "", time.monotonic() + RUNS_S
     try:
         for run in list_runs(state)[:MAX_RUNS]:
-            gate = state.gate.of_run(state, run.id, RUN_S)
+            gate = state.gate.of_run(state, run.id, max(0.0, until_s - time.monotonic()))
             if gate.items or gate.unread:
                 runs.append({"id": run.id, "counts": gate.counts, "unread": gate.unread, "total": len(gate.items)})
         log = state.gate.log.read()[::-1][:LOGGED]
