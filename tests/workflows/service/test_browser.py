@@ -118,6 +118,7 @@ def test_from_captures_to_the_next_model(served: Served) -> None:
         tab.on("pageerror", lambda error: problems.append(str(error)))
         tab.on("request", lambda sent: problems.append(sent.url) if not sent.url.startswith(served.url) else None)
         see = sync_api.expect
+        see.set_options(timeout=60_000)  # the machine may be busy
         mend_the_broken_one(served, tab, see)
         look_at_the_run(served, tab, see)
         decided = decide_two(served, tab, see)
