@@ -3,7 +3,7 @@
 A recipe is the result of a function without parameters; its values are saved with every registration.
 """
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 from registration.errors import InputError
@@ -165,12 +165,6 @@ def _offsets(
     )
 
 
-def _views_per_step(stages: Iterable[Stage], views: int) -> tuple[Stage, ...]:
-    """The stages with so many views in a step, and with half of them in the last one, whose steps are small."""
-    *first, last = (replace(stage, views_per_step=views) for stage in stages)
-    return (*first, replace(last, views_per_step=views // 2))
-
-
 def draft(*, scale: bool = True) -> Recipe:
     """Minutes: the model's parameters, then offsets, up to a head of about 512 px."""
     stages = (
@@ -180,7 +174,7 @@ def draft(*, scale: bool = True) -> Recipe:
         _offsets(2.5, 6, 30, level=1, start=4e-4, end=5e-5),
         _offsets(1.5, 5, 40, level=0, start=2e-4, end=2e-5, ssim=0.0),
     )
-    return Recipe(name="draft", stages=_views_per_step(stages, 8), scale=scale)
+    return Recipe(name="draft", stages=stages, scale=scale)
 
 
 def studio(*, scale: bool = True) -> Recipe:
@@ -192,7 +186,8 @@ def studio(*, scale: bool = True) -> Recipe:
         _offsets(2.5, 6, 60, level=1, start=4e-4, end=5e-5),
         _offsets(1.5, 4, 90, level=0, start=3e-4, end=1e-5, ssim=0.0),
     )
-    return Recipe(name="studio", stages=_views_per_step(stages, 12), scale=scale, finest_head_px=1024)
+    wider = tuple(replace(stage, views_per_step=12) for stage in stages)
+    return Recipe(name="studio", stages=wider, scale=scale, finest_head_px=1024)
 
 
 def preview(*, scale: bool = True) -> Recipe:
@@ -207,7 +202,7 @@ def preview(*, scale: bool = True) -> Recipe:
         replace(stage, level=min(stage.level, 1), weights=replace(stage.weights, contacts=0.0, tongue=0.0))
         for stage in stages
     )
-    return Recipe(name="preview", stages=_views_per_step(plain, 8), scale=scale, levels=2, texture_px=512)
+    return Recipe(name="preview", stages=tuple(plain), scale=scale, levels=2, texture_px=512)
 
 
 def in_model(*, scale: bool = True) -> Recipe:
