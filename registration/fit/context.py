@@ -15,13 +15,14 @@ from registration.geometry.large_steps import normalised_laplacian, spacing
 from registration.geometry.nearest_planes import NearestPlanes
 from registration.landmark_fit.observations import Observations
 from registration.losses import depth
+from registration.losses.folds import FoldPenalty
 from registration.losses.scan import ScanDistance
 from registration.losses.self_intersection import SelfIntersectionPenalty
 from registration.losses.uv_ssim import UVSSIM
 from registration.model.gnm import GNM
 from registration.model.gnm_npz import GNMData
 from registration.model.landmarks import LandmarkScheme
-from registration.model.regions import crossing_parts, head_skin, offset_regions, vertex_classes
+from registration.model.regions import crossing_parts, exterior, head_skin, offset_regions, vertex_classes
 from registration.render.renderer import Renderer
 from registration.targets.classes import ClassMap
 from registration.types import Registration, Rendered, SurfaceHits, Targets
@@ -110,6 +111,12 @@ class FitContext:
     def self_intersection(self) -> SelfIntersectionPenalty:
         """The penalty on intersections between parts of the head."""
         return SelfIntersectionPenalty(self.data, self.device)
+
+    @cached_property
+    def folds(self) -> FoldPenalty:
+        """The penalty on folds of the outer skin."""
+        data = self.data
+        return FoldPenalty(data.triangles, data.template_vertex_positions, exterior(data), self.device)
 
     @cached_property
     def scan_distance(self) -> ScanDistance | None:

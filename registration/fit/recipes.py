@@ -48,6 +48,7 @@ class Weights:
     eye_scale: float = 2e-3
     offsets: float = 2e4  # per m^2: the assumed strength of the image losses, against which `Lengths` are balanced
     contacts: float = 0.0  # per mm^2 of excess depth, summed over the vertices inside another part
+    folds: float = 0.0  # of the area of faces that turn against their neighbours, as a share of the skin's
     tongue: float = 1e-5  # the same of the tongue, which is mostly occluded: about as strong as its prior
     slide: float = 0.0  # dissimilarity of the neutral's texture and the unwrapped images; expressions only
     depth: float = 1e5  # per m^2 of robust squared distance from the depth maps, where there are any
@@ -156,6 +157,7 @@ def _offsets(
             landmark_likelihood=0.001,
             landmarks_along_skin=True,
             contacts=2e-4,
+            folds=5.0,
             slide=0.5,
             depth_scale_mm=max(0.5, 0.3 * smoothing_mm),
             scan=_SCAN if smoothing_mm < _COARSE_MM else 0.0,

@@ -1,6 +1,6 @@
 """The loss terms of a fit. A new one is a factory in a module of this package and a line in `TERMS`."""
 
-from registration.fit.terms import contacts, depth, image, landmarks, priors, scan, sliding
+from registration.fit.terms import contacts, depth, folds, image, landmarks, priors, scan, sliding
 from registration.fit.terms.term import StageContext, StepState, Term, TermFactory
 
 __all__ = ["TERMS", "StageContext", "StepState", "Term", "TermFactory", "make_terms"]
@@ -12,6 +12,7 @@ TERMS: tuple[TermFactory, ...] = (
     image.colour,
     landmarks.landmarks,
     contacts.contacts,
+    folds.folds,
     sliding.sliding,
     scan.scan,
     depth.depth,
