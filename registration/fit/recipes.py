@@ -40,10 +40,10 @@ class Weights:
     landmark_sigma_px: float = 3.0  # at 512 px of head height; of landmarks whose spread is not known
     landmark_likelihood: float = 0.02  # of landmarks whose spread is known, in place of `landmarks`
     landmarks_along_skin: bool = False  # whether the latter move free skin along itself only
-    identity: float = 2e-3
-    expression: float = 2e-3
+    identity: float = 3.7e-5  # sum of squared coefficients
+    expression: float = 3.1e-5
     rotations: float = 0.1  # joints other than the root, per rad^2
-    parts: float = 1e-4  # mean square of the identity coefficients that move no skin, where they alone are free
+    parts: float = 3.3e-5  # the same of those that move no skin, where they alone are free
     eyes: float = 1.0  # translation of the eyeballs relative to the model, per m^2
     eye_scale: float = 2e-3
     offsets: float = 2e4  # per m^2: the assumed strength of the image losses, against which `Lengths` are balanced

@@ -15,7 +15,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from registration.geometry.large_steps import normalised_laplacian, spacing, to_torch
-from registration.geometry.topology import edges
+from registration.geometry.topology import edges, vertex_areas
 
 _MEMBRANE_FRACTION = 0.2  # of b q^2 in the penalty at the half-gain wavelength; the rest is bending's, c q^4
 
@@ -40,7 +40,8 @@ class OffsetRegularizer:
     """The three penalties of [GNM, Head Registration] on one mesh: L2, edge coupling [FLAME], squared Laplacian.
 
     In the bind pose the displaced mesh and the model's differ by the offsets alone, so that the change of an edge
-    [FLAME] is linear in the offsets. Derivatives are finite differences over each vertex' mean edge length.
+    [FLAME] is linear in the offsets. Derivatives are finite differences over each vertex' mean edge length. Vertices
+    count by their area, as in images, which show a lid's many small faces no larger than they are.
 
     Args:
         triangles: of the mesh.
@@ -64,30 +65,35 @@ class OffsetRegularizer:
         l2, membrane, bending = regularization_weights(half_gain_m, decay_m)
         size = spacing(triangles, points)
         ends = edges(triangles).vertices
+        share = vertex_areas(points, triangles)
+        share /= share.sum()
 
         def tensor(values: np.ndarray) -> Tensor:
             return torch.as_tensor(values.astype(np.float32), device=device)
 
-        self._l2 = tensor(l2)
+        self._l2 = tensor(share * l2)
         # With six regular neighbours at distance h, half the sum over edges is 1.5 h^2 |grad|^2, and the mean of the
         # neighbours differs from the vertex by h^2 / 4 times the Laplacian.
-        self._membrane = tensor((membrane / size**2)[ends].mean(1) / 1.5)
-        self._bending = tensor(bending * (4 / size**2) ** 2)
+        self._membrane = tensor((share * membrane / size**2)[ends].mean(1) / 1.5)
+        self._bending = tensor(share * bending * (4 / size**2) ** 2)
 
     def __call__(self, offsets: Float[Tensor, "V 3"]) -> dict[str, Float[Tensor, ""]]:
-        """Return the penalties "offset l2", "offset coupling" and "offset laplacian": means over the vertices, m^2.
+        """Return the penalties "offset l2", "offset coupling" and "offset laplacian": means over the surface, m^2.
 
         Args:
             offsets: bind pose, metres.
         """
         first, second = (offsets.index_select(0, self._edges[:, k]) for k in range(2))
         return {
-            "offset l2": (self._l2 * offsets.square().sum(-1)).mean(),
-            "offset coupling": (self._membrane * (first - second).square().sum(-1)).sum() / len(offsets),
-            "offset laplacian": (self._bending * (self._laplacian @ offsets).square().sum(-1)).mean(),
+            "offset l2": (self._l2 * offsets.square().sum(-1)).sum(),
+            "offset coupling": (self._membrane * (first - second).square().sum(-1)).sum(),
+            "offset laplacian": (self._bending * (self._laplacian @ offsets).square().sum(-1)).sum(),
         }
 
 
 def gaussian_prior(coefficients: Float[Tensor, "C"]) -> Float[Tensor, ""]:
-    """Return the mean square of coefficients: their negative log likelihood for unit variance, up to a factor."""
-    return coefficients.square().mean() if len(coefficients) else torch.zeros((), device=coefficients.device)
+    """Return the sum of squared coefficients: twice their negative log likelihood for unit variance, up to a constant.
+
+    A sum and not a mean: a component's variance does not grow with the number of others.
+    """
+    return coefficients.square().sum()

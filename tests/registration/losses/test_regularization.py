@@ -21,9 +21,11 @@ def elasticity(columns: int, rows: int, half_gain_m: float, decay_m: float = 0.0
         decay_m=np.full(count, decay_m),
         device=torch.device("cpu"),
     )
-    inner = flat._membrane.median(), flat._bending.median()  # of vertices whose edges do not wrap around
-    flat._membrane.fill_(inner[0])
-    flat._bending.fill_(inner[1])
+    # Those of vertices whose edges do not wrap around, each of which has an equal share of the unfolded area.
+    a = regularization_weights(np.array([half_gain_m]), np.array([decay_m]))[0][0]
+    share = a / count / float(flat._l2.median())
+    for values in (flat._l2, flat._membrane, flat._bending):
+        values.fill_(values.median() * share)
     return flat
 
 
@@ -69,7 +71,7 @@ def test_an_offset_without_data_decays_over_the_decay_length():
         decay_m=np.full(count, 0.025),
         device=torch.device("cpu"),
     )
-    for values in (penalty._membrane, penalty._bending):
+    for values in (penalty._l2, penalty._membrane, penalty._bending):
         values.fill_(values.median())
     column = torch.arange(count) % columns
     height = torch.zeros(count, 3, dtype=torch.float64)
@@ -121,10 +123,47 @@ def test_stiffness_depends_on_the_wavelength_at_each_vertex():
     assert costs[1] == pytest.approx(16 * costs[0], rel=1e-3)
 
 
+def square(cells: int, left_m: float, size_m: float = 0.04) -> tuple[np.ndarray, np.ndarray]:
+    """Points (V, 3) of a square in the plane z = 0 and its triangles."""
+    x, y = (axis.ravel() for axis in np.meshgrid(np.arange(cells + 1), np.arange(cells + 1)))
+    points = np.stack([left_m + x * size_m / cells, y * size_m / cells, np.zeros(len(x))], 1)
+    corner = (x + (cells + 1) * y)[(x < cells) & (y < cells)]
+    lower = np.stack([corner, corner + 1, corner + cells + 1], 1)
+    upper = np.stack([corner + 1, corner + cells + 2, corner + cells + 1], 1)
+    return points, np.concatenate([lower, upper])
+
+
+def test_a_bump_costs_the_same_on_small_faces_as_on_large_ones():
+    """One of two squares of one size has sixteen times as many vertices; its bump would cost more by vertices."""
+    (coarse, coarse_faces), (fine, fine_faces) = square(20, 0.0), square(80, 0.1)
+    points = np.concatenate([coarse, fine])
+    penalty = OffsetRegularizer(
+        np.concatenate([coarse_faces, fine_faces + len(coarse)]),
+        points,
+        half_gain_m=np.full(len(points), 0.01),
+        decay_m=np.full(len(points), 0.025),
+        device=torch.device("cpu"),
+    )
+    bump = np.exp(-np.square((points[:, :2] - [0.02, 0.02]) / 0.006).sum(1))  # of the coarse square
+    bump += np.exp(-np.square((points[:, :2] - [0.12, 0.02]) / 0.006).sum(1))
+    costs = []
+    for chosen in (np.arange(len(points)) < len(coarse), np.arange(len(points)) >= len(coarse)):
+        offsets = torch.tensor(np.outer(0.001 * bump * chosen, [0, 0, 1]), dtype=torch.float32)
+        costs.append({name: float(cost) for name, cost in penalty(offsets).items()})
+    for name in costs[0]:
+        assert costs[1][name] == pytest.approx(costs[0][name], rel=0.2), name  # derivatives differ by the edge length
+
+
 def test_gaussian_prior():
     coefficients = torch.tensor([1.0, -2.0, 0.0], requires_grad=True)
     value = gaussian_prior(coefficients)
-    assert value.item() == pytest.approx(5 / 3)
+    assert value.item() == pytest.approx(5)
     value.backward()
-    torch.testing.assert_close(coefficients.grad, torch.tensor([2 / 3, -4 / 3, 0.0]))
+    torch.testing.assert_close(coefficients.grad, torch.tensor([2.0, -4.0, 0.0]))
     assert gaussian_prior(torch.zeros(0)).item() == 0
+
+
+def test_the_prior_of_a_coefficient_does_not_depend_on_how_many_there_are():
+    few, many = torch.zeros(54), torch.zeros(253)
+    few[3] = many[3] = 2.0
+    assert gaussian_prior(few).item() == gaussian_prior(many).item()
