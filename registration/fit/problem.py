@@ -13,6 +13,7 @@ from registration.fit.appearance import Appearance
 from registration.fit.camera_refinement import CameraRefinement
 from registration.fit.context import FitContext
 from registration.fit.initialization import PoseCandidate, rate_candidate
+from registration.fit.landmark_slide import slide_to_landmarks
 from registration.fit.optimizer import AdamBlock, AdamUniformBlock, History, ParameterBlock, minimize
 from registration.fit.recipes import Lengths, Stage, rigid_stage
 from registration.fit.terms import StageContext, StepState, Term, make_terms
@@ -109,6 +110,8 @@ class FitProblem:
 
     def _run_stage(self, stage: Stage, on_step: OnStep) -> _StageTrace:
         recipe = self.context.recipe
+        if stage.landmark_slide:
+            slide_to_landmarks(self.context, self.variables, self.landmarks_used)
         fixed = {name for name, free in (("scale", recipe.scale), ("parts", self.variables.has_parts)) if not free}
         names = [name for name, _ in stage.free if name not in fixed]
         lengths = stage.lengths if "offsets" in names else None

@@ -87,6 +87,7 @@ class Stage:
     free: tuple[tuple[str, Rate], ...] = ()  # variables and their rates; all but `offsets` are updated by Adam
     lengths: Lengths | None = None  # needed while `offsets` is free
     texture: bool = False  # estimate texture and camera gains
+    landmark_slide: bool = False  # before it, carry the skin along itself to where landmarks are
 
     def frees(self, name: str) -> bool:
         """Return whether a variable is free in this stage."""
@@ -119,6 +120,7 @@ _POSE = (("root", 5e-3), ("joints", 5e-3), ("position", 1e-3), ("eyes", 1e-3))
 
 _SCAN = 3e4  # per m^2
 _LID_NORMAL_TRUNCATION = 0.45  # 26 degrees: a rim, where the image shows the lid that covers it
+_SLIDE_MM = 5.0  # smoothing of the stage before which the skin is carried along itself: the surface is known roughly
 _COARSE_MM = 10.0  # smoothing beyond which the head's shape is still unknown, and closest points are wrong ones
 
 
@@ -164,6 +166,7 @@ def _offsets(
             scan_scale_mm=max(0.5, 0.3 * smoothing_mm),
         ),
         texture=True,
+        landmark_slide=smoothing_mm == _SLIDE_MM,
     )
 
 
@@ -229,7 +232,11 @@ def expression_recipe(recipe: Recipe) -> Recipe:
     """
     fixed = ("identity", "scale")
     stages = tuple(
-        replace(stage, free=(*((name, rate) for name, rate in stage.free if name not in fixed), *_PARTS))
+        replace(
+            stage,
+            free=(*((name, rate) for name, rate in stage.free if name not in fixed), *_PARTS),
+            landmark_slide=False,  # the neutral's texture tells where skin is along itself
+        )
         for stage in recipe.stages
     )
     return replace(recipe, stages=stages)

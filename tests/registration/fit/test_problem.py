@@ -12,13 +12,15 @@ from registration.fit import problem as problem_module
 from registration.fit import terms
 from registration.fit.context import FitContext, ViewOrder
 from registration.fit.initialization import from_landmarks
+from registration.fit.landmark_slide import slide_to_landmarks
 from registration.fit.problem import FitProblem, assess, refine
-from registration.fit.recipes import Rate, Recipe, Stage, Weights, draft, preview, studio
+from registration.fit.recipes import Rate, Recipe, Stage, Weights, draft, expression_recipe, preview, studio
 from registration.fit.terms import StageContext, StepState, Term
 from registration.fit.terms import image as image_terms
 from registration.fit.variables import InitialGuess
 from registration.geometry.nearest_planes import MeshPlanes
 from registration.geometry.surface_views import SurfaceViews
+from registration.geometry.topology import vertex_normals
 from registration.inputs import RegistrationInputs, read_inputs
 from registration.model.atlas import texture_atlas
 from registration.model.gnm import GNM
@@ -207,6 +209,52 @@ def test_offsets_are_a_latent_only_while_a_stage_runs(context: FitContext, initi
     problem.run(context.recipe.stages, lambda stage, step: latent.append(problem.variables.latent is not None))
     assert latent == [False, False, True, True] and problem.variables.latent is None
     assert problem.variables.skin_offsets().any()
+
+
+def landmarks_beside(problem: FitProblem, spread_m: float) -> tuple[FitContext, np.ndarray]:
+    """The problem's context with landmarks 1 mm to the side and 1 mm before the mesh's; and where they are."""
+    scheme, context = problem.context.schemes["68"], problem.context
+    points = scheme.points(problem.vertices().double().numpy()) + np.array([1e-3, 0.0, 1e-3])
+    spread = np.full(len(points), spread_m)
+    return replace(context, triangulated={"68": points}, triangulated_spread_m={"68": spread}), points
+
+
+@pytest.mark.parametrize("spread_m, share", [(1e-4, (0.75, 1.05)), (2e-2, (0.0, 0.15))])
+def test_skin_slides_along_itself_to_landmarks_by_their_spread(
+    context: FitContext, initial: InitialGuess, spread_m: float, share: tuple[float, float]
+) -> None:
+    problem = FitProblem(context, initial)
+    with_landmarks, points = landmarks_beside(problem, spread_m)
+    before, scheme = problem.vertices(), context.schemes["68"]
+    slide_to_landmarks(with_landmarks, problem.variables, problem.landmarks_used)
+    moved = (problem.vertices() - before).double().numpy()
+    normals = vertex_normals(before, context.triangles).double().numpy()
+    across = np.abs((moved * normals).sum(1))[problem.variables.skin]
+    assert across.max() < 0.02 * np.linalg.norm(moved, axis=1).max()
+    brows = np.arange(17, 27)  # skin that faces forwards
+    facing = scheme.points(normals)[brows]
+    to_the_side = np.array([1e-3, 0, 1e-3]) - facing * (facing @ [1e-3, 0, 1e-3])[:, None]
+    reached = (scheme.points(moved)[brows] * to_the_side).sum() / np.square(to_the_side).sum()
+    assert share[0] < reached < share[1]
+    others = np.setdiff1d(np.arange(len(moved)), problem.variables.skin)
+    assert not moved[others].any()
+
+
+def test_landmarks_that_are_outliers_or_missing_move_nothing(context: FitContext, initial: InitialGuess) -> None:
+    problem = FitProblem(context, initial)
+    with_landmarks, points = landmarks_beside(problem, 1e-4)
+    before = problem.vertices()
+    slide_to_landmarks(context, problem.variables, problem.landmarks_used)
+    slide_to_landmarks(with_landmarks, problem.variables, {"68": np.zeros(len(points), bool)})
+    missing = replace(with_landmarks, triangulated={"68": np.full_like(points, np.nan)})
+    slide_to_landmarks(missing, problem.variables, problem.landmarks_used)
+    torch.testing.assert_close(problem.vertices(), before, atol=1e-7, rtol=0)
+
+
+def test_recipes_slide_once_and_not_for_expressions() -> None:
+    for make in (preview, draft, studio):
+        assert [stage.name for stage in make().stages if stage.landmark_slide] == ["offsets 5 mm"]
+        assert not any(stage.landmark_slide for stage in expression_recipe(make()).stages)
 
 
 def test_outliers_of_the_initial_guess_do_not_count(context: FitContext, initial: InitialGuess) -> None:
