@@ -196,7 +196,7 @@ def studio(*, scale: bool = True) -> Recipe:
 
 
 def preview(*, scale: bool = True) -> Recipe:
-    """Seconds, for small images: about half of draft's steps, two levels, no self-intersection penalty."""
+    """For a first look: half of draft's steps, two levels up to a head of 256 px, no self-intersection penalty."""
     stages = (
         _model(70),
         _offsets(20, 12, 20, level=1, start=4e-3, end=2e-3),
@@ -207,7 +207,7 @@ def preview(*, scale: bool = True) -> Recipe:
         replace(stage, level=min(stage.level, 1), weights=replace(stage.weights, contacts=0.0, tongue=0.0))
         for stage in stages
     )
-    return Recipe(name="preview", stages=tuple(plain), scale=scale, levels=2, texture_px=512)
+    return Recipe(name="preview", stages=tuple(plain), scale=scale, finest_head_px=256, levels=2, texture_px=512)
 
 
 def in_model(*, scale: bool = True) -> Recipe:
