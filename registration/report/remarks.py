@@ -78,20 +78,25 @@ def remarks(registration: Assessed) -> list[str]:
         for pair, row in figures.get("intersections", {}).get("pairs", {}).items()
         if row.get(BEYOND_KEY)
     ]
-    lines += [
-        _folds(place, row["edges"], row.get("view"))
-        for place, row in figures.get("folds", {}).get("places", {}).items()
-    ]
+    lines += _folds(figures.get("folds", {}).get("places", {}))
     return lines
 
 
-def _folds(place: str, count: int, view: str | None) -> str:
+def _folds(places: Mapping[str, Any]) -> list[str]:
+    """A line that says where the skin is folded, if anywhere, and in which views to look at it."""
+    words = [f"{row['edges']} of the {place}" + _in_view(row.get("view")) for place, row in places.items()]
+    if not words:
+        return []
+    count = sum(row["edges"] for row in places.values())
     edges = "1 edge" if count == 1 else f"{count} edges"
-    where = f": look at it in {view}" if view else ""
-    return (
+    return [
         f"The skin turns back on itself by more than {SHARP_FOLD_DEG:g} degrees, as the model's does not, "
-        f"at {edges} of the {place}{where}."
-    )
+        f"at {edges}: {', '.join(words)}."
+    ]
+
+
+def _in_view(view: str | None) -> str:
+    return f" (look at {view})" if view else ""
 
 
 def _scan_in_fit(used: Mapping[str, Any]) -> list[str]:

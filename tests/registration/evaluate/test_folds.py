@@ -53,11 +53,11 @@ def test_a_fold_of_a_lid_is_found_there_in_the_view_that_looks_at_it(side, sign)
     assert figures["edges"] == len(sharp) == sum(place["edges"] for place in figures["places"].values())
     assert figures["places"][f"{side} eye"]["view"] == f"from {side}"
     lines = remarks(a_registration(figures={"folds": figures}))
-    assert any(f"of the {side} eye: look at it in from {side}." in line for line in lines)
+    assert any(f"of the {side} eye (look at from {side})" in line for line in lines)
 
 
 def test_a_remark_counts():
     places = {"nose": {"edges": 1, "view": "cam2"}, "mouth": {"edges": 3, "view": None}}
-    first, second = remarks(a_registration(figures={"folds": {"edges": 4, "places": places}}))
-    assert first.endswith("at 1 edge of the nose: look at it in cam2.") and second.endswith("at 3 edges of the mouth.")
+    [line] = remarks(a_registration(figures={"folds": {"edges": 4, "places": places}}))
+    assert line.endswith("at 4 edges: 1 of the nose (look at cam2), 3 of the mouth.")
     assert remarks(a_registration(figures={"folds": {"edges": 0, "places": {}}})) == []
