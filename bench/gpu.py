@@ -21,7 +21,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 
 from rich.console import Console
@@ -44,7 +44,7 @@ class Part:
     figures: Callable[[str], str]  # of the command's output
     outcome: str = ""
     seconds: float = 0.0
-    gpu_gb: float = field(default=0.0)
+    gpu_gb: float = 0.0
 
     def run(self, out: Path, seconds: float) -> None:
         """Run the command for at most `seconds`, its output into OUT/NAME.log."""

@@ -38,9 +38,8 @@ class RegisteredSubjects:
     stabilized_set: Path | None  # the stabilized set; None: neutrals alone
     tags: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)  # by folder name
     left_out: Collection[str] = ()  # registrations that are not used, as SUBJECT/NAME of the folders
-    figures_of: Callable[[Mapping[str, Any]], Mapping[str, float]] | None = (
-        None  # `TrainingMesh.figures` of a manifest's
-    )
+    # Of a registration's figures, those that say whether it is an outlier (`TrainingMesh.figures`).
+    figures_of: Callable[[Mapping[str, Any]], Mapping[str, float]] = lambda _: {}
 
     @cached_property
     def usable(self) -> dict[str, UsableRegistrations]:
@@ -79,7 +78,7 @@ class RegisteredSubjects:
                             confidence=registration.confidence,
                             triangles=neutral.triangles,
                             digest=self.inputs[f"{name}/{folder}"],
-                            figures=self.figures_of(registration.figures) if self.figures_of else {},
+                            figures=self.figures_of(registration.figures),
                         )
                     )
             yield TrainingSubject(
