@@ -70,7 +70,7 @@ def pushed_tongue(data: GNMData, penalty: SelfIntersectionPenalty) -> Table:
             penalty.update_candidates(vertices)
             depth_mm = penalty.excess_mm(vertices)["tongue-teeth"].numpy()[tongue]
             points = vertices.numpy().astype(np.float64)
-            truth = crossed_parts.tooth_depths_mm(points[tongue], points, teeth)
+            truth = crossed_parts.part_depths_mm(points[tongue], points, teeth)
             error = np.abs(depth_mm - np.maximum(truth - MARGIN_MM, 0)).max()
             table.add_row(name, f"{push:g}", f"{(truth > 0).sum()}", f"{truth.max():.2f}", f"{error:.3f}")
     return table

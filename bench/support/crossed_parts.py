@@ -11,6 +11,8 @@ import torch
 from jaxtyping import Bool, Float, Int
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
+from scipy.spatial.distance import cdist
 from torch import Tensor
 
 from registration.fit.optimizer import AdamUniformBlock, minimize
@@ -20,6 +22,7 @@ from registration.frames import MM_PER_M
 from registration.geometry.closest_point import closest_points
 from registration.geometry.large_steps import LargeSteps
 from registration.geometry.topology import edges, vertex_normals
+from registration.geometry.winding import closed
 from registration.losses.self_intersection import SelfIntersectionPenalty
 from registration.model import regions
 from registration.model.gnm_npz import GNMData
@@ -72,11 +75,11 @@ def raised_lower_lip(data: GNMData, by_mm: float) -> Float[Tensor, "V 3"]:
 def pressed_lid(data: GNMData, by_mm: float) -> Float[Tensor, "V 3"]:
     """Return the template with the left eye's upper lid pushed towards the eyeball's centre."""
     points = data.template_vertex_positions.astype(np.float64)
-    centre = points[regions.eyeball_shells(data)[0]].mean(0)
-    offset = points - centre
+    shell = regions.eyeball_shells(data)[0]
+    offset = points - points[shell].mean(0)
     distance = np.linalg.norm(offset, axis=1)
-    lid = regions.exterior(data) & (distance < 18.5e-3) & (np.abs(offset[:, 0]) < 8e-3)
-    lid &= (offset[:, 1] > 2e-3) & (offset[:, 2] > 8e-3)
+    x, y, z = (offset / np.median(distance[shell])).T  # models differ in the size of their eyes
+    lid = regions.exterior(data) & (x**2 + y**2 + z**2 < 1.34**2) & (np.abs(x) < 0.58) & (y > 0.145) & (z > 0.58)
     return displaced(data, lid, -offset / distance[:, None] * by_mm / MM_PER_M)
 
 
@@ -103,7 +106,10 @@ def recover(data: GNMData, before: Float[Tensor, "V 3"], *, steps: int, rate: fl
 
 
 def cheeks(data: GNMData) -> Bool[np.ndarray, "V"]:
-    return np.any([regions.group(data, f"{side}_cheek_region") > 0.5 for side in ("left", "right")], axis=0)
+    """The cheeks from 2 mm beside the lips, which overlap them in some models."""
+    members = np.any([regions.group(data, f"{side}_cheek_region") > 0.5 for side in ("left", "right")], axis=0)
+    points = data.template_vertex_positions
+    return members & (cKDTree(points[np.logical_or(*regions.lips(data))]).query(points)[0] > 2e-3)
 
 
 def lip_depths_mm(data: GNMData, vertices: Float[Tensor, "V 3"]) -> Float[np.ndarray, "V"]:
@@ -112,7 +118,6 @@ def lip_depths_mm(data: GNMData, vertices: Float[Tensor, "V 3"]) -> Float[np.nda
     At the mouth's corners, where the lips are connected, vertices next to the other lip are excluded.
     """
     points, skin = vertices.numpy().astype(np.float64), _skin(data)
-    normals = vertex_normals(vertices, torch.as_tensor(skin)).numpy()
     height = data.template_vertex_positions[:, 1]
     lips, depth = regions.lips(data), np.zeros(len(points))
     slit = np.mean([height[regions.group(data, name) > 0.5].mean() for name in ("upper_lip", "lower_lip")])
@@ -123,8 +128,20 @@ def lip_depths_mm(data: GNMData, vertices: Float[Tensor, "V 3"]) -> Float[np.nda
         lip = lip & ~np.isin(np.arange(len(points)), skin[other[skin].any(1)])
         distance[lip] = closest_points(points[lip], points, skin[patch[skin].all(1)])[0] * MM_PER_M
         near = np.flatnonzero(distance < 2.0)
-        inside = winding(points[near] + 2e-5 * normals[near], points[skin]) > 0.5
-        depth[near[inside]] = distance[near[inside]]
+        inside = near[_inside_skin(vertices, skin, near)]
+        depth[inside] = distance[inside]
+    return depth
+
+
+def ear_depths_mm(data: GNMData, vertices: Float[Tensor, "V 3"]) -> Float[np.ndarray, "V"]:
+    """Return the depth of each vertex of the left ear inside the head; 0 for all other vertices."""
+    points, skin, ears = vertices.numpy().astype(np.float64), _skin(data), regions.ears(data)
+    head = regions.exterior(data) & ~ears
+    left = np.flatnonzero(ears & (data.template_vertex_positions[:, 0] > 0))
+    distance, depth = closest_points(points[left], points, skin[head[skin].all(1)])[0] * MM_PER_M, np.zeros(len(points))
+    near = np.flatnonzero(distance < 2.0)
+    inside = near[_inside_skin(vertices, skin, left[near])]
+    depth[left[inside]] = distance[inside]
     return depth
 
 
@@ -146,44 +163,45 @@ def teeth_of(data: GNMData) -> list[Int[np.ndarray, "_ 3"]]:
     return [mesh[piece[mesh[:, 0]] == number] for number in np.unique(piece[mesh])]
 
 
-def tooth_depths_mm(
-    points: Float[np.ndarray, "P 3"], vertices: Float[np.ndarray, "V 3"], teeth: list[Int[np.ndarray, "_ 3"]]
+def part_depths_mm(
+    points: Float[np.ndarray, "P 3"], vertices: Float[np.ndarray, "V 3"], parts: list[Int[np.ndarray, "_ 3"]]
 ) -> Float[np.ndarray, "P"]:
-    """Return the depth of points in any of the teeth; 0 outside. Open roots are closed by a cone."""
+    """Return the depth of points in any of the parts, such as teeth; 0 outside. Openings are closed by cones."""
     depth = np.zeros(len(points))
-    for tooth in teeth:
-        corners = vertices[tooth]
+    for part in parts:
+        corners = vertices[part]
         boxed = np.flatnonzero(((points > corners.min((0, 1))) & (points < corners.max((0, 1)))).all(1))
         if len(boxed):
-            inside = winding(points[boxed], np.concatenate([corners, _cone(vertices, tooth)])) > 0.5
-            distance_mm = closest_points(points[boxed], vertices, tooth)[0] * MM_PER_M
+            solid, faces = closed(vertices, part)
+            inside = winding(points[boxed], solid[faces]) > 0.5
+            distance_mm = closest_points(points[boxed], vertices, part)[0] * MM_PER_M
             depth[boxed] = np.maximum(depth[boxed], np.where(inside, distance_mm, 0.0))
     return depth
 
 
-def _cone(vertices: Float[np.ndarray, "V 3"], part: Int[np.ndarray, "_ 3"]) -> Float[np.ndarray, "_ 3 3"]:
-    """Return a shallow cone of triangles that closes the opening of a part."""
-    ends = {(a, b) for a, b in part[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2).tolist()}
-    boundary = vertices[np.array([(b, a) for a, b in ends if (b, a) not in ends], int).reshape(-1, 2)]
-    if not len(boundary):
-        return np.empty((0, 3, 3))
-    centre = boundary.mean((0, 1))
-    out = centre - vertices[part].mean((0, 1))
-    tip = centre + 0.5 * np.linalg.norm(boundary[:, 0] - centre, axis=1).mean() * out / np.linalg.norm(out)
-    return np.stack([boundary[:, 0], boundary[:, 1], np.broadcast_to(tip, (len(boundary), 3))], 1)
-
-
 def winding(points: Float[np.ndarray, "P 3"], corners: Float[np.ndarray, "F 3 3"]) -> Float[np.ndarray, "P"]:
     """Return generalized winding numbers by solid angles (van Oosterom and Strackee, 1983)."""
+    a, b, c = np.moveaxis(corners, 1, 0)
+    normals = np.cross(b - a, c - a)
+    heights = (normals * a).sum(1)
+    ab, bc, ca = (np.square(start - end).sum(1) for start, end in ((a, b), (b, c), (c, a)))
     total = np.zeros(len(points))
     for k, point in enumerate(points):
-        a, b, c = np.moveaxis(corners - point, 1, 0)
-        la, lb, lc = (np.linalg.norm(side, axis=1) for side in (a, b, c))
-        dot = (np.einsum("fc,fc->f", *pair) for pair in ((a, b), (b, c), (c, a)))
-        weights = (lc, la, lb)
-        below = la * lb * lc + sum(d * w for d, w in zip(dot, weights, strict=True))
-        total[k] = np.arctan2(np.einsum("fc,fc->f", a, np.cross(b, c)), below).sum()
+        la, lb, lc = (cdist(point[None], corner)[0] for corner in (a, b, c))
+        aa, bb, cc = la * la, lb * lb, lc * lc
+        # The scalar products of the three offsets, by the law of cosines.
+        below = la * lb * lc + ((aa + bb - ab) * lc + (bb + cc - bc) * la + (cc + aa - ca) * lb) / 2
+        total[k] = np.arctan2(heights - normals @ point, below).sum()
     return total / (2 * np.pi)
+
+
+def _inside_skin(
+    vertices: Float[Tensor, "V 3"], skin: Int[np.ndarray, "F 3"], members: Int[np.ndarray, "M"]
+) -> Bool[np.ndarray, "M"]:
+    """Whether vertices of the skin, moved slightly along their normals, lie inside the skin."""
+    normals = vertex_normals(vertices, torch.as_tensor(skin)).numpy()[members]
+    points = vertices.numpy().astype(np.float64)
+    return winding(points[members] + 2e-5 * normals, points[skin]) > 0.5
 
 
 def _skin(data: GNMData) -> Int[np.ndarray, "F 3"]:

@@ -1,4 +1,3 @@
-from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -6,22 +5,24 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from bench.support.crossed_parts import (
-    displaced,
-    pressed_lid,
-    raised_lower_lip,
-    teeth_of,
-    tooth_depths_mm,
-    translated_part,
-    winding,
-)
+from bench.support.crossed_parts import part_depths_mm, teeth_of, translated_part, winding
 from registration.errors import InputError
 from registration.geometry.topology import vertex_normals
-from registration.losses.self_intersection import SelfIntersectionPenalty
-from registration.model import gnm_npz, regions
+from registration.losses.self_intersection import OF_THE_TONGUE, SelfIntersectionPenalty
+from registration.model import regions
 from registration.model.gnm_npz import GNMData
 from tests.conftest import SHARED, needs_shared
 from tests.fixtures.make_fixtures import tiny_model
+from tests.registration.losses.crossings import (
+    CROSSINGS,
+    DEPTH_MM,
+    Crossed,
+    Crossing,
+    push_until,
+    pushed,
+    template,
+    tongue_moved,
+)
 
 CPU = torch.device("cpu")
 PAIRS = (
@@ -37,18 +38,27 @@ PAIRS = (
 MARGIN_MM = 0.05
 
 
-@pytest.fixture(scope="module")
-def full() -> GNMData:
-    return gnm_npz.read(SHARED / "data" / "gnm" / "gnm_head_reconstructed.npz")
+class Heads:
+    """A model, its penalty, and its heads with crossed parts, each made once."""
+
+    def __init__(self, data: GNMData):
+        self.data, self.penalty = data, SelfIntersectionPenalty(data, CPU)
+        self._crossed: dict[str, Crossed] = {}
+
+    def crossed(self, pair: str) -> Crossed:
+        if pair not in self._crossed:
+            self._crossed[pair] = push_until(self.data, CROSSINGS[pair], DEPTH_MM)
+        return self._crossed[pair]
 
 
 @pytest.fixture(scope="module")
-def penalty(full) -> SelfIntersectionPenalty:
-    return SelfIntersectionPenalty(full, CPU)
+def heads(any_model: GNMData) -> Heads:
+    return Heads(any_model)
 
 
-def template(data: GNMData) -> torch.Tensor:
-    return torch.as_tensor(data.template_vertex_positions)
+@pytest.fixture(scope="module")
+def gnm_penalty(gnm_model: GNMData) -> SelfIntersectionPenalty:
+    return SelfIntersectionPenalty(gnm_model, CPU)
 
 
 def posed(vertices: torch.Tensor, scale: float) -> torch.Tensor:
@@ -56,29 +66,9 @@ def posed(vertices: torch.Tensor, scale: float) -> torch.Tensor:
     return scale * vertices @ rotation.T + torch.tensor([0.7, -0.3, 1.1], dtype=vertices.dtype)
 
 
-def squeezed(data: GNMData) -> torch.Tensor:
-    """Both ears pressed against the head."""
-    inwards = np.zeros((len(data.template_vertex_positions), 3))
-    inwards[:, 0] = -0.022 * np.sign(data.template_vertex_positions[:, 0])
-    lateral = np.abs(data.template_vertex_positions[:, 0])
-    return displaced(data, regions.ears(data) & (lateral > 0.083), inwards)
-
-
-CROSSED: dict[str, Callable[[GNMData], torch.Tensor]] = {
-    "lids-eyeballs": lambda data: pressed_lid(data, 1.0),
-    "lips-teeth": lambda data: translated_part(data, regions.lips(data)[0], (0.0, 0.0, -6.0)),
-    "upper-lower lip": lambda data: raised_lower_lip(data, 2.0),
-    "tongue-teeth": lambda data: translated_part(data, regions.tongue(data), (4.0, 0.0, 0.0)),
-    "tongue-lips": lambda data: translated_part(data, regions.tongue(data), (0.0, 2.0, 15.0)),
-    "tongue-palate": lambda data: translated_part(data, regions.tongue(data), (0.0, 14.0, 0.0)),
-    "tongue-gums": lambda data: translated_part(data, regions.tongue(data), (0.0, -4.0, 6.0)),
-    "ears-head": squeezed,
-}
-
-
-@pytest.mark.parametrize("model", ["tiny", pytest.param("full", marks=needs_shared)])
+@pytest.mark.parametrize("model", ["tiny", "first_model", pytest.param("gnm_model", marks=needs_shared)])
 def test_a_template_costs_nothing_in_any_pose(model, request):
-    data = tiny_model() if model == "tiny" else request.getfixturevalue("full")
+    data = tiny_model() if model == "tiny" else request.getfixturevalue(model)
     penalty = SelfIntersectionPenalty(data, CPU)
     for vertices in (template(data), posed(template(data), 1.0), posed(template(data), 1.3)):
         vertices = vertices.clone().requires_grad_(True)
@@ -118,10 +108,9 @@ def test_a_tooth_in_the_tongue_displaces_both():
     assert up.sum().abs() < 1e-4 * up[teeth].sum()
 
 
-@needs_shared
 @pytest.mark.parametrize("pair", PAIRS)
-def test_gradients_of_every_pair(full, penalty, pair):
-    vertices = CROSSED[pair](full).double()
+def test_gradients_of_every_pair(heads, pair):
+    penalty, vertices = heads.penalty, heads.crossed(pair).vertices.double()
     penalty.update_candidates(vertices)
     at = vertices.clone().requires_grad_(True)
     cost = penalty(at)[pair]
@@ -135,12 +124,42 @@ def test_gradients_of_every_pair(full, penalty, pair):
     assert at.grad.sum(0).abs().max() < 1e-6 * at.grad.abs().sum()
 
 
-@needs_shared
-def test_excess_depths_are_in_millimetres_of_the_scaled_head(full, penalty):
-    vertices = CROSSED["tongue-teeth"](full)
+def assert_as_measured(pair: str, excess: torch.Tensor, crossed: Crossed, rest_mm: np.ndarray) -> None:
+    """Nine in ten vertices that are too deep are so by what is measured; the others lie at openings of a part."""
+    got, measured = excess.numpy(), np.maximum(crossed.depth_mm - rest_mm - MARGIN_MM, 0)
+    deep = crossed.points & ((got > 0) | (measured > 0))
+    facets = 0.07 if pair == "lids-eyeballs" else 0.0  # between the eyeball's mesh and its spheres
+    assert deep.sum() > 3 and np.quantile(np.abs(got - measured)[deep], 0.9) < 0.01 + facets
+
+
+@pytest.mark.parametrize("pair", PAIRS)
+def test_depths_in_every_pair_are_those_measured(heads, pair):
+    crossed = heads.crossed(pair)
+    heads.penalty.update_candidates(crossed.vertices)
+    excess, costs = heads.penalty.excess_mm(crossed.vertices), heads.penalty(crossed.vertices)
+    assert_as_measured(pair, excess[pair], crossed, crossed.rest_mm)
+    # A vertex in two teeth counts twice.
+    assert 1 - 1e-5 < costs[pair] / excess[pair].square().sum() < 1.5
+    assert pair in OF_THE_TONGUE or not any(cost for other, cost in costs.items() if other != pair)
+
+
+@pytest.mark.parametrize("pair", ["lids-eyeballs", "lips-teeth", "tongue-teeth"])
+def test_depths_in_the_template_are_subtracted(heads, pair):
+    """A model whose template has the parts crossed already, by a part of the depth."""
+    rest = push_until(heads.data, CROSSINGS[pair], 0.5 * DEPTH_MM)
+    penalty = SelfIntersectionPenalty(replace(heads.data, template_vertex_positions=rest.vertices.numpy()), CPU)
+    penalty.update_candidates(rest.vertices)
+    assert penalty(rest.vertices)[pair] == 0
+    crossed = heads.crossed(pair)
+    penalty.update_candidates(crossed.vertices)
+    assert_as_measured(pair, penalty.excess_mm(crossed.vertices)[pair], crossed, rest.depth_mm)
+
+
+def test_excess_depths_are_in_millimetres_of_the_scaled_head(heads):
+    penalty, vertices = heads.penalty, heads.crossed("tongue-teeth").vertices
     penalty.update_candidates(vertices)
     excess, cost = penalty.excess_mm(vertices)["tongue-teeth"], penalty(vertices)["tongue-teeth"]
-    assert excess.max() > 1 and excess.square().sum() <= cost * (1 + 1e-5)
+    assert excess.max() > 1
     for scale in (0.5, 1.2):
         elsewhere = posed(vertices, scale)
         penalty.update_candidates(elsewhere)
@@ -177,50 +196,53 @@ def outside(data: GNMData, vertices: torch.Tensor, excess: torch.Tensor) -> np.n
 
 
 @needs_shared
-def test_skin_at_the_mouth_corners_is_not_inside_the_other_lip(full, penalty):
+def test_skin_at_the_mouth_corners_is_not_inside_the_other_lip(gnm_model, gnm_penalty):
     """Pursed lips: behind the skin next to them, through the interior, lies the oral lining of the other lip."""
-    vertices, random = template(full).numpy().astype(np.float64), np.random.default_rng(5)
-    for basis, scale in ((full.expression_basis[200:350], 0.5), (full.expression_basis[350:382], 0.3)):
+    vertices, random = template(gnm_model).numpy().astype(np.float64), np.random.default_rng(5)
+    for basis, scale in ((gnm_model.expression_basis[200:350], 0.5), (gnm_model.expression_basis[350:382], 0.3)):
         vertices = vertices + np.einsum("e,evc->vc", random.normal(size=len(basis)) * scale, basis)
-    basis = full.vertex_identity_basis
+    basis = gnm_model.vertex_identity_basis
     head = torch.as_tensor(vertices + np.einsum("e,evc->vc", random.normal(size=len(basis)), basis)).float()
-    penalty.update_candidates(head)
-    excess = penalty.excess_mm(head)["upper-lower lip"]
+    gnm_penalty.update_candidates(head)
+    excess = gnm_penalty.excess_mm(head)["upper-lower lip"]
     # By the closest surface alone, 16 vertices of the skin next to the mouth would be up to 7 mm too deep.
-    assert 0 < excess.count_nonzero() < 10 and not outside(full, head, excess).any()
+    assert 0 < excess.count_nonzero() < 10 and not outside(gnm_model, head, excess).any()
 
 
 @needs_shared
-def test_intersections_of_the_official_samples(full, penalty):
+def test_intersections_of_the_official_samples(gnm_model, gnm_penalty):
     """Every lip vertex that is too deep is indeed inside the head; a wide open mouth costs nothing."""
     samples = np.load(SHARED / "data" / "gnm" / "gnm_real_samples.npz")
     names = [*samples["identity_names"].tolist(), *samples["expression_names"].tolist()]
     deepest = {}
     for name, delta in zip(names, [*samples["identity_deltas"], *samples["expression_deltas"]], strict=True):
-        vertices = template(full) + torch.as_tensor(delta)
-        penalty.update_candidates(vertices)
-        excess_by_pair = penalty.excess_mm(vertices)
+        vertices = template(gnm_model) + torch.as_tensor(delta)
+        gnm_penalty.update_candidates(vertices)
+        excess_by_pair = gnm_penalty.excess_mm(vertices)
         deepest[name] = {pair: float(excess.max()) for pair, excess in excess_by_pair.items()}
-        assert not outside(full, vertices, excess_by_pair["upper-lower lip"]).any(), name
+        assert not outside(gnm_model, vertices, excess_by_pair["upper-lower lip"]).any(), name
     assert 0 < deepest["surprise"].pop("tongue-gums") < 0.1 and not any(deepest["surprise"].values())
     assert 0.4 < deepest["identity_a"]["upper-lower lip"] < 0.8  # lip regions without the oral lining would give 1.7
     assert 0.8 < deepest["pucker"]["upper-lower lip"] < 1.4 and 2.5 < deepest["pucker"]["tongue-palate"] < 3.5
     assert max(depths["lips-teeth"] + depths["ears-head"] for depths in deepest.values()) == 0
 
 
-@needs_shared
 @pytest.mark.parametrize("direction", [(1.0, 0.0, 0.0), (-0.7, 0.3, 0.7)])
-def test_a_tongue_pushed_into_the_teeth(full, penalty, direction):
-    tongue = regions.tongue(full)
-    teeth = teeth_of(full)
-    assert len(teeth) == 32
+def test_a_tongue_pushed_into_the_teeth(heads, direction):
+    data, penalty, tongue, teeth = heads.data, heads.penalty, regions.tongue(heads.data), teeth_of(heads.data)
+    assert len(teeth) in (28, 32)
+
+    def depths_mm(data: GNMData, vertices: torch.Tensor) -> np.ndarray:
+        points, depth = vertices.numpy().astype(np.float64), np.zeros(len(vertices))
+        depth[tongue] = part_depths_mm(points[tongue], points, teeth)
+        return depth
+
+    crossing = Crossing(tongue_moved(*direction), depths_mm, regions.tongue)
     deepest = []
-    for push in (0.0, 1.0, 2.0, 3.0, 4.0, 5.0):
-        vertices = translated_part(full, tongue, tuple(push * axis for axis in direction))
+    for push in np.linspace(0, push_until(data, crossing, 2.5).push_mm, 6).tolist():
+        vertices = pushed(data, crossing, push)
         penalty.update_candidates(vertices)
-        excess = penalty.excess_mm(vertices)["tongue-teeth"].numpy()[tongue]
-        points = vertices.numpy().astype(np.float64)
-        truth = tooth_depths_mm(points[tongue], points, teeth)
-        np.testing.assert_allclose(excess, np.maximum(truth - MARGIN_MM, 0), atol=0.01)
+        excess, truth = penalty.excess_mm(vertices)["tongue-teeth"].numpy()[tongue], depths_mm(data, vertices)
+        np.testing.assert_allclose(excess, np.maximum(truth[tongue] - MARGIN_MM, 0), atol=0.01)
         deepest.append(truth.max())
     assert deepest[0] == 0 and deepest[-1] > 2 and np.all(np.diff(deepest) >= 0)

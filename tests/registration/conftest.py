@@ -1,4 +1,4 @@
-"""Both models whose anatomy is found."""
+"""The model that the project builds from nothing, and the released one where it is at hand."""
 
 import pytest
 
@@ -26,7 +26,7 @@ def gnm_model() -> GNMData:
     return gnm_npz.read(GNM)
 
 
-@pytest.fixture(params=["first_model", "gnm_model"])
+@pytest.fixture(scope="session", params=["first_model", "gnm_model"])
 def any_model(request: pytest.FixtureRequest) -> GNMData:
     data: GNMData = request.getfixturevalue(request.param)
     return data
