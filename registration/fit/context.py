@@ -11,6 +11,7 @@ from torch import Tensor
 
 from registration.fit.recipes import Recipe
 from registration.fit.variables import skin_triangles, skin_vertices
+from registration.geometry.folds import Creases
 from registration.geometry.large_steps import normalised_laplacian, spacing
 from registration.geometry.nearest_planes import NearestPlanes
 from registration.landmark_fit.observations import Observations
@@ -113,10 +114,19 @@ class FitContext:
         return SelfIntersectionPenalty(self.data, self.device)
 
     @cached_property
+    def outer_skin(self) -> Bool[np.ndarray, "V"]:
+        """The vertices of the skin that may not fold."""
+        return exterior(self.data)
+
+    @cached_property
+    def creases(self) -> Creases:
+        """The edges of the outer skin, which may become folds."""
+        return Creases.of(self.data.triangles, self.data.template_vertex_positions, self.outer_skin)
+
+    @cached_property
     def folds(self) -> FoldPenalty:
         """The penalty on folds of the outer skin."""
-        data = self.data
-        return FoldPenalty(data.triangles, data.template_vertex_positions, exterior(data), self.device)
+        return FoldPenalty(self.creases, self.device)
 
     @cached_property
     def scan_distance(self) -> ScanDistance | None:

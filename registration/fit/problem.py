@@ -17,6 +17,7 @@ from registration.fit.landmark_slide import slide_to_landmarks
 from registration.fit.optimizer import AdamBlock, AdamUniformBlock, History, ParameterBlock, minimize
 from registration.fit.recipes import Lengths, Stage, rigid_stage
 from registration.fit.terms import StageContext, StepState, Term, make_terms
+from registration.fit.unfolding import unfold
 from registration.fit.variables import InitialGuess, Variables
 from registration.fit.view_weights import HEAD_PX, MIN_ERROR_PX, ViewErrors, ViewWeights, view_errors
 from registration.frames import MM_PER_M
@@ -142,6 +143,8 @@ class FitProblem:
         )
         motion = [(self.vertices() - vertices).norm(dim=-1) * MM_PER_M for vertices in before]
         self.variables.commit_latent()
+        if stage.weights.folds > 0 and "offsets" in names:
+            unfold(self.context, self.variables)
         return _StageTrace(
             history=history, motion_mm=float(motion[0].quantile(0.95)) if motion else None, failure=failure
         )

@@ -13,6 +13,8 @@ from torch import Tensor
 
 from registration.geometry.topology import LEAST_AREA, edges
 
+FREE_COSINE = 0.0  # of a turn that is no fold yet, 90 degrees: half a circle over two edges is a rim, not a fold
+
 
 @dataclass(frozen=True, kw_only=True)
 class Creases:

@@ -2,34 +2,23 @@
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float
 from torch import Tensor
 
-from registration.geometry.folds import Creases, turn_cosines
-
-_FREE = 0.0  # cosine of a turn that is no fold yet, 90 degrees: half a circle over two edges is a rim, not a fold
+from registration.geometry.folds import FREE_COSINE, Creases, turn_cosines
 
 
 class FoldPenalty:
     """How much of the skin's area turns against its neighbours: 90 degrees are free, and what there is at rest.
 
     Args:
-        triangles: of the mesh.
-        rest: vertices at rest, metres.
-        members: vertices of the skin that may not fold.
+        creases: the edges of the skin that may not fold.
         device: of the vertices.
     """
 
-    def __init__(
-        self,
-        triangles: Int[np.ndarray, "F 3"],
-        rest: Float[np.ndarray, "V 3"],
-        members: Bool[np.ndarray, "V"],
-        device: torch.device,
-    ):
-        creases = Creases.of(triangles, rest, members)
+    def __init__(self, creases: Creases, device: torch.device):
         self._faces = torch.as_tensor(creases.faces, device=device)
-        self._limit = torch.as_tensor(np.minimum(creases.rest_cosine, _FREE).astype(np.float32), device=device)
+        self._limit = torch.as_tensor(np.minimum(creases.rest_cosine, FREE_COSINE).astype(np.float32), device=device)
         self._share = torch.as_tensor((creases.area / creases.area.sum()).astype(np.float32), device=device)
 
     def __call__(self, vertices: Float[Tensor, "V 3"]) -> Float[Tensor, ""]:

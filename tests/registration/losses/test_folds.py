@@ -12,7 +12,11 @@ CPU = torch.device("cpu")
 
 
 def penalty(degrees: float, rest: np.ndarray = FLAT) -> float:
-    return float(FoldPenalty(TRIANGLES, rest, EVERYTHING, CPU)(torch.as_tensor(turned(degrees))))
+    return float(penalty_of(rest)(torch.as_tensor(turned(degrees))))
+
+
+def penalty_of(rest: np.ndarray) -> FoldPenalty:
+    return FoldPenalty(Creases.of(TRIANGLES, rest, EVERYTHING), CPU)
 
 
 def test_a_third_of_the_area_at_full_turn():
@@ -28,20 +32,20 @@ def test_what_is_folded_at_rest_is_free():
 
 
 def test_it_does_not_depend_on_pose_and_size():
-    loss = FoldPenalty(TRIANGLES, FLAT, EVERYTHING, CPU)
+    loss = penalty_of(FLAT)
     moved = 1.2 * turned(150)[:, [2, 0, 1]] + [3.0, -1.0, 0.5]
     assert float(loss(torch.as_tensor(moved))) == pytest.approx(penalty(150), rel=1e-9)
 
 
 def test_gradient():
-    loss = FoldPenalty(TRIANGLES, FLAT, EVERYTHING, CPU)
+    loss = penalty_of(FLAT)
     loss._share, loss._limit = loss._share.double(), loss._limit.double()
     points = torch.tensor(1e3 * turned(140), requires_grad=True)
     assert torch.autograd.gradcheck(loss, (points,))
 
 
 def test_descent_opens_a_fold():
-    creases, loss = Creases.of(TRIANGLES, FLAT, EVERYTHING), FoldPenalty(TRIANGLES, FLAT, EVERYTHING, CPU)
+    creases, loss = Creases.of(TRIANGLES, FLAT, EVERYTHING), penalty_of(FLAT)
     points = torch.tensor(turned(170), requires_grad=True)
     assert len(creases.sharp(points.detach().numpy(), 120)) == 1
     optimizer = torch.optim.Adam([points], lr=2e-5)
