@@ -80,7 +80,7 @@ class FitContext:
     @cached_property
     def view_order(self) -> "ViewOrder":
         """The order in which steps take views."""
-        return ViewOrder(self.view_count, self.seed)
+        return ViewOrder(np.stack([camera.centre for camera in self.pyramid[0].pixels.cameras]), self.seed)
 
     @cached_property
     def captured_schemes(self) -> dict[str, LandmarkScheme]:
@@ -169,20 +169,32 @@ class FitContext:
 
 
 class ViewOrder:
-    """The order in which steps take views: random permutations; a view that still waits does not join the next one."""
+    """The order in which steps take views: each once before any comes again, and those of a step far apart.
 
-    def __init__(self, count: int, seed: int):
-        self._count = count
+    Gradients of views all around the head differ less from step to step than those of random views.
+
+    Args:
+        centres: of the cameras.
+        seed: of the first view of each step, and of ties.
+    """
+
+    def __init__(self, centres: Float[np.ndarray, "N 3"], seed: int):
+        self._distance = np.linalg.norm(centres[:, None] - centres[None], axis=-1)
         self._random = np.random.default_rng(seed)
         self._waiting: list[int] = []
 
     def take(self, count: int) -> list[int]:
         """Return the next `count` views, or all if there are fewer, sorted."""
-        count = min(count, self._count)
-        while len(self._waiting) < count:
-            order = self._random.permutation(self._count)
-            self._waiting += [int(view) for view in order if int(view) not in self._waiting]
-        taken, self._waiting = self._waiting[:count], self._waiting[count:]
+        taken: list[int] = []
+        while len(taken) < min(count, len(self._distance)):
+            candidates = [view for view in self._waiting if view not in taken]
+            if not candidates:
+                self._waiting += [int(view) for view in self._random.permutation(len(self._distance))]
+                continue
+            apart = self._distance[candidates][:, taken].min(1) if taken else np.zeros(len(candidates))
+            view = candidates[int(apart.argmax())]
+            self._waiting.remove(view)
+            taken.append(view)
         return sorted(taken)
 
 

@@ -28,6 +28,7 @@ from registration.types import Rendered, Targets
 
 _MOTION_FRACTION = 0.1  # of the last stage's steps, over which the motion of the vertices is measured
 _MAX_STEP_MM = 2.0  # of a region with a rate scale of its own, unless the stage itself steps further
+_TEXTURE_STEPS = 2  # after which the texture is updated: it follows the mean of many, and is a tenth of a step's cost
 _AGREEING_VIEWS = 3  # that locate a landmark; of two, a wrong one moves the point along the other's ray
 
 
@@ -191,7 +192,7 @@ class FitProblem:
         if stage.texture:
             self.appearance.fit_exposures(state.rendered, state.batch, state.agree, state.views)
         losses = {name: loss for term in terms for name, loss in term(state).items()}
-        if stage.texture:
+        if stage.texture and step % _TEXTURE_STEPS == 0:
             vertices = state.vertices.detach()
             self.appearance.update_texture(vertices, state.rendered, state.batch, state.agree, state.views)
         return losses

@@ -282,14 +282,24 @@ def test_a_pose_is_assessed_and_refined_without_touching_other_problems(
 
 
 def test_steps_take_all_views_evenly_and_none_twice() -> None:
-    order = ViewOrder(7, seed=3)
+    centres = np.random.default_rng(0).normal(size=(7, 3))
+    order = ViewOrder(centres, seed=3)
     steps = [order.take(3) for _ in range(70)]
     assert all(len(set(step)) == 3 and step == sorted(step) for step in steps)
     counts = np.bincount([view for step in steps for view in step], minlength=7)
     assert counts.sum() == 210 and counts.min() >= 24 and set(steps[0]) & set(steps[1]) == set()
-    again = ViewOrder(7, seed=3)
+    again = ViewOrder(centres, seed=3)
     assert [again.take(3) for _ in range(70)] == steps
-    assert ViewOrder(2, seed=0).take(5) == [0, 1]
+    assert ViewOrder(centres[:2], seed=0).take(5) == [0, 1]
+
+
+def test_views_of_a_step_are_far_apart() -> None:
+    """Of eight cameras in a circle, four at a time: never two neighbours in the first half of a pass."""
+    angle = 2 * np.pi * np.arange(8) / 8
+    order = ViewOrder(np.stack([np.cos(angle), np.sin(angle), 0 * angle], -1), seed=5)
+    for _ in range(20):
+        first, second = order.take(4), order.take(4)
+        assert set(np.diff(first)) == {2} and sorted(first + second) == list(range(8))
 
 
 def test_a_stage_without_a_weight_has_no_term(context: FitContext, initial: InitialGuess) -> None:
