@@ -141,19 +141,19 @@ def _model(steps: int) -> Stage:
 
 
 def _offsets(
-    smoothing_mm: float, half_gain_mm: float, steps: int, level: int, start: float, end: float, ssim: float = 0.06
+    smoothing_mm: float, half_gain_mm: float, steps: int, level: int, start: float, end: float, views: int = 8
 ) -> Stage:
     # Pose and expression are fixed: offsets would compensate their drift, which teeth, without offsets, would follow.
     return Stage(
         name=f"offsets {smoothing_mm:g} mm",
         steps=steps,
         level=level,
+        views_per_step=views,
         lengths=Lengths(smoothing_mm=smoothing_mm, half_gain_mm=half_gain_mm),
         free=(("offsets", Rate(start=start, end=end)), ("eyes", Rate(start=start / 10, end=end / 10))),
         weights=Weights(
             lid_normal_truncation=_LID_NORMAL_TRUNCATION,
-            rgb=0.3,
-            ssim=ssim,
+            rgb=0.6,
             classes=0.1,
             landmarks=0.01,
             landmark_likelihood=0.001,
@@ -177,34 +177,38 @@ def draft(*, scale: bool = True) -> Recipe:
         _offsets(20, 12, 30, level=2, start=4e-3, end=2e-3),
         _offsets(5, 8, 40, level=1, start=1e-3, end=5e-4),
         _offsets(2.5, 6, 30, level=1, start=4e-4, end=5e-5),
-        _offsets(1.5, 5, 40, level=0, start=2e-4, end=2e-5, ssim=0.0),
+        _offsets(1.5, 5, 40, level=0, start=2e-4, end=2e-5, views=4),
     )
     return Recipe(name="draft", stages=stages, scale=scale)
 
 
 def studio(*, scale: bool = True) -> Recipe:
-    """Full quality: more views per step and more steps, up to a head of about 1024 px."""
+    """Full quality: twice draft's steps, eight views in each, up to a head of about 1024 px."""
     stages = (
         _model(150),
         _offsets(20, 12, 50, level=2, start=4e-3, end=2e-3),
         _offsets(5, 8, 80, level=1, start=1e-3, end=5e-4),
         _offsets(2.5, 6, 60, level=1, start=4e-4, end=5e-5),
-        _offsets(1.5, 4, 90, level=0, start=3e-4, end=1e-5, ssim=0.0),
+        _offsets(1.5, 4, 90, level=0, start=3e-4, end=1e-5),
     )
-    wider = tuple(replace(stage, views_per_step=12) for stage in stages)
-    return Recipe(name="studio", stages=wider, scale=scale, finest_head_px=1024)
+    return Recipe(name="studio", stages=stages, scale=scale, finest_head_px=1024)
 
 
 def preview(*, scale: bool = True) -> Recipe:
-    """For a first look: half of draft's steps, two levels up to a head of 256 px, no self-intersection penalty."""
+    """For a first look: half of draft's steps and views, two levels up to a head of 256 px, no contact penalty."""
     stages = (
         _model(70),
         _offsets(20, 12, 20, level=1, start=4e-3, end=2e-3),
         _offsets(5, 8, 25, level=0, start=1e-3, end=5e-4),
-        _offsets(1.5, 5, 25, level=0, start=2e-4, end=2e-5, ssim=0.0),
+        _offsets(1.5, 5, 25, level=0, start=2e-4, end=2e-5),
     )
     plain = (
-        replace(stage, level=min(stage.level, 1), weights=replace(stage.weights, contacts=0.0, tongue=0.0))
+        replace(
+            stage,
+            level=min(stage.level, 1),
+            views_per_step=4,
+            weights=replace(stage.weights, contacts=0.0, tongue=0.0),
+        )
         for stage in stages
     )
     return Recipe(name="preview", stages=tuple(plain), scale=scale, finest_head_px=256, levels=2, texture_px=512)

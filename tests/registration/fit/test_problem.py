@@ -72,7 +72,7 @@ def test_stages_have_the_losses_of_their_weights_and_variables(context: FitConte
     model, offsets = context.recipe.stages
     assert trace.failure is None and np.isfinite(trace.motion_mm)
     assert set(trace.history[model.name]) == IMAGES | {"identity", "expression", "joints", "eyes"}
-    assert set(trace.history[offsets.name]) == IMAGES | OFFSETS | {"rgb", "ssim", "eyes", "folds"}
+    assert set(trace.history[offsets.name]) == IMAGES | OFFSETS | {"rgb", "eyes", "folds"}
     assert all(len(values) == 2 for losses in trace.history.values() for values in losses.values())
     assert set(trace.seconds) == {model.name, offsets.name}
 

@@ -88,11 +88,14 @@ def test_named_recipes_compare_everything(
         return tuple(record(term) for term in make_terms(of))
 
     monkeypatch.setattr(problem_module, "make_terms", recorded)
-    stages = [replace(stage, steps=1, level=0) for stage in recipe().stages if stage.frees("offsets")]
+    stages = [
+        replace(stage, steps=1, level=0, weights=replace(stage.weights, ssim=0.06 * number))
+        for number, stage in enumerate(filter(lambda stage: stage.frees("offsets"), recipe().stages))
+    ]
     assert FitProblem(context, guess).run(stages).failure is None
-    *coarse, finest = moved.values()
-    for losses in (*coarse, finest):
+    without_ssim, *with_ssim = moved.values()
+    for losses in (without_ssim, *with_ssim):
         assert min(losses[name] for name in ("normals", "mask", "classes", "rgb", "slide")) > 0
         pairs = {name.removeprefix("contact ") for name in losses if name.startswith("contact ")}
         assert pairs == set(context.self_intersection.pairs) and set(OF_THE_TONGUE) <= pairs
-    assert all(losses["ssim"] > 0 for losses in coarse) and "ssim" not in finest
+    assert all(losses["ssim"] > 0 for losses in with_ssim) and "ssim" not in without_ssim
