@@ -9,7 +9,9 @@ whole exterior skin, weighted by area; and surface to surface there, which is wh
 the position of vertices along smooth skin, which images do not determine. Specificity: of 100 random heads from the
 nearest true head. `gain`: relative reduction of model 0's distance by the last model, with 20 components.
 `negative_control`: the same for a model that is built from as many random heads of model 0 itself: the effect of
-building alone. With the same --out an interrupted run is resumed.
+building alone. `true_meshes`: the same for one that is built from the true meshes of the training subjects: what exact
+registrations would gain, so that the difference is what registrations lose. With the same --out an interrupted run is
+resumed.
 """
 
 import argparse
@@ -51,7 +53,7 @@ from workflows.steps.synthesize import Population, synth_dataset
 COMPONENTS = (10, 20, 40)
 HEADLINE = "20"  # number of components of the gain
 SAMPLES = 100
-CONTROL = "control"
+CONTROL, EXACT = "control", "true meshes"
 POINTS = 2000  # of each true surface
 STUDIO = Studio(cameras=8, size_px=(256, 256), texture_size=512, quality=Quality(pixel_samples=2, light_rays=32))
 
@@ -65,6 +67,17 @@ def model_samples(data: GNMData, count: int, seed: int) -> list[TrainingSubject]
     for number, head in enumerate(heads.astype(np.float32)):
         mesh = TrainingMesh(name=NEUTRAL, label=NEUTRAL, vertices=head, confidence=confidence, triangles=data.triangles)
         subjects.append(TrainingSubject(name=f"sample_{number:03d}", neutral=mesh))
+    return subjects
+
+
+def true_subjects(dataset: Path, names: Sequence[str], data: GNMData) -> list[TrainingSubject]:
+    """Return the true meshes of subjects, observed everywhere."""
+    confidence = np.ones(len(data.template_vertex_positions), np.float32)
+    subjects = []
+    for name in names:
+        head = read_truth(dataset / name / NEUTRAL / "ground_truth.npz").astype(np.float32)
+        mesh = TrainingMesh(name=NEUTRAL, label=NEUTRAL, vertices=head, confidence=confidence, triangles=data.triangles)
+        subjects.append(TrainingSubject(name=name, neutral=mesh))
     return subjects
 
 
@@ -153,6 +166,9 @@ def main() -> None:
     names = list(models)
     samples = model_samples(models[FIRST], options.training, options.seed)
     models[CONTROL] = build_model(samples, models[FIRST]).data
+    held_out = {subject.subject for subject in subjects}
+    training = [name for name in population.seeds if name not in held_out]
+    models[EXACT] = build_model(true_subjects(options.out / "dataset", training, models[FIRST]), models[FIRST]).data
     distances = print_distances(models, subjects)
     for round_ in result.state.rounds:
         rejected = [registration.name for registration in round_.build.rejected]
@@ -181,7 +197,8 @@ def print_gains(distances: dict[tuple[str, str], dict[str, float]], names: Seque
     for measure in MEASURES:
         first, last = distances[measure, FIRST][HEADLINE], distances[measure, names[-1]].get(HEADLINE, np.nan)
         print(f"{measure}:")
-        print(f"negative_control {1 - distances[measure, CONTROL].get(HEADLINE, np.nan) / first:.3f}")
+        for label, name in (("negative_control", CONTROL), ("true_meshes", EXACT)):
+            print(f"{label} {1 - distances[measure, name].get(HEADLINE, np.nan) / first:.3f}")
         for number, name in enumerate(names):
             print(f"generalization_mm {number} {distances[measure, name].get(HEADLINE, np.nan):.3f}")
         print(f"gain {1 - last / first:.3f}")
