@@ -6,12 +6,13 @@ Neutrals of any adult age and build, 8 views of 256 x 256 px (`gnmreg dataset sy
 is compared with where it truly is, in the capture's world. Along: the part of the difference in the tangent plane of
 the true surface; across: the distance from the true surface. Root mean squares in mm over the vertices, then over the
 subjects, with the standard error of the subjects' own: on the head's skin, its face, and the neck with the chest; and
-of those vertices that a camera sees. Sharp folds: the mean number in a subject's outer skin. With the same --out an
-interrupted run is resumed.
+of those vertices that a camera sees. Sharp folds: the mean number in a subject's outer skin. The second table is a
+bound: the model's most probable parameters, given the true vertices of the head's skin and the true surface of the
+neck. With the same --out an interrupted run is resumed.
 """
 
 import argparse
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -21,6 +22,7 @@ from rich.console import Console
 from rich.table import Table
 
 from bench.coregistration import STUDIO
+from bench.support.known_head import known_head
 from coregister.first_model import build
 from registration.capture.scan import read_truth
 from registration.evaluate.names import SHARP_FOLD_DEG
@@ -72,11 +74,11 @@ def rms(values: Float[np.ndarray, "M"]) -> float:
     return float(np.sqrt(np.mean(np.square(values)))) if len(values) else float("nan")
 
 
-def table(errors: list[Errors], data: GNMData) -> Table:
+def table(errors: list[Errors], data: GNMData, title: str) -> Table:
     """Return the figures of all subjects."""
     head, neck = regions.head_skin(data), regions.exterior(data) & regions.neck_other(data)
     places = {"head": head, "face": regions.common_face(data)["face"], "neck": neck}
-    shown = Table("skin", "along, mm", "across, mm", "seen: along", "seen: across")
+    shown = Table("skin", "along, mm", "across, mm", "seen: along", "seen: across", title=title)
     for place, members in places.items():
         cells = []
         for only_seen in (False, True):
@@ -102,14 +104,18 @@ def main() -> None:
     data = gnm_npz.read(model)
     population = Population(subjects=options.subjects, seed=options.seed, studio=STUDIO)
     chosen = RegisterOptions(recipe=options.recipe, seed=options.seed)
-    errors = []
+    errors, bounds = [], []
     with console_progress() as progress:
         synth_dataset(options.out / "dataset", population, progress=progress)
         for name in population.seeds:
             capture = options.out / "dataset" / name / "neutral"
             result = register(capture, model, options.out / options.recipe / name, chosen, progress=progress)
-            errors.append(measure(result, read_truth(capture / "ground_truth.npz"), data))
-    Console(width=100).print(table(errors, data))
+            truth = read_truth(capture / "ground_truth.npz")
+            errors.append(measure(result, truth, data))
+            bounds.append(measure(replace(result, vertices=known_head(data, result, truth)), truth, data))
+    console = Console(width=100)
+    console.print(table(errors, data, "registrations"))
+    console.print(table(bounds, data, "the model, head known, neck known across"))
 
 
 if __name__ == "__main__":
