@@ -214,6 +214,7 @@ def _context(inputs: RegistrationInputs, seed: int, device: torch.device, progre
         classes,
         finest_head_px=recipe.finest_head_px,
         levels=recipe.levels,
+        coarsest_head_px=recipe.coarsest_head_px,
         head_rows=inputs.head_rows,
         surface=surface,
         progress=lambda done: progress.update(done, count, "reading views"),

@@ -1,5 +1,6 @@
 """The parts of a fit that do not depend on the initial guess: model, targets, recipe, and what is derived from them."""
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -64,6 +65,14 @@ class FitContext:
     def view_count(self) -> int:
         """How many views there are."""
         return len(self.pyramid[0].names)
+
+    @cached_property
+    def texture_px(self) -> int:
+        """Width and height of the texture: the recipe's, or less, so that the images' pixels reach every texel.
+
+        The atlas is about as wide as two heads are high.
+        """
+        return min(self.recipe.texture_px, 2 ** math.ceil(math.log2(2 * self.pyramid[0].px_per_head)))
 
     @cached_property
     def renderer(self) -> Renderer:

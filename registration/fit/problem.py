@@ -63,7 +63,7 @@ class FitProblem:
     def __init__(self, context: FitContext, initial: InitialGuess):
         self.context = context
         self.variables = Variables(context.model, context.data, initial)
-        self.appearance = Appearance(context.renderer, context.recipe.texture_px, context.view_count, context.device)
+        self.appearance = Appearance(context.renderer, context.texture_px, context.view_count, context.device)
         if context.neutral is not None:
             self.appearance.set_texture(context.neutral.texture)
         self.view_weights = ViewWeights.uniform(context.view_count)

@@ -102,7 +102,8 @@ class Recipe:
     stages: tuple[Stage, ...]
     finest_head_px: int = 512  # resolution of level 0, as the head's height
     levels: int = 3
-    texture_px: int = 1024
+    coarsest_head_px: int = 128  # resolution below which no level is reduced, however small the images are
+    texture_px: int = 1024  # at most; less for small images (`FitContext.texture_px`)
     slide_px: int = 512  # of the textures that the `slide` loss compares
     edge_samples: float = (
         1.0  # per pixel of silhouette, for its gradient; 0: none, as in renderers without edge sampling

@@ -30,11 +30,14 @@ def build_pyramid(
     *,
     finest_head_px: int,
     levels: int,
+    coarsest_head_px: int = 0,
     head_rows: Mapping[str, int] | None = None,
     surface: SurfaceViews | None = None,
     progress: Callable[[int], None] = lambda done: None,
 ) -> tuple[Targets, ...]:
     """Return the targets of all views from fine to coarse; each level has half the resolution of the one before.
+
+    Small images are not reduced to nothing: a level has `coarsest_head_px` at least, or is that of the images.
 
     Args:
         capture: its views are decoded one at a time.
@@ -42,6 +45,7 @@ def build_pyramid(
         finest_head_px: resolution at level 0, as the subject's height: larger images are reduced to it (those up to a
             tenth larger stay as they are), none is enlarged.
         levels: how many.
+        coarsest_head_px: resolution below which no level is reduced, as the subject's height.
         head_rows: height of the head in each view, px of the stored image, by the view's name, as the ledger of a
             validated capture has it; None: masks and labels are decoded once more to measure it.
         surface: of the subject, in the cameras' world: its normals stand in for normal maps where a view has none.
@@ -54,6 +58,8 @@ def build_pyramid(
         head_rows = {sample.name: sample.head_rows for sample in sample_views(capture)}
     reduction = float(np.median([head_rows[view.name] for view in capture.views])) / finest_head_px
     whole = max(1, int(reduction))  # by blocks while decoding, the rest by areas of the crop
+    head_px = finest_head_px * reduction / max(reduction, 1.0)
+    heights = [max(head_px / 2**level, min(head_px, coarsest_head_px)) for level in range(levels)]
     listed: list[list[_ListedView]] = [[] for _ in range(levels)]
     for done, view in enumerate(capture.views):
         progress(done)
@@ -64,11 +70,17 @@ def build_pyramid(
         if surface is not None and not crop.has_normals:
             crop = crop.with_surface(surface)
         crop = crop.padded(2 ** (levels - 1))  # whole blocks of the coarsest level
-        for level in range(levels):
+        for level, height in enumerate(heights):
+            if level and height == heights[level - 1]:
+                continue
             if level:
-                crop = crop.reduced(crop.camera.width_px // 2, crop.camera.height_px // 2)
+                share = height / heights[level - 1]
+                crop = crop.reduced(round(crop.camera.width_px * share), round(crop.camera.height_px * share))
             listed[level].append(_ListedView.from_crop(crop))
-    return tuple(_targets(views, mapping) for views in listed)
+    pyramid: list[Targets] = []
+    for views in listed:
+        pyramid.append(_targets(views, mapping) if views else pyramid[-1])
+    return tuple(pyramid)
 
 
 @dataclass(frozen=True, kw_only=True)
