@@ -281,6 +281,13 @@ def test_a_pose_is_assessed_and_refined_without_touching_other_problems(
     assert refined.identity is shifted.identity
 
 
+@pytest.mark.parametrize("texture_px", (64, 4096))
+def test_texels_are_no_finer_than_pixels(context: FitContext, initial: InitialGuess, texture_px: int) -> None:
+    context = replace(context, recipe=replace(context.recipe, texture_px=texture_px))
+    size, head_px = len(FitProblem(context, initial).appearance.texture), context.pyramid[0].px_per_head
+    assert size == 64 if texture_px == 64 else 2 * head_px <= size < 4 * head_px
+
+
 def test_steps_take_all_views_evenly_and_none_twice() -> None:
     centres = np.random.default_rng(0).normal(size=(7, 3))
     order = ViewOrder(centres, seed=3)
