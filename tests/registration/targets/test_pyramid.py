@@ -85,17 +85,6 @@ def test_heads_are_reduced_by_fractions(capture, pyramid, finest_head_px):
             np.testing.assert_allclose(view[:, :2], camera.project(small.landmarks_68())[0], atol=0.02)
 
 
-def test_no_level_is_reduced_below_the_coarsest_head(capture, pyramid):
-    levels = build_pyramid(capture, class_map(CLASSES), finest_head_px=10_000, levels=4, coarsest_head_px=60)
-    assert (
-        len(levels[0].pixels.view) == len(pyramid[0].pixels.view) and levels[2] is levels[1] and levels[3] is levels[1]
-    )
-    assert levels[1].px_per_head == pytest.approx(levels[0].px_per_head * 60 / 87, rel=0.02)
-    assert_channels_match_cameras(levels[1], least=2000 * (60 / 87) ** 2)
-    small = build_pyramid(capture, class_map(CLASSES), finest_head_px=10_000, levels=2, coarsest_head_px=128)
-    assert small[1] is small[0]
-
-
 def test_heads_a_little_larger_stay_as_they_are(capture, pyramid):
     same = build_pyramid(capture, class_map(CLASSES), finest_head_px=81, levels=1)[0]
     assert torch.equal(same.rgb, pyramid[0].rgb) and torch.equal(same.pixels.x, pyramid[0].pixels.x)
