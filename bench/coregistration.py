@@ -23,13 +23,14 @@ from pathlib import Path
 
 import numpy as np
 
+from bench.support.population import observed_everywhere
 from coregister.evaluate.evaluation import HeldOutSubject
 from coregister.evaluate.linear_fit import LinearPart, fit_correspondence, identity_part
 from coregister.evaluate.scan_fit import fit_scan
 from coregister.evaluate.specificity import specificity_mm
 from coregister.first_model import build as bootstrap
 from coregister.next_model.build import build_model
-from coregister.next_model.training_data import NEUTRAL, TrainingMesh, TrainingSubject
+from coregister.next_model.training_data import NEUTRAL, TrainingSubject
 from coregister.stopping_rule import StoppingRule
 from coregister.synthetic.capture import Studio
 from registration.capture.scan import read_truth
@@ -62,23 +63,7 @@ def model_samples(data: GNMData, count: int, seed: int) -> list[TrainingSubject]
     """Return random heads of a model, coefficients of unit variance, observed everywhere."""
     coefficients = np.random.default_rng(seed).standard_normal((count, len(data.vertex_identity_basis)))
     heads = data.template_vertex_positions + np.tensordot(coefficients, data.vertex_identity_basis, 1)
-    confidence = np.ones(len(data.template_vertex_positions), np.float32)
-    subjects = []
-    for number, head in enumerate(heads.astype(np.float32)):
-        mesh = TrainingMesh(name=NEUTRAL, label=NEUTRAL, vertices=head, confidence=confidence, triangles=data.triangles)
-        subjects.append(TrainingSubject(name=f"sample_{number:03d}", neutral=mesh))
-    return subjects
-
-
-def true_subjects(dataset: Path, names: Sequence[str], data: GNMData) -> list[TrainingSubject]:
-    """Return the true meshes of subjects, observed everywhere."""
-    confidence = np.ones(len(data.template_vertex_positions), np.float32)
-    subjects = []
-    for name in names:
-        head = read_truth(dataset / name / NEUTRAL / "ground_truth.npz").astype(np.float32)
-        mesh = TrainingMesh(name=NEUTRAL, label=NEUTRAL, vertices=head, confidence=confidence, triangles=data.triangles)
-        subjects.append(TrainingSubject(name=name, neutral=mesh))
-    return subjects
+    return observed_everywhere({f"sample_{number:03d}": head for number, head in enumerate(heads)}, data.triangles)
 
 
 def surface_part(data: GNMData) -> LinearPart:
@@ -167,8 +152,12 @@ def main() -> None:
     samples = model_samples(models[FIRST], options.training, options.seed)
     models[CONTROL] = build_model(samples, models[FIRST]).data
     held_out = {subject.subject for subject in subjects}
-    training = [name for name in population.seeds if name not in held_out]
-    models[EXACT] = build_model(true_subjects(options.out / "dataset", training, models[FIRST]), models[FIRST]).data
+    exact = {
+        name: read_truth(options.out / "dataset" / name / NEUTRAL / "ground_truth.npz")
+        for name in population.seeds
+        if name not in held_out
+    }
+    models[EXACT] = build_model(observed_everywhere(exact, models[FIRST].triangles), models[FIRST]).data
     distances = print_distances(models, subjects)
     for round_ in result.state.rounds:
         rejected = [registration.name for registration in round_.build.rejected]

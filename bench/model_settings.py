@@ -20,7 +20,7 @@ from itertools import product
 import numpy as np
 from jaxtyping import Float
 
-from bench.support.population import true_neutrals
+from bench.support.population import observed_everywhere, true_neutrals
 from coregister.evaluate.linear_fit import fit_correspondence, identity_part
 from coregister.evaluate.specificity import specificity_mm
 from coregister.first_model import assembly, makehuman, population
@@ -30,7 +30,6 @@ from coregister.next_model import identity
 from coregister.next_model.build import build_model
 from coregister.next_model.identity import IdentitySettings
 from coregister.next_model.recipes import true_meshes
-from coregister.next_model.training_data import TrainingMesh, TrainingSubject
 from registration.model import gnm_npz
 from registration.model.gnm_npz import GNMData
 
@@ -63,12 +62,7 @@ def add_noise(heads: Float[np.ndarray, "N V 3"], rms_mm: float, draw: int) -> Fl
 
 def next_model(heads: Float[np.ndarray, "N V 3"], previous: GNMData, settings: IdentitySettings) -> GNMData:
     """Return the model that is built from neutrals alone."""
-    confidence = np.ones(heads.shape[1], np.float32)
-    meshes = [
-        TrainingMesh(name=str(k), label="neutral", vertices=head, confidence=confidence, triangles=previous.triangles)
-        for k, head in enumerate(heads)
-    ]
-    subjects = [TrainingSubject(name=mesh.name, neutral=mesh) for mesh in meshes]
+    subjects = observed_everywhere({str(number): head for number, head in enumerate(heads)}, previous.triangles)
     return build_model(subjects, previous, replace(true_meshes(), identity=settings)).data
 
 

@@ -6,7 +6,7 @@ from jaxtyping import Bool, Float, Int
 from registration.detect import face478_points as named
 from registration.detect.face478 import SCHEME as FACE478
 from registration.detect.map_solve import Regions
-from registration.geometry.topology import edges
+from registration.geometry.topology import edges, grown
 from registration.model import regions
 from registration.model.gnm_npz import GNMData
 
@@ -53,13 +53,9 @@ def lid_edges(data: GNMData, *, left: bool) -> tuple[Int[np.ndarray, "U"], Int[n
 
     The skin of a lid ends behind its edge, on the eyeball: the rims and `_EDGE_RINGS` rings of skin around them.
     """
-    a, b = edges(data.triangles).vertices.T
     outside, near = regions.exterior(data), lid_rims(data)
     for _ in range(_EDGE_RINGS):
-        grown = near.copy()
-        grown[a[near[b]]] = True
-        grown[b[near[a]]] = True
-        near = grown & outside
+        near = grown(data.triangles, near, 1) & outside
     height = _above_the_corners(data, left=left)
     return np.flatnonzero(near & (height > 0)), np.flatnonzero(near & (height < 0))
 

@@ -13,8 +13,9 @@ from torch import Tensor
 from registration.fit.recipes import Recipe
 from registration.fit.variables import skin_triangles, skin_vertices
 from registration.geometry.folds import Creases
-from registration.geometry.large_steps import normalised_laplacian, spacing
+from registration.geometry.large_steps import spacing
 from registration.geometry.nearest_planes import NearestPlanes
+from registration.geometry.topology import grown
 from registration.landmark_fit.observations import Observations
 from registration.losses import depth
 from registration.losses.folds import FoldPenalty
@@ -222,12 +223,8 @@ class SkinMesh:
         skin = skin_vertices(data)
         triangles = skin_triangles(data.triangles, skin, len(data.template_vertex_positions))
         points = data.template_vertex_positions[skin]
-        neighbours = normalised_laplacian(triangles, len(skin)) != 0  # and each vertex itself
         masks = offset_regions(data)
         region = np.zeros(len(skin), np.int64)
         for number, settings in enumerate(recipe.regions, start=1):
-            members = masks[settings.name][skin]
-            for _ in range(_REGION_RINGS):
-                members = members | (neighbours @ members)
-            region[members] = number
+            region[grown(triangles, masks[settings.name][skin], _REGION_RINGS)] = number
         return cls(triangles=triangles, points=points, edge_length_m=spacing(triangles, points), region=region)

@@ -12,8 +12,9 @@ from scipy.optimize import minimize
 from registration.fit.context import FitContext
 from registration.fit.variables import Variables
 from registration.frames import MM_PER_M
-from registration.geometry.folds import FREE_COSINE, Creases, turn_cosines
+from registration.geometry.folds import Creases, turn_cosines
 from registration.geometry.large_steps import normalised_laplacian, to_torch
+from registration.geometry.topology import grown
 
 _SHARP_DEG = 100.0  # turn of an edge that is unfolded: less than what counts as a fold, which what follows may add to
 _RINGS = 2  # of vertices around a fold that may move
@@ -59,11 +60,9 @@ def unfolding(
         sharp = creases.sharp(moved, _SHARP_DEG)
         if not len(sharp):
             break
-        near = np.zeros(len(vertices), bool)
-        near[sharp] = True
-        for _ in range(_RINGS):
-            near[triangles[near[triangles].any(1)]] = True
-        rows = np.flatnonzero(near & members)
+        folded = np.zeros(len(vertices), bool)
+        folded[sharp] = True
+        rows = np.flatnonzero(grown(triangles, folded, _RINGS) & members)
         moved[rows] += _least_motion(triangles, creases, rows, moved)
     return moved - vertices
 
@@ -74,7 +73,7 @@ def _least_motion(
     """The displacement of some vertices, metres."""
     edges = np.isin(creases.faces, rows).any((1, 2))
     faces = torch.as_tensor(creases.faces[edges])
-    limit = torch.as_tensor(np.minimum(creases.rest_cosine[edges], FREE_COSINE))
+    limit = torch.as_tensor(creases.free_cosine[edges])
     laplacian = normalised_laplacian(triangles, len(vertices))[rows][:, rows]
     laplacian = to_torch(laplacian, torch.device("cpu"), torch.float64)
     base, index = torch.as_tensor(vertices), torch.as_tensor(rows)

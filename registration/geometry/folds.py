@@ -13,7 +13,7 @@ from torch import Tensor
 
 from registration.geometry.topology import LEAST_AREA, edges
 
-FREE_COSINE = 0.0  # of a turn that is no fold yet, 90 degrees: half a circle over two edges is a rim, not a fold
+_FREE_COSINE = 0.0  # of a turn that is no fold yet, 90 degrees: half a circle over two edges is a rim, not a fold
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -51,6 +51,11 @@ class Creases:
             rest_cosine=turn_cosines(torch.as_tensor(points), torch.as_tensor(faces)).numpy(),
             area=np.linalg.norm(np.cross(b - a, c - a), axis=-1).sum(1) / 6,
         )
+
+    @property
+    def free_cosine(self) -> Float[np.ndarray, "E"]:
+        """The cosine of the turn up to which an edge is no fold: 90 degrees, or what it has at rest."""
+        return np.minimum(self.rest_cosine, _FREE_COSINE)
 
     def sharp(self, vertices: Float[np.ndarray, "V 3"], beyond_deg: float) -> Int[np.ndarray, "N 2"]:
         """Return the edges that turn by more than an angle (degrees) here and not at rest, as pairs of vertices."""

@@ -86,6 +86,14 @@ def boundary_vertices(triangles: Int[np.ndarray, "F 3"], count: int) -> Bool[np.
     return found
 
 
+def grown(triangles: Int[np.ndarray, "F 3"], members: Bool[np.ndarray, "V"], rings: int) -> Bool[np.ndarray, "V"]:
+    """Return the members with so many rings of vertices around them."""
+    for _ in range(rings):
+        members = members.copy()
+        members[triangles[members[triangles].any(1)]] = True
+    return members
+
+
 def connected_parts(triangles: Int[np.ndarray, "F 3"]) -> Int[np.ndarray, "F"]:
     """Return for each triangle the number of its connected component; triangles are connected by common vertices."""
     count = int(triangles.max()) + 1

@@ -5,7 +5,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from registration.geometry.folds import FREE_COSINE, Creases, turn_cosines
+from registration.geometry.folds import Creases, turn_cosines
 
 
 class FoldPenalty:
@@ -18,7 +18,7 @@ class FoldPenalty:
 
     def __init__(self, creases: Creases, device: torch.device):
         self._faces = torch.as_tensor(creases.faces, device=device)
-        self._limit = torch.as_tensor(np.minimum(creases.rest_cosine, FREE_COSINE).astype(np.float32), device=device)
+        self._limit = torch.as_tensor(creases.free_cosine.astype(np.float32), device=device)
         self._share = torch.as_tensor((creases.area / creases.area.sum()).astype(np.float32), device=device)
 
     def __call__(self, vertices: Float[Tensor, "V 3"]) -> Float[Tensor, ""]:

@@ -56,9 +56,9 @@ def build_pyramid(
     """
     if head_rows is None:
         head_rows = {sample.name: sample.head_rows for sample in sample_views(capture)}
-    reduction = float(np.median([head_rows[view.name] for view in capture.views])) / finest_head_px
+    stored_px = float(np.median([head_rows[view.name] for view in capture.views]))
+    reduction, head_px = stored_px / finest_head_px, min(stored_px, finest_head_px)
     whole = max(1, int(reduction))  # by blocks while decoding, the rest by areas of the crop
-    head_px = finest_head_px * reduction / max(reduction, 1.0)
     heights = [max(head_px / 2**level, min(head_px, coarsest_head_px)) for level in range(levels)]
     listed: list[list[_ListedView]] = [[] for _ in range(levels)]
     for done, view in enumerate(capture.views):

@@ -6,7 +6,7 @@ import torch
 import trimesh
 
 from registration.errors import InputError
-from registration.geometry.topology import edges, vertex_normals
+from registration.geometry.topology import edges, grown, vertex_normals
 
 SQUARE = np.array([[0, 1, 2], [0, 2, 3]])
 
@@ -111,3 +111,12 @@ def test_gradient_of_normals():
     vertices = torch.tensor(ball.vertices + 0.1 * np.random.default_rng(0).standard_normal(ball.vertices.shape))
     triangles = torch.tensor(np.array(ball.faces))
     assert torch.autograd.gradcheck(lambda v: vertex_normals(v, triangles), vertices.requires_grad_())
+
+
+def test_rings_around_a_vertex():
+    strip = np.array([[k, k + 1, k + 2] for k in range(8)])  # neighbours are at most two apart
+    members = np.arange(10) == 4
+    assert np.flatnonzero(grown(strip, members, 0)).tolist() == [4]
+    assert np.flatnonzero(grown(strip, members, 1)).tolist() == [2, 3, 4, 5, 6]
+    assert np.flatnonzero(grown(strip, members, 2)).tolist() == [0, 1, 2, 3, 4, 5, 6, 7, 8]
+    assert members.sum() == 1
