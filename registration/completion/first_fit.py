@@ -60,9 +60,9 @@ class HeadFitter:
     ):
         self.data, self.schemes, self._neutral, self._seed = data, schemes, neutral, seed
         self._model = GNM(data, device=device)
-        recipe = replace(in_model(), name="completion", finest_head_px=_HEAD_PX, levels=1)
+        recipe = in_model()
         first = replace(recipe.stages[0], level=0)
-        recipe = replace(recipe, stages=(first,))
+        recipe = replace(recipe, name="completion", finest_head_px=_HEAD_PX, levels=1, stages=(first,))
         self._recipe: Recipe = recipe if neutral is None else expression_recipe(recipe)
 
     def start(self, capture: Capture, head: HeadPose | None) -> FittedHead:

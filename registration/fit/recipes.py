@@ -115,6 +115,33 @@ class Recipe:
         OffsetRegion(name="nostrils", length=0.5, rate_scale=10.0),
     )
 
+    def __post_init__(self) -> None:
+        """Refuse numbers that no fit can use, before anything is computed.
+
+        Raises:
+            InputError: a count or size is below its least, or a stage's level is none of the recipe's.
+        """
+        least = {"finest_head_px": 1, "levels": 1, "coarsest_head_px": 0, "texture_px": 1, "slide_px": 1}
+        for name, minimum in least.items():
+            self._require(name, getattr(self, name), f"{minimum} or more", getattr(self, name) >= minimum)
+        for stage in self.stages:
+            for name in ("steps", "views_per_step"):
+                self._require(
+                    f"{name} of stage {stage.name}", getattr(stage, name), "1 or more", getattr(stage, name) >= 1
+                )
+            known = 0 <= stage.level < self.levels
+            self._require(f"level of stage {stage.name}", stage.level, f"0 to {self.levels - 1}", known)
+
+    def _require(self, name: str, got: float, expected: str, met: bool) -> None:
+        if not met:
+            raise InputError(
+                "A number of the recipe is out of range",
+                where=f"recipe {self.name}, {name}",
+                expected=expected,
+                got=got,
+                fix="correct the function that returns the recipe",
+            )
+
 
 _POSE = (("root", 5e-3), ("joints", 5e-3), ("position", 1e-3), ("eyes", 1e-3))
 

@@ -16,7 +16,7 @@ from registration.geometry.folds import Creases, turn_cosines
 from registration.geometry.large_steps import normalised_laplacian, to_torch
 from registration.geometry.topology import grown
 
-_SHARP_DEG = 100.0  # turn of an edge that is unfolded: less than what counts as a fold, which what follows may add to
+_SHARP_DEG = 115.0  # a little below a fold's 120; with 100, creases of a lid were pushed into the lid
 _RINGS = 2  # of vertices around a fold that may move
 _ROUNDS = 2  # a fold at the border of what moved
 _ROUGHNESS, _MOTION = 0.1, 0.005  # per mm^2, against one edge's squared excess of the turn's cosine
