@@ -1,12 +1,14 @@
 """Measure how much of a wave of known length a registration keeps, region by region, and what its lengths state.
 
-    python -m bench.waves [--out DIR] [--length-mm 10] [--amplitude-mm 0.3] [--recipe draft]
+    python -m bench.waves [--out DIR] [--length-mm 10 20] [--amplitude-mm 0.3] [--recipe draft]
 
 The first model's mean head gets waves along its normals, across the face from left to right, that fade at the rims of
 mouth and lids. Its registration's distance from the head without waves is compared with the wave at the same place:
-gain is the slope of the one against the other. The stated gain is that of the last stage's lengths
-(docs/algorithms.md, "Regularization of the offsets") for the wave's length along the skin. With the same --out an
-interrupted run is resumed.
+gain is the slope of the one against the other, divided by that of the wavy head itself, whose closest points in creases
+are not its own vertices. The stated gain is that of the last stage's lengths
+(docs/algorithms.md, "Regularization of the offsets") for the wave's length along the skin. Measured are the vertices
+whose edges along the waves are shorter than a quarter of their length: a coarser mesh cannot have these waves, nor do
+its images show them. With the same --out an interrupted run is resumed.
 """
 
 import argparse
@@ -26,7 +28,7 @@ from registration.fit.variables import skin_vertices
 from registration.frames import MM_PER_M
 from registration.geometry.closest_point import barycentric_points, closest_points
 from registration.geometry.large_steps import normalised_laplacian
-from registration.geometry.topology import vertex_normals
+from registration.geometry.topology import edges, vertex_normals
 from registration.losses.regularization import regularization_weights
 from registration.model import gnm_npz, regions
 from registration.model.gnm_npz import GNMData
@@ -34,9 +36,11 @@ from registration.model.landmarks import schemes_beside
 from registration.options import RegisterOptions
 from registration.pipeline import register
 from registration.progress import console_progress
+from registration.types import Registration
 
 _FADE_RINGS = 3  # of vertices over which waves fade at rims
 _FACING = 0.6  # largest component of a normal along the waves, of skin that is measured: elsewhere they are longer
+_RESOLVED = 0.25  # longest edge along the waves, of their length, of a vertex that is measured
 _ACROSS = np.array([1.0, 0.0, 0.0])  # direction of the waves
 
 
@@ -68,8 +72,20 @@ class WavyHead:
         flat = regions.outer_surface(self.data) & (np.abs(self.normals @ _ACROSS) < _FACING)
         return {name: members & flat for name, members in chosen.items()}
 
+    def resolved(self) -> Bool[np.ndarray, "V"]:
+        """Return the vertices whose edges are short enough along the waves for the mesh to have them."""
+        ends = edges(self.data.triangles).vertices
+        along = np.abs(np.diff(self.rest[ends] @ _ACROSS, axis=1)[:, 0])
+        longest = np.zeros(len(self.rest))
+        for k in range(2):
+            np.maximum.at(longest, ends[:, k], along)
+        return longest < _RESOLVED * self.length_m
+
     def gain(self, vertices: Float[np.ndarray, "V 3"], members: Bool[np.ndarray, "V"]) -> float:
-        """Return the share of the waves that a registration has at some of its vertices."""
+        """Return the share of the waves that a registration has at some of its vertices, relative to this head's."""
+        return self._slope(vertices, members) / self._slope(self.vertices, members)
+
+    def _slope(self, vertices: Float[np.ndarray, "V 3"], members: Bool[np.ndarray, "V"]) -> float:
         skin = self.data.triangles[regions.exterior(self.data)[self.data.triangles].all(1)].astype(np.int64)
         points = vertices[members].astype(np.float64)
         _, face, barycentric = closest_points(points, self.rest, skin)
@@ -96,10 +112,27 @@ class WavyHead:
         return float(np.mean(1 / (1 + a + b * q**2 + c * q**4)))
 
 
+def registered(head: WavyHead, model: Path, options: argparse.Namespace, out: Path) -> Registration:
+    """Render a capture of the head and register it, both unless they exist."""
+    capture = out / "capture"
+    with console_progress() as progress:
+        if not capture.exists():
+            render_capture(
+                capture,
+                data=head.data,
+                vertices=head.vertices,
+                schemes=schemes_beside(model, head.data.template_vertex_positions),
+                subject="waves",
+                expression="neutral",
+                studio=Studio(cameras=options.views, size_px=tuple(options.size), texture_size=1024),
+            )
+        return register(capture, model, out / options.recipe, RegisterOptions(recipe=options.recipe), progress=progress)
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=Path, default=Path("build/bench_waves"))
-    parser.add_argument("--length-mm", type=float, default=10.0)
+    parser.add_argument("--length-mm", type=float, nargs="+", default=[10.0, 20.0])
     parser.add_argument("--amplitude-mm", type=float, default=0.3)
     parser.add_argument("--recipe", default="draft")
     parser.add_argument("--views", type=int, default=12)
@@ -107,25 +140,16 @@ def main() -> None:
     options = parser.parse_args()
     model = build.bootstrap()
     data = gnm_npz.read(model)
-    head = WavyHead(data, options.length_mm / MM_PER_M, options.amplitude_mm / MM_PER_M)
-    capture = options.out / "capture"
-    with console_progress() as progress:
-        if not capture.exists():
-            render_capture(
-                capture,
-                data=data,
-                vertices=head.vertices,
-                schemes=schemes_beside(model, data.template_vertex_positions),
-                subject="waves",
-                expression="neutral",
-                studio=Studio(cameras=options.views, size_px=tuple(options.size), texture_size=1024),
-            )
-        chosen = RegisterOptions(recipe=options.recipe)
-        result = register(capture, model, options.out / options.recipe, chosen, progress=progress)
-    table = Table("region", "vertices", "gain", "stated", title=f"waves of {options.length_mm:g} mm, {options.recipe}")
-    for name, members in head.regions().items():
-        stated = head.stated_gain(load_recipe(options.recipe), members)
-        table.add_row(name, str(members.sum()), f"{head.gain(result.vertices, members):.2f}", f"{stated:.2f}")
+    table = Table("waves, mm", "region", "vertices", "of them resolved", "gain", "stated", title=options.recipe)
+    for length_mm in options.length_mm:
+        head = WavyHead(data, length_mm / MM_PER_M, options.amplitude_mm / MM_PER_M)
+        result = registered(head, model, options, options.out / f"{length_mm:g}mm")
+        resolved = head.resolved()
+        for name, members in head.regions().items():
+            measured = members & resolved
+            gains = head.gain(result.vertices, measured), head.stated_gain(load_recipe(options.recipe), measured)
+            counts = str(members.sum()), str(measured.sum())
+            table.add_row(f"{length_mm:g}", name, *counts, *(f"{gain:.2f}" for gain in gains))
     Console(width=80).print(table)
 
 
