@@ -23,7 +23,8 @@ def load_named(wanted: str | T, table: Mapping[str, Callable[[], T]], type_: typ
         title: what messages call them.
 
     Raises:
-        InputError: an unknown name, a module or function that cannot be imported or fails, or a result of another type.
+        InputError: an unknown name, a module or function that cannot be imported or fails, or a result of another
+            type; or what the function itself raises.
     """
     if isinstance(wanted, type_):
         return wanted
@@ -42,6 +43,8 @@ def load_named(wanted: str | T, table: Mapping[str, Callable[[], T]], type_: typ
         raise invalid(got=f"the name {name}")
     try:
         loaded = _import(module, function)()
+    except InputError:
+        raise  # says itself what is wrong, as with a recipe's number out of range
     except (Exception, SystemExit) as error:  # the module is the user's: anything may go wrong
         raise invalid(got=f"{type(error).__name__}: {error}") from error
     if not isinstance(loaded, type_):

@@ -25,3 +25,12 @@ def test_others_are_refused(name: str, got: str) -> None:
     with pytest.raises(InputError, match="no such number") as refused:
         load_named(name, TABLE, int, title="number")
     assert got in refused.value.got and "three" in refused.value.expected
+
+
+def test_what_a_function_refuses_is_reported_as_it_says(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    text = "from registration.fit.recipes import Recipe\ndef none():\n    return Recipe(name='mine', stages=(), levels=0)\n"
+    (tmp_path / "recipe_of_mine.py").write_text(text)
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(InputError, match="number of the recipe is out of range") as refused:
+        load_named("recipe_of_mine:none", TABLE, int, title="number")
+    assert refused.value.where == "recipe mine, levels" and refused.value.got == "0"
