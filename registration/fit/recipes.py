@@ -47,7 +47,7 @@ class Weights:
     eyes: float = 1.0  # translation of the eyeballs relative to the model, per m^2
     eye_scale: float = 2e-3
     offsets: float = 2e4  # per m^2: the assumed strength of the image losses, against which `Lengths` are balanced
-    contacts: float = 0.0  # per mm^2 of excess depth, summed over the vertices inside another part
+    contacts: float = 0.0  # per mm^2 of excess depth, summed by area over the vertices inside another part
     folds: float = 0.0  # of the area of faces that turn against their neighbours, as a share of the skin's
     tongue: float = 1e-5  # the same of the tongue, which is mostly occluded: about as strong as its prior
     slide: float = 0.0  # dissimilarity of the neutral's texture and the unwrapped images; expressions only

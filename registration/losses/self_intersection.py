@@ -2,11 +2,14 @@
 
 For a pair of parts the loss is
 
-    sum over vertices v of relu(depth(v) - tolerance(v))^2   [mm^2]
+    a * sum over vertices v of relu(depth(v) - tolerance(v))^2   [mm^2]
 
 depth(v) is how deep v lies in the other part; tolerance(v) is its depth in the template plus a margin: eyelids and lips
-are normally in contact, and the template has intersections. An eyeball is the union of two spheres; every other part is
-a surface with an inside. Eye sockets and the oral lining are excluded: in the model they lie inside their neighbours.
+are normally in contact, and the template has intersections. a is the mean area of the pair's vertices in the template,
+relative to that of all pairs: images and the regularization of offsets count by area, too, against which the lids' many
+small faces would otherwise be pushed off the eyeballs and rolled outwards. An eyeball is the union of two spheres;
+every other part is a surface with an inside. Eye sockets and the oral lining are excluded: in the model they lie inside
+their neighbours.
 """
 
 from collections.abc import Sequence
@@ -22,7 +25,7 @@ from registration.frames import MM_PER_M
 from registration.geometry.contacts import ContactCandidates, ContactSearch, Interior, depths
 from registration.geometry.geodesic import edge_distances
 from registration.geometry.spheres import fit_sphere, on_main_sphere
-from registration.geometry.topology import connected_parts, edges
+from registration.geometry.topology import connected_parts, edges, vertex_areas
 from registration.model import regions
 from registration.model.gnm_npz import GNMData
 
@@ -59,6 +62,10 @@ class SelfIntersectionPenalty:
         data: the model.
         device: of the vertices.
 
+    Attributes:
+        pairs: their names.
+        weights: a of each pair.
+
     Raises:
         InputError: the model lacks a vertex group that names a part.
     """
@@ -75,6 +82,9 @@ class SelfIntersectionPenalty:
         # Every vertex of every contact has a slot in the tolerances.
         points = [eyeball.points for eyeball in self._eyeballs] + [surface.points for _, surface in self._surfaces]
         self._slots = np.cumsum([0, *(len(index) for index in points)])
+        names = ["lids-eyeballs"] * len(self._eyeballs) + [name for name, _ in self._surfaces]
+        weights = _area_weights(vertex_areas(rest, data.triangles), self.pairs, names, points)
+        self.weights = torch.as_tensor(weights, dtype=torch.float32, device=device)
         none = torch.zeros(self._slots[-1], device=device)
         self._candidates = self._find_candidates(template, none)
         self._template_tolerance = self._depths_at_least(none, template, self.pairs) + _MARGIN
@@ -108,13 +118,13 @@ class SelfIntersectionPenalty:
             vertices: world, metres.
 
         Returns:
-            Pair -> sum over vertices of squared excess depths, mm^2. Differentiable in both parts; value and gradient
-            are zero for the template.
+            Pair -> weighted sum over vertices of squared excess depths, mm^2. Differentiable in both parts; value and
+            gradient are zero for the template.
         """
         slot, pair, _, depth = self._depths(vertices, self._candidates, self._tolerance)
         excess = torch.relu(depth - self._tolerance[slot])
         total = excess.new_zeros(len(self.pairs)).index_add(0, pair, excess.square())
-        return dict(zip(self.pairs, self._candidates.scale**2 * total, strict=True))
+        return dict(zip(self.pairs, self._candidates.scale**2 * self.weights * total, strict=True))
 
     @torch.no_grad()
     def excess_mm(self, vertices: Float[Tensor, "V 3"]) -> dict[str, Float[Tensor, "V"]]:
@@ -239,6 +249,24 @@ def _surfaces(data: GNMData, rest: Float[np.ndarray, "V 3"]) -> list[tuple[str, 
         ("ears-head", into(ears, part(head), around_ears)),
         ("ears-head", into(head, part(ears), around_ears)),
     ]
+
+
+def _area_weights(
+    areas: Float[np.ndarray, "V"], pairs: Sequence[str], names: Sequence[str], points: Sequence[Int[np.ndarray, "_"]]
+) -> Float[np.ndarray, "Q"]:
+    """The mean area of each pair's vertices relative to that of all; zero for a pair without vertices.
+
+    Args:
+        areas: of the vertices.
+        pairs: the Q names.
+        names: of the pair of each list of vertices.
+        points: the lists.
+    """
+    weights = np.zeros(len(pairs))
+    for number, pair in enumerate(pairs):
+        members = np.unique(np.concatenate([own for name, own in zip(names, points, strict=True) if name == pair]))
+        weights[number] = areas[members].mean() if len(members) else 0.0
+    return weights / areas[np.concatenate(points)].mean()
 
 
 def _linings(data: GNMData, rest: Float[np.ndarray, "V 3"]) -> tuple[Bool[np.ndarray, "V"], Bool[np.ndarray, "V"]]:

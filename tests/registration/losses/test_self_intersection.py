@@ -7,7 +7,7 @@ from scipy.spatial.transform import Rotation
 
 from bench.support.crossed_parts import part_depths_mm, teeth_of, translated_part, winding
 from registration.errors import InputError
-from registration.geometry.topology import vertex_normals
+from registration.geometry.topology import vertex_areas, vertex_normals
 from registration.losses.self_intersection import OF_THE_TONGUE, SelfIntersectionPenalty
 from registration.model import regions
 from registration.model.gnm_npz import GNMData
@@ -49,6 +49,9 @@ class Heads:
         if pair not in self._crossed:
             self._crossed[pair] = push_until(self.data, CROSSINGS[pair], DEPTH_MM)
         return self._crossed[pair]
+
+    def weight(self, pair: str) -> float:
+        return float(self.penalty.weights[self.penalty.pairs.index(pair)])
 
 
 @pytest.fixture(scope="module")
@@ -139,8 +142,24 @@ def test_depths_in_every_pair_are_those_measured(heads, pair):
     excess, costs = heads.penalty.excess_mm(crossed.vertices), heads.penalty(crossed.vertices)
     assert_as_measured(pair, excess[pair], crossed, crossed.rest_mm)
     # A vertex in two teeth counts twice.
-    assert 1 - 1e-5 < costs[pair] / excess[pair].square().sum() < 1.5
+    assert 1 - 1e-5 < costs[pair] / excess[pair].square().sum() / heads.weight(pair) < 1.5
     assert pair in OF_THE_TONGUE or not any(cost for other, cost in costs.items() if other != pair)
+
+
+def test_pairs_count_by_the_area_of_their_vertices(heads):
+    """Else the lids' many small vertices roll the lids off the eyeballs."""
+    areas = vertex_areas(heads.data.template_vertex_positions.astype(np.float64), heads.data.triangles)
+    upper, lower = regions.lips(heads.data)
+    members = {"lips-teeth": upper | lower, "tongue-gums": regions.tongue(heads.data)}
+    members |= {
+        "tongue-palate": regions.palate(heads.data),
+        "lids-eyeballs": regions.offset_regions(heads.data)["lids"],
+    }
+    weights = np.array([heads.weight(pair) for pair in members])
+    means = np.array([areas[vertices].mean() for vertices in members.values()])
+    # The penalty's lids are all skin near an eyeball.
+    np.testing.assert_allclose(weights[:3] / weights[0], means[:3] / means[0], rtol=1e-4)
+    assert weights[3] < 0.5 * weights[0] and 0.5 < weights[3] / weights[0] / (means[3] / means[0]) < 2
 
 
 @pytest.mark.parametrize("pair", ["lids-eyeballs", "lips-teeth", "tongue-teeth"])
