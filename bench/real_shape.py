@@ -1,11 +1,11 @@
 """Measure on real captures, leave-one-out, whether a model rebuilt from few subjects generalizes better.
 
-    python -m bench.real_shape CAPTURE... --model MODEL.npz --out OUT [--shrinkage chosen] [--by-area] [--no-mirrored]
+    python -m bench.real_shape CAPTURE... --model MODEL.npz --out OUT [--shrinkage 0.5] [--no-by-area] [--no-mirrored]
 
 Every neutral CAPTURE, with a scan, is registered with the `draft` recipe from MODEL into OUT/registrations; existing
 registrations are reused. Each subject in turn is held out: the next model is built from the other subjects' usable
-registrations and MODEL, and both models are fitted to the held-out subject with the same numbers of components, by two
-measures:
+registrations and MODEL, with the settings of `gnmreg coregister` unless options say otherwise, and both models are
+fitted to the held-out subject with the same numbers of components, by two measures:
 
 scan      distance of the scan's points of the face (as `gnmreg evaluate` selects them) from the model's surface, with
           all coefficients and the rigid motion free (`coregister.evaluate.scan_fit`): independent of the subject's
@@ -31,7 +31,7 @@ from coregister.evaluate.linear_fit import LinearFit, fit_correspondence, identi
 from coregister.evaluate.scan_fit import fit_scan, points_on_skin
 from coregister.next_model.build import build_model
 from coregister.next_model.identity import IdentitySettings
-from coregister.next_model.recipes import true_meshes
+from coregister.next_model.recipes import few_registrations
 from coregister.next_model.training_data import TrainingMesh, TrainingSubject, unpose
 from registration.capture.native import read_capture
 from registration.capture.scan import read_scan
@@ -119,7 +119,7 @@ def leave_one_out(
                 for index, (subject, (_, other)) in enumerate(zip(subjects, pairs, strict=True))
                 if index != number and other.status in USABLE
             ]
-            rebuilt = build_model(others, previous, replace(true_meshes(), identity=settings)).data
+            rebuilt = build_model(others, previous, replace(few_registrations(), identity=settings)).data
             errors.append([errors_mm(data, registration, points, counts) for data in (previous, rebuilt)])
     return np.array(errors)
 
@@ -145,9 +145,9 @@ def main() -> None:
     parser.add_argument("--out", required=True, type=Path)
     parser.add_argument("--components", type=int, nargs="*", default=[5, 10, 20, 40])
     parser.add_argument("--headline", type=int, default=20)
-    parser.add_argument("--shrinkage", default=str(true_meshes().identity.shrinkage))
+    parser.add_argument("--shrinkage", default="chosen", help="the share of MODEL (default: chosen)")
     for name in ("by-area", "mirrored"):
-        default = getattr(true_meshes().identity, name.replace("-", "_"))
+        default = getattr(few_registrations().identity, name.replace("-", "_"))
         parser.add_argument(f"--{name}", action=argparse.BooleanOptionalAction, default=default)
     options = parser.parse_args()
     pairs = register_all(options.captures, options.model, options.out)
