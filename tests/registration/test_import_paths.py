@@ -28,8 +28,9 @@ def test_others_are_refused(name: str, got: str) -> None:
 
 
 def test_what_a_function_refuses_is_reported_as_it_says(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    text = "from registration.fit.recipes import Recipe\ndef none():\n    return Recipe(name='mine', stages=(), levels=0)\n"
-    (tmp_path / "recipe_of_mine.py").write_text(text)
+    imports, function = "from registration.fit.recipes import Recipe", "def none():"
+    body = "    return Recipe(name='mine', stages=(), levels=0)"
+    (tmp_path / "recipe_of_mine.py").write_text("\n".join([imports, function, body]))
     monkeypatch.chdir(tmp_path)
     with pytest.raises(InputError, match="number of the recipe is out of range") as refused:
         load_named("recipe_of_mine:none", TABLE, int, title="number")
