@@ -22,6 +22,7 @@ from registration.evaluate.evaluation import RegistrationEvaluation, evaluate_re
 from registration.evaluate.folds import fold_figures
 from registration.evaluate.plausibility import plausibility
 from registration.evaluate.residuals import far_landmarks
+from registration.evaluate.reversed_skin import reversed_figures
 from registration.evaluate.verdict import judge
 from registration.evaluate.viewpoint import intersection_figures
 from registration.fit import camera_refinement
@@ -341,7 +342,7 @@ def _evaluate(
     evaluation: RegistrationEvaluation | None = None
     finite = np.isfinite(registration.vertices).all()
     if finite:
-        progress.message("auditing intersections between parts, and folds")
+        progress.message("auditing intersections between parts, folds and reversed skin")
         vertices = registration.vertices - inputs.origin if inputs.origin.any() else registration.vertices
         audit = audit_penetration(vertices, inputs.data, scale=float(registration.scale))
         shown = {view.name for view in comparison.views}
@@ -353,6 +354,7 @@ def _evaluate(
         figures = {
             "intersections": intersections,
             "folds": folds,
+            "reversed_skin": reversed_figures(vertices, inputs.data, cameras),
             **plausibility(registration, inputs.data, inputs.neutral),
         }
         if (far := far_landmarks(inputs.capture, registration.landmarks)) is not None:

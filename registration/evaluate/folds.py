@@ -4,9 +4,10 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 
 from registration.evaluate.names import SHARP_FOLD_DEG
+from registration.evaluate.places import named_places
 from registration.evaluate.viewpoint import best_view
 from registration.geometry.folds import Creases
 from registration.model import regions
@@ -30,26 +31,11 @@ def fold_figures(vertices: Float[np.ndarray, "V 3"], data: GNMData, cameras: Map
     """
     mesh, rest = vertices.astype(np.float64), data.template_vertex_positions
     sharp = Creases.of(data.triangles, rest, regions.exterior(data)).sharp(mesh, SHARP_FOLD_DEG)
-    left = rest[:, 0] > 0
     remaining, places = np.ones(len(sharp), bool), {}
-    for name, members in _places(data, left).items():
+    for name, members in named_places(data).items():
         here = members[sharp].any(1) & remaining
         remaining &= ~here
         if here.any():
             view = best_view(mesh[np.unique(sharp[here])], mesh.mean(0), cameras)
             places[name] = {"edges": int(here.sum()), "view": view}
     return {"edges": len(sharp), "places": places}
-
-
-def _places(data: GNMData, left: Bool[np.ndarray, "V"]) -> dict[str, Bool[np.ndarray, "V"]]:
-    """Parts of the skin by the name that a reader looks for; an edge belongs to the first one that it touches."""
-    own = regions.offset_regions(data)
-    sides = {"left": left, "right": ~left}
-    return {
-        **{f"{side} eye": own["lids"] & half for side, half in sides.items()},
-        "mouth": own["lips"],
-        "nose": regions.common_face(data)["nose"],
-        **{f"{side} ear": own["ears"] & half for side, half in sides.items()},
-        "neck": regions.neck_other(data),
-        "skin of the head": np.ones(len(left), bool),
-    }

@@ -8,6 +8,7 @@ Level = Literal["good", "look", "wrong"]
 LEVEL_TITLES: Mapping[Level, str] = {"good": "good", "look": "look at it", "wrong": "wrong"}
 TOLERANCE_MM = 0.3
 SHARP_FOLD_DEG = 120.0  # turn of the surface at an edge, beyond which it is a fold
+REVERSED_SKIN_MM2 = 2.0  # of skin that is turned inside out: good registrations have up to 1, rolled lids 3 to 20
 BEYOND_KEY = f"vertices_beyond_{TOLERANCE_MM}mm"  # of a penetration audit's figures
 
 

@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from registration.evaluate.names import RESIDUALS, Level
+from registration.evaluate.names import RESIDUALS, REVERSED_SKIN_MM2, Level
 from registration.types import Status
 
 _ORDER: tuple[Level, ...] = ("good", "look", "wrong")
@@ -43,6 +43,7 @@ RESIDUAL_LIMITS = {
 }
 LEAST_COVERAGE = 0.5  # of the head by depths that were made from the photographs
 INTERSECTION_LIMIT_MM = Limit(look=2.0)
+REVERSED_LIMIT_MM2 = Limit(look=REVERSED_SKIN_MM2)
 NOT_TRUSTED_LIMIT = Limit(look=0.0, wrong=0.5)  # fraction of the views
 _SCAN_PHRASES = {
     "median_mm": "half of the scan's face lies more than {:.2f} mm from the mesh",
@@ -85,7 +86,7 @@ def judge(status: Status, figures: Mapping[str, Any]) -> Verdict:
         found += [*_residuals(residuals), *_made(_mapping(figures.get("made")))]
     else:
         found.append(("look", "nothing measures the mesh: there is neither a scan of the face nor any image residual"))
-    found += _views(figures) + _intersections(figures)
+    found += _views(figures) + _intersections(figures) + _reversed_skin(figures)
     if warnings := figures.get("warnings"):
         found.append(
             (
@@ -159,3 +160,12 @@ def _intersections(figures: Mapping[str, Any]) -> list[tuple[Level, str]]:
     if name is None or INTERSECTION_LIMIT_MM.level(excess[name]) == "good":
         return []
     return [("look", f"parts of the mesh lie up to {excess[name]:.1f} mm inside one another ({name})")]
+
+
+def _reversed_skin(figures: Mapping[str, Any]) -> list[tuple[Level, str]]:
+    reversed_skin = _mapping(figures.get("reversed_skin"))
+    area = reversed_skin.get("area_mm2")
+    if not isinstance(area, int | float) or REVERSED_LIMIT_MM2.level(area) == "good":
+        return []
+    places = ", ".join(_mapping(reversed_skin.get("places")))
+    return [("look", f"{area:.0f} mm\u00b2 of the skin are turned inside out ({places})")]

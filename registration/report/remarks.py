@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from typing import Any, Protocol, runtime_checkable
 
-from registration.evaluate.names import BEYOND_KEY, SHARP_FOLD_DEG
+from registration.evaluate.names import BEYOND_KEY, REVERSED_SKIN_MM2, SHARP_FOLD_DEG
 from registration.types import METRIC_TITLES, Status
 
 # Pair of the penetration audit -> what lies where, and where to look.
@@ -79,6 +79,12 @@ def remarks(registration: Assessed) -> list[str]:
         if row.get(BEYOND_KEY)
     ]
     lines += _folds(figures.get("folds", {}).get("places", {}))
+    lines += [
+        f"The skin of the {place} is turned inside out: a camera sees {row['area_mm2']:.1f} mm\u00b2 of its inner side"
+        f"{_in_view(row.get('view'))}."
+        for place, row in figures.get("reversed_skin", {}).get("places", {}).items()
+        if row["area_mm2"] > REVERSED_SKIN_MM2
+    ]
     return lines
 
 

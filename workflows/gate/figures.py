@@ -47,6 +47,7 @@ class GateFigures:
     depth_mm: float | None = None
     intersections_mm: float | None = None
     intersecting_vertices: float | None = None
+    reversed_skin_mm2: float | None = None
     untrusted_percent: float | None = None
     warnings: float | None = None
     motion_mm: float | None = None
@@ -115,6 +116,9 @@ FIGURES: Mapping[str, FigureKind] = {
         meaning="vertices that lie too deep in another part",
         noise=10.0,
         digits=0,
+    ),
+    "reversed_skin_mm2": FigureKind(
+        title="reversed skin", unit="mm²", meaning="skin of eyes, mouth, nostrils and ears turned inside out", noise=0.3
     ),
     "untrusted_percent": FigureKind(
         title="views not trusted", unit="%", meaning="views that disagree with the others", noise=1.0, digits=0
@@ -217,6 +221,7 @@ def read_figures(figures: Mapping[str, Any]) -> GateFigures:
         far_landmarks_percent=at("far_landmarks", "percent"),
         intersections_mm=_largest([row.get("max_excess_mm") for row in counted]),
         intersecting_vertices=_sum([row.get(BEYOND_KEY) for row in counted]),
+        reversed_skin_mm2=at("reversed_skin", "area_mm2"),
         untrusted_percent=100 * untrusted / count if count else None,
         warnings=float(len(figures["warnings"])) if isinstance(figures.get("warnings"), list | tuple) else 0.0,
         motion_mm=at("motion_mm"),

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from registration.errors import check_seed
+from registration.evaluate.names import REVERSED_SKIN_MM2
 from registration.storage.records import Record
 from workflows.gate.figures import FIGURES, Assessed, GateFigures
 
@@ -87,6 +88,7 @@ class GateThresholds(
     depth_mm: Limit = _limit(0.6, 5.0)
     intersections_mm: Limit = _limit(6.0)
     intersecting_vertices: Limit = _limit(400.0)
+    reversed_skin_mm2: Limit = _limit(REVERSED_SKIN_MM2)
     untrusted_percent: Limit = _limit(0.0, 60.0)
     warnings: Limit = _limit(0.0)
     motion_mm: Limit = _limit(None)

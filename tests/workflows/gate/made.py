@@ -33,6 +33,7 @@ def figures(worst: str = "", factor: float = 1.0, **residuals: float) -> dict[st
         "views_not_trusted": {},
         "motion_mm": 0.01,
         "intersections": {"pairs": {"lips in teeth": {"max_excess_mm": 0.4, "vertices_beyond_0.3mm": 2}}},
+        "reversed_skin": {"area_mm2": 0.0, "places": {}},
         "from_model": {"identity_sigmas": 0.8, "expression_sigmas": 0.5, "offset_sigmas": 0.2, "size_percent": 1.0},
     }
 

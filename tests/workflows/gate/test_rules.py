@@ -78,11 +78,13 @@ def test_figures_are_read_from_a_manifest(tmp_path):
     values = made.figures("labels_percent", 4.0)
     values |= {"views_not_trusted": {"cam1": "it disagrees"}, "warnings": ["one"]}
     values |= {"scan_to_mesh": {"face": {"mean_mm": 0.25}}, "from_neutral": {"offsets_mm": 0.3, "texture": 0.1}}
+    values |= {"reversed_skin": {"area_mm2": 2.5, "places": {}}}
     values["intersections"]["pairs"]["tongue in teeth"] = {"max_excess_mm": 9.0, "vertices_beyond_0.3mm": 90}
     read = assess(read_manifest(made.write(tmp_path / "r", **values))).figures
     assert (read.worst_labels_percent, read.labels_percent, read.scan_mm) == (8.0, 2.0, 0.25)
     assert (read.untrusted_percent, read.warnings, read.neutral_offsets_mm) == (25.0, 1.0, 0.3)
     assert (read.intersections_mm, read.intersecting_vertices, read.neutral_texture) == (0.4, 2.0, 0.1)
+    assert read.reversed_skin_mm2 == 2.5
 
 
 @pytest.mark.parametrize("value", ["3", None, float("nan"), True, [1.0], {"a": 1}])
