@@ -37,7 +37,7 @@ def reversed_figures(
     """
     mesh, triangles = vertices.astype(np.float64), data.triangles.astype(np.int64)
     places = {name: members[triangles].any(1) for name, members in fine_places(data).items()}
-    audited = regions.exterior(data)[triangles].all(1) & np.any(list(places.values()), axis=0)
+    audited = regions.exterior(data)[triangles].all(1) & np.stack(list(places.values())).any(0)
     corners = mesh[triangles]
     normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     caster, members = RayCaster(mesh, triangles), mesh[np.unique(triangles[audited])]
