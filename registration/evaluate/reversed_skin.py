@@ -36,8 +36,10 @@ def reversed_figures(
         most of it, and that view; and the sum over the places.
     """
     mesh, triangles = vertices.astype(np.float64), data.triangles.astype(np.int64)
-    places = {name: members[triangles].any(1) for name, members in fine_places(data).items()}
-    audited = regions.exterior(data)[triangles].all(1) & np.stack(list(places.values())).any(0)
+    fine = fine_places(data)
+    # (K, F): whether a face belongs to a place
+    belongs = np.asarray(np.stack(list(fine.values()))[:, triangles].any(2))
+    audited = np.asarray(regions.exterior(data)[triangles].all(1) & belongs.any(0))
     corners = mesh[triangles]
     normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     caster, members = RayCaster(mesh, triangles), mesh[np.unique(triangles[audited])]
@@ -47,9 +49,10 @@ def reversed_figures(
         face = caster.rasterize(window)[0]
         face = face[(face >= 0) & audited[face]]
         ray = camera.centre - corners[face, 0]
-        face, ray = (values[(ray * normal[face]).sum(1) < 0] for values in (face, ray))
+        inner = (ray * normal[face]).sum(1) < 0
+        face, ray = face[inner], ray[inner]
         pixel_mm2 = (ray**2).sum(1) * MM_PER_M**2 / (window.intrinsics[0, 0] * window.intrinsics[1, 1])
-        for place, inside in places.items():
+        for place, inside in zip(fine, belongs, strict=True):
             area_mm2 = float(pixel_mm2[inside[face]].sum())
             if area_mm2 > figures.get(place, {"area_mm2": 0.0})["area_mm2"]:
                 figures[place] = {"area_mm2": area_mm2, "view": view}
