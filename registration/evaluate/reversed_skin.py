@@ -33,7 +33,7 @@ def reversed_figures(
 
     Returns:
         The entry of the manifest: of each place that has any, the area across the line of sight in the view that shows
-        most of it, and that view; and the sum over the places.
+        most of it, and that view; and the sum over the places, None without a camera.
     """
     mesh, triangles = vertices.astype(np.float64), data.triangles.astype(np.int64)
     fine = fine_places(data)
@@ -56,7 +56,8 @@ def reversed_figures(
             area_mm2 = float(pixel_mm2[inside[face]].sum())
             if area_mm2 > figures.get(place, {"area_mm2": 0.0})["area_mm2"]:
                 figures[place] = {"area_mm2": area_mm2, "view": view}
-    return {"area_mm2": float(sum(place["area_mm2"] for place in figures.values())), "places": figures}
+    total = float(sum(place["area_mm2"] for place in figures.values()))
+    return {"area_mm2": total if cameras else None, "places": figures}
 
 
 def _window(camera: Camera, points: Float[np.ndarray, "P 3"]) -> Camera:
