@@ -117,6 +117,8 @@ def main() -> None:
             for _ in range(options.repeats):
                 for sources, repeats in runs.items():
                     repeats.append(measure(capture, options.model.resolve(), recipe, sources))
+                    cpu_seconds = repeats[-1].cpu_seconds
+                    errors.print(f"{'/'.join(capture.parts[-2:])} {recipe} {sources.name}: {cpu_seconds:.0f} CPU s")
                     if repeats[-1].error:
                         errors.print(repeats[-1].error, markup=False)
             for sources, repeats in runs.items():
