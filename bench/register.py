@@ -108,6 +108,11 @@ def main() -> None:
     parser.add_argument("--repeats", type=int, default=1)
     parser.add_argument("--sources", nargs="+", type=Path, default=[_HERE], metavar="CHECKOUT")
     options = parser.parse_args()
+    if options.repeats < 1:
+        parser.error(f"--repeats must be 1 or more, not {options.repeats}")
+    for sources in options.sources:  # else the installed version would be measured in its place
+        if not (sources / "workflows" / "cli").is_dir():
+            parser.error(f"--sources {sources} is no root folder of a checkout: it has no workflows/cli")
     heads = ("capture", "recipe", "sources", "status", "s", "CPU s", "face, mm", "median", "p95", "vertices", "folds")
     title = f"medians of {options.repeats}, {os.cpu_count()} cores; scan to mesh and vertex error on the face"
     table, errors = Table(*heads, "peak GB", title=title), Console(stderr=True)

@@ -138,6 +138,8 @@ def main() -> None:
     parser.add_argument("--views", type=int, default=12)
     parser.add_argument("--size", type=int, nargs=2, default=(360, 540), metavar=("W", "H"))
     options = parser.parse_args()
+    if (shortest := min(options.length_mm)) <= 0:
+        parser.error(f"--length-mm must be above 0, not {shortest:g}")
     model = build.bootstrap()
     data = gnm_npz.read(model)
     table = Table("waves, mm", "region", "vertices", "of them resolved", "gain", "stated", title=options.recipe)
