@@ -22,10 +22,10 @@ def fine_places(data: GNMData) -> dict[str, Bool[np.ndarray, "V"]]:
 def named_places(data: GNMData) -> dict[str, Bool[np.ndarray, "V"]]:
     """Return places that cover the whole skin. They overlap: what is in several belongs to the first of them."""
     fine = fine_places(data)
+    del fine["nostrils"]  # a part of the nose
     return {
-        **{name: members for name, members in fine.items() if "eye" in name or name == "mouth"},
+        **fine,
         "nose": regions.common_face(data)["nose"],
-        **{name: members for name, members in fine.items() if "ear" in name},
         "neck": regions.neck_other(data),
         "skin of the head": np.ones(len(data.template_vertex_positions), bool),
     }

@@ -7,22 +7,12 @@ from registration.evaluate.folds import fold_figures
 from registration.geometry.folds import Creases
 from registration.model import regions
 from registration.report.remarks import remarks
-from registration.types import Camera
 from tests.fixtures.make_fixtures import tiny_model
+from tests.registration.evaluate.cameras import looking_at
 from tests.registration.report.test_page import a_registration
 
 DATA = tiny_model()
 REST = DATA.template_vertex_positions.astype(np.float64)
-
-
-def camera(towards: np.ndarray) -> Camera:
-    """A camera 1 m from the head's middle in a horizontal direction, that looks at it."""
-    middle, out = REST.mean(0), towards / np.linalg.norm(towards)
-    pose = np.eye(4)
-    pose[:3, :3] = [np.cross([0.0, 1.0, 0.0], out), [0.0, -1.0, 0.0], -out]
-    pose[:3, 3] = -pose[:3, :3] @ (middle + out)
-    intrinsics = np.array([[400.0, 0, 200], [0, 400, 200], [0, 0, 1]])
-    return Camera(width_px=400, height_px=400, intrinsics=intrinsics, T_cam_world=pose)
 
 
 def folded(members: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -46,7 +36,10 @@ def test_the_template_has_none():
 
 @pytest.mark.parametrize(("side", "sign"), [("left", 1.0), ("right", -1.0)])
 def test_a_fold_of_a_lid_is_found_there_in_the_view_that_looks_at_it(side, sign):
-    cameras = {name: camera(np.array([x, 0.0, 1.0])) for name, x in (("from left", 1.0), ("from right", -1.0))}
+    cameras = {
+        name: looking_at(REST.mean(0), np.array([x, 0.0, 1.0]), 1.0, 400)
+        for name, x in (("from left", 1.0), ("from right", -1.0))
+    }
     lids = regions.offset_regions(DATA)["lids"] & (sign * REST[:, 0] > 0)
     mesh, sharp = folded(lids)
     figures = fold_figures(mesh, DATA, cameras)

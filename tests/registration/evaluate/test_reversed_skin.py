@@ -9,22 +9,19 @@ from registration.model import regions
 from registration.model.gnm_npz import GNMData
 from registration.report.remarks import remarks
 from registration.types import Camera
+from tests.registration.evaluate.cameras import looking_at
 from tests.registration.report.test_page import a_registration
 
 GOOD = {"scan_to_mesh": {"face": {"mean_mm": 0.1, "median_mm": 0.05, "p95_mm": 0.3}}}
 
 
 def around(mesh: np.ndarray, size_px: int = 500) -> dict[str, Camera]:
-    """Cameras half a metre from the head's middle, that look at it from five sides."""
-    cameras, middle = {}, mesh.mean(0)
-    for degrees in (-90, -45, 0, 45, 90):
-        out = np.array([np.sin(np.radians(degrees)), 0.0, np.cos(np.radians(degrees))])
-        pose = np.eye(4)
-        pose[:3, :3] = [np.cross([0.0, 1.0, 0.0], out), [0.0, -1.0, 0.0], -out]
-        pose[:3, 3] = -pose[:3, :3] @ (middle + 0.8 * out)
-        intrinsics = np.array([[size_px, 0, size_px / 2], [0, size_px, size_px / 2], [0, 0, 1.0]])
-        cameras[f"at {degrees}"] = Camera(width_px=size_px, height_px=size_px, intrinsics=intrinsics, T_cam_world=pose)
-    return cameras
+    """Cameras that look at the head from five sides."""
+    angles = {degrees: np.radians(degrees) for degrees in (-90, -45, 0, 45, 90)}
+    return {
+        f"at {degrees}": looking_at(mesh.mean(0), np.array([np.sin(a), 0.0, np.cos(a)]), 0.8, size_px)
+        for degrees, a in angles.items()
+    }
 
 
 @pytest.fixture(scope="module")
