@@ -41,6 +41,7 @@ from registration.types import Registration
 _FADE_RINGS = 3  # of vertices over which waves fade at rims
 _FACING = 0.6  # largest component of a normal along the waves, of skin that is measured: elsewhere they are longer
 _RESOLVED = 0.25  # longest edge along the waves, of their length, of a vertex that is measured
+_FEWEST = 10  # vertices of which a gain says something
 _ACROSS = np.array([1.0, 0.0, 0.0])  # direction of the waves
 
 
@@ -149,9 +150,12 @@ def main() -> None:
         resolved = head.resolved()
         for name, members in head.regions().items():
             measured = members & resolved
-            gains = head.gain(result.vertices, measured), head.stated_gain(load_recipe(options.recipe), measured)
             counts = str(members.sum()), str(measured.sum())
-            table.add_row(f"{length_mm:g}", name, *counts, *(f"{gain:.2f}" for gain in gains))
+            cells = ["-", "-"]
+            if measured.sum() >= _FEWEST:
+                gains = head.gain(result.vertices, measured), head.stated_gain(load_recipe(options.recipe), measured)
+                cells = [f"{gain:.2f}" for gain in gains]
+            table.add_row(f"{length_mm:g}", name, *counts, *cells)
     Console(width=80).print(table)
 
 
