@@ -5,10 +5,10 @@
 Neutrals of any adult age and build, 8 views of 256 x 256 px (`gnmreg dataset synth`), are registered, and every vertex
 is compared with where it truly is, in the capture's world. Along: the part of the difference in the tangent plane of
 the true surface; across: the distance from the true surface. Root mean squares in mm over the vertices, then over the
-subjects, with the standard error of the subjects' own: on the head's skin, its face, and the neck with the chest; and
-of those vertices that a camera sees. Sharp folds: the mean number in a subject's outer skin. The second table is a
-bound: the model's most probable parameters, given the true vertices of the head's skin and the true surface of the
-neck. With the same --out an interrupted run is resumed.
+subjects, with the standard error of the subjects' own: on the head's skin, its face, lips, lids and ears, and the neck
+with the chest; and of those vertices that a camera sees. Sharp folds: the mean number in a subject's outer skin. The
+second table is a bound: the model's most probable parameters, given the true vertices of the head's skin and the true
+surface of the neck. With the same --out an interrupted run is resumed.
 """
 
 import argparse
@@ -78,6 +78,8 @@ def table(errors: list[Errors], data: GNMData, title: str) -> Table:
     """Return the figures of all subjects."""
     head, neck = regions.head_skin(data), regions.exterior(data) & regions.neck_other(data)
     places = {"head": head, "face": regions.common_face(data)["face"], "neck": neck}
+    detailed = regions.offset_regions(data)
+    places |= {name: head & detailed[name] for name in ("lips", "lids", "ears")}
     shown = Table("skin", "along, mm", "across, mm", "seen: along", "seen: across", title=title)
     for place, members in places.items():
         cells = []

@@ -1,17 +1,19 @@
 """Measure the opening of the eyelids of registered synthetic people whose eyes are closed, half closed or open.
 
-    python -m bench.lids [--expressions blink half_blink neutral] [--given images normals] [--seed 8]
+    python -m bench.lids [--expressions blink half_blink neutral] [--given images normals] [--seeds 8 9] [--keep DIR]
 
 Each person is rendered (`gnmreg capture synth`) and registered from photographs and cameras alone, or with normals and
 masks but neither labels nor landmarks. The opening is the mean distance between three points of the upper and of the
 lower lid of the first model, in the truth and in the registration, mm; negative where the upper lid's points lie below
-the lower lid's. The truth of `blink` is -2.89 and -3.23: the upper lid covers the edge of the lower one.
+the lower lid's, as in `blink`, where the upper lid covers the edge of the lower one by about 3 mm. With --keep,
+captures and registrations stay in that folder, and captures that are there already are used.
 """
 
 import argparse
 import shutil
 import tempfile
 from collections.abc import Sequence
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -44,6 +46,8 @@ def opening_mm(scheme: LandmarkScheme, vertices: Float[np.ndarray, "V 3"], side:
 def measure(whole: Path, given: str, recipe: str, work: Path) -> tuple[str, Sequence[tuple[float, float]]]:
     """Register a capture with some of its channels; status, and truth and result (mm) of both sides."""
     target, out = work / f"{whole.name}_{given}", work / f"{whole.name}_{given}_out"
+    for folder in (target, out):
+        shutil.rmtree(folder, ignore_errors=True)
     target.mkdir()
     for name in (*_ALWAYS, *GIVEN[given]):
         source = whole / name
@@ -62,22 +66,23 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--expressions", nargs="+", default=["blink", "half_blink", "neutral"])
     parser.add_argument("--given", nargs="+", choices=GIVEN, default=list(GIVEN))
-    parser.add_argument("--seed", type=int, default=8)
+    parser.add_argument("--seeds", nargs="+", type=int, default=[8])
     parser.add_argument("--recipe", default="draft")
+    parser.add_argument("--keep", type=Path, metavar="DIR", help="keep captures and registrations in this folder")
     options = parser.parse_args()
     console = Console(width=120)
-    table = Table(
-        "expression", "given", "status", *(f"{side}: {what}" for side in LIDS for what in ("truth", "result"))
-    )
-    with tempfile.TemporaryDirectory() as folder:
-        for expression in options.expressions:
-            whole = Path(folder) / expression
-            run_command(["capture", "synth", str(whole), "--seed", str(options.seed), "--expression", expression])
-            for given in options.given:
-                status, sides = measure(whole, given, options.recipe, Path(folder))
-                cells = (expression, given, status, *(f"{value:.2f}" for pair in sides for value in pair))
-                console.print(" | ".join(cells))
-                table.add_row(*cells)
+    sides = (f"{side}: {what}" for side in LIDS for what in ("truth", "result"))
+    table = Table("seed", "expression", "given", "status", *sides)
+    with tempfile.TemporaryDirectory() as temporary:
+        folder = options.keep or Path(temporary)
+        for seed, expression, given in product(options.seeds, options.expressions, options.given):
+            whole = folder / f"{expression}_{seed}"
+            if not whole.exists():
+                run_command(["capture", "synth", str(whole), "--seed", str(seed), "--expression", expression])
+            status, openings = measure(whole, given, options.recipe, folder)
+            cells = (str(seed), expression, given, status, *(f"{value:.2f}" for pair in openings for value in pair))
+            console.print(" | ".join(cells))
+            table.add_row(*cells)
     console.print(table)
 
 

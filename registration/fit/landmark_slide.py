@@ -6,7 +6,8 @@ do that: its size follows from the largest gradients, and landmarks strong enoug
 leave the surface less of it (docs/recipes.md, "Landmarks").
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -14,18 +15,27 @@ from jaxtyping import Bool, Float
 from registration.fit.context import FitContext
 from registration.fit.initialization import UNKNOWN_SPREAD_M
 from registration.fit.variables import Variables
+from registration.geometry.rasterizer import RayCaster
 from registration.geometry.surface_field import FieldPrior, expected_field
 from registration.geometry.topology import vertex_normals
+from registration.model.gnm_npz import GNMData
+from registration.model.regions import eyeball_shells, lids_by_eye
+from registration.types import Camera
 
 # Of the model's people and others: 0.93 mm along the skin, in two directions.
 PRIOR = FieldPrior(deviation_m=0.7e-3, range_m=70e-3)
 _LEAST_SPREAD_M = 0.1e-3  # of a landmark: edges are a millimetre long
+_OPEN_EYE = 0.03  # of an eyeball's vertices that a camera sees; of a half-closed eye 0.1, of an open one a third
 
 
 def slide_to_landmarks(
     context: FitContext, variables: Variables, landmarks_used: Mapping[str, Bool[np.ndarray, "L"]]
 ) -> None:
     """Displace the skin along itself towards the triangulated landmarks, between two stages.
+
+    A landmark whose point on the mesh no view sees does not count: between closed lids or lips a detector marks the
+    line that it sees, not the edge that is covered. Nor does one on the lids of a closed eye, where detectors are
+    several times farther off than their spread says, which is that of open eyes.
 
     Args:
         context: with the landmarks, and how far they may be off.
@@ -38,13 +48,17 @@ def slide_to_landmarks(
     skin = variables.skin
     row = np.full(len(mesh), -1)
     row[skin] = np.arange(len(skin))
+    sight = _Sight(mesh=RayCaster(mesh, context.data.triangles), cameras=context.pyramid[0].pixels.cameras)
+    closed_lids = _closed_lids(context.data, mesh, sight)
     indices, weights, observed, spread = [], [], [], []
     for name, points in context.triangulated.items():
         scheme, stated = context.schemes[name], context.landmark_spread_m(name)
         known = np.full(len(points), UNKNOWN_SPREAD_M) if stated is None else np.maximum(stated, _LEAST_SPREAD_M)
         corners = row[scheme.indices]
         used = landmarks_used[name] & np.isfinite(points).all(1) & np.isfinite(known) & (corners >= 0).all(1)
-        difference = points - scheme.points(mesh)
+        places = scheme.points(mesh)
+        used &= sight.seen(places) & ~closed_lids[scheme.indices].any(1)
+        difference = points - places
         indices.append(corners[used])
         weights.append(scheme.weights[used])
         observed.append(_along(difference, scheme.points(normals))[used])
@@ -63,6 +77,27 @@ def slide_to_landmarks(
     displacement = np.zeros_like(mesh)
     displacement[skin] = _along(field, normals[skin])
     variables.move_skin(displacement)
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Sight:
+    """What the capture's cameras see of the mesh."""
+
+    mesh: RayCaster
+    cameras: Sequence[Camera]
+
+    def seen(self, points: Float[np.ndarray, "P 3"]) -> Bool[np.ndarray, "P"]:
+        """Whether a camera sees a point with nothing of the mesh in front of it."""
+        return np.any([self.mesh.visible(points, camera) for camera in self.cameras], axis=0)
+
+
+def _closed_lids(data: GNMData, mesh: Float[np.ndarray, "V 3"], sight: _Sight) -> Bool[np.ndarray, "V"]:
+    """The skin around the eyes of which no camera sees more than a trace."""
+    closed = np.zeros(len(mesh), bool)
+    for ball, lids in zip(eyeball_shells(data), lids_by_eye(data), strict=True):
+        if sight.seen(mesh[ball]).mean() < _OPEN_EYE:
+            closed |= lids > 0
+    return closed
 
 
 def _along(vectors: Float[np.ndarray, "N 3"], normals: Float[np.ndarray, "N 3"]) -> Float[np.ndarray, "N 3"]:

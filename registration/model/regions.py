@@ -193,8 +193,13 @@ def mouth_lining(data: GNMData) -> Bool[np.ndarray, "V"]:
 
 def lids(data: GNMData) -> Float[np.ndarray, "V"]:
     """The skin that slides and folds over the eyeballs: 1 within 3 mm of them, 0 beyond 9 mm."""
-    balls = np.maximum(group(data, "left_eye"), group(data, "right_eye")) > _INSIDE
-    return exterior(data) * _nearness(data, balls, 3e-3, 9e-3)
+    return np.maximum(*lids_by_eye(data))
+
+
+def lids_by_eye(data: GNMData) -> tuple[Float[np.ndarray, "V"], Float[np.ndarray, "V"]]:
+    """The lids, as `lids`, of the left and of the right eyeball."""
+    left, right = (exterior(data) * _nearness(data, ball, 3e-3, 9e-3) for ball in eyeballs(data))
+    return left, right
 
 
 def inner_lips(data: GNMData) -> Float[np.ndarray, "V"]:

@@ -19,12 +19,14 @@ from registration.fit.terms import StageContext, StepState, Term
 from registration.fit.terms import image as image_terms
 from registration.fit.variables import InitialGuess
 from registration.geometry.nearest_planes import MeshPlanes
+from registration.geometry.rasterizer import visible
 from registration.geometry.surface_views import SurfaceViews
 from registration.geometry.topology import vertex_normals
 from registration.inputs import RegistrationInputs, read_inputs
 from registration.model.atlas import texture_atlas
 from registration.model.gnm import GNM
-from registration.model.regions import offset_regions
+from registration.model.landmarks import LandmarkScheme
+from registration.model.regions import lids_by_eye, offset_regions
 from registration.options import RegisterOptions
 from registration.render import backend
 from registration.targets.classes import class_map
@@ -211,10 +213,14 @@ def test_offsets_are_a_latent_only_while_a_stage_runs(context: FitContext, initi
     assert problem.variables.skin_offsets().any()
 
 
-def landmarks_beside(problem: FitProblem, spread_m: float) -> tuple[FitContext, np.ndarray]:
+def landmarks_beside(
+    problem: FitProblem, spread_m: float, scheme: LandmarkScheme | None = None
+) -> tuple[FitContext, np.ndarray]:
     """The problem's context with landmarks 1 mm to the side and 1 mm before the mesh's; and where they are."""
-    scheme, context = problem.context.schemes["68"], problem.context
-    points = scheme.points(problem.vertices().double().numpy()) + np.array([1e-3, 0.0, 1e-3])
+    context = problem.context
+    if scheme is not None:
+        context = replace(context, schemes={"68": scheme})
+    points = context.schemes["68"].points(problem.vertices().double().numpy()) + np.array([1e-3, 0.0, 1e-3])
     spread = np.full(len(points), spread_m)
     return replace(context, triangulated={"68": points}, triangulated_spread_m={"68": spread}), points
 
@@ -249,6 +255,41 @@ def test_landmarks_that_are_outliers_or_missing_move_nothing(context: FitContext
     missing = replace(with_landmarks, triangulated={"68": np.full_like(points, np.nan)})
     slide_to_landmarks(missing, problem.variables, problem.landmarks_used)
     torch.testing.assert_close(problem.vertices(), before, atol=1e-7, rtol=0)
+
+
+@pytest.mark.parametrize("seen", [True, False])
+def test_landmarks_of_skin_that_no_view_sees_move_nothing(
+    context: FitContext, initial: InitialGuess, seen: bool
+) -> None:
+    """Skin that lies 3 mm behind other skin in every view, or skin that a view sees."""
+    problem = FitProblem(context, initial)
+    mesh = problem.vertices().double().numpy()
+    views = [visible(mesh, mesh, context.data.triangles, camera, 3e-3) for camera in problem.pyramid[0].pixels.cameras]
+    places = np.flatnonzero(np.any(views, axis=0) == seen)
+    corners = np.intersect1d(places, problem.variables.skin)[:20, None].repeat(3, axis=1)
+    scheme = LandmarkScheme(name="68", indices=corners, weights=np.full((len(corners), 3), 1 / 3))
+    with_landmarks, _ = landmarks_beside(problem, 1e-4, scheme)
+    slide_to_landmarks(with_landmarks, problem.variables, {"68": np.ones(len(corners), bool)})
+    moved = (problem.vertices() - torch.as_tensor(mesh)).norm(dim=-1).max()
+    assert len(corners) == 20 and (moved > 5e-4) == seen
+
+
+@pytest.mark.parametrize("closed", [True, False])
+def test_landmarks_on_the_lids_of_an_eye_that_no_view_sees_move_nothing(
+    context: FitContext, initial: InitialGuess, closed: bool
+) -> None:
+    """An eyeball behind the forehead is not seen, as between closed lids."""
+    problem = FitProblem(context, initial)
+    if closed:
+        problem.variables["eyes"][0, :3] = torch.tensor([0.0, 0.05, -0.06])
+    before = problem.vertices()
+    left, right = (np.flatnonzero(lids > 0) for lids in lids_by_eye(context.data))
+    for lids, moves in ((left, not closed), (right, True)):
+        corners = lids[:, None].repeat(3, axis=1)
+        scheme = LandmarkScheme(name="68", indices=corners, weights=np.full((len(lids), 3), 1 / 3))
+        with_landmarks, _ = landmarks_beside(problem, 1e-4, scheme)
+        slide_to_landmarks(with_landmarks, problem.variables, {"68": np.ones(len(lids), bool)})
+        assert bool((problem.vertices() - before).norm(dim=-1).max() > 2e-4) == moves
 
 
 def test_recipes_slide_once_and_not_for_expressions() -> None:
