@@ -7,7 +7,6 @@ leave the surface less of it (docs/recipes.md, "Landmarks").
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -42,14 +41,16 @@ def slide_to_landmarks(
         variables: their offsets take up the motion.
         landmarks_used: scheme -> landmarks that are no outliers.
     """
+    if not context.triangulated:
+        return
     vertices = variables.vertices(variables.skin_offsets()).detach()
     normals = vertex_normals(vertices, context.triangles).double().cpu().numpy()
     mesh = vertices.double().cpu().numpy()
     skin = variables.skin
     row = np.full(len(mesh), -1)
     row[skin] = np.arange(len(skin))
-    sight = _Sight(mesh=RayCaster(mesh, context.data.triangles), cameras=context.pyramid[0].pixels.cameras)
-    closed_lids = _closed_lids(context.data, mesh, sight)
+    caster, cameras = RayCaster(mesh, context.data.triangles), context.pyramid[0].pixels.cameras
+    closed_lids = _closed_lids(context.data, mesh, caster, cameras)
     indices, weights, observed, spread = [], [], [], []
     for name, points in context.triangulated.items():
         scheme, stated = context.schemes[name], context.landmark_spread_m(name)
@@ -57,14 +58,12 @@ def slide_to_landmarks(
         corners = row[scheme.indices]
         used = landmarks_used[name] & np.isfinite(points).all(1) & np.isfinite(known) & (corners >= 0).all(1)
         places = scheme.points(mesh)
-        used &= sight.seen(places) & ~closed_lids[scheme.indices].any(1)
+        used &= caster.visible_to_any(places, cameras) & ~closed_lids[scheme.indices].any(1)
         difference = points - places
         indices.append(corners[used])
         weights.append(scheme.weights[used])
         observed.append(_along(difference, scheme.points(normals))[used])
         spread.append(known[used])
-    if not observed:
-        return
     field = expected_field(
         context.skin.triangles,
         context.skin.points.astype(np.float64),
@@ -79,23 +78,13 @@ def slide_to_landmarks(
     variables.move_skin(displacement)
 
 
-@dataclass(frozen=True, kw_only=True)
-class _Sight:
-    """What the capture's cameras see of the mesh."""
-
-    mesh: RayCaster
-    cameras: Sequence[Camera]
-
-    def seen(self, points: Float[np.ndarray, "P 3"]) -> Bool[np.ndarray, "P"]:
-        """Whether a camera sees a point with nothing of the mesh in front of it."""
-        return np.any([self.mesh.visible(points, camera) for camera in self.cameras], axis=0)
-
-
-def _closed_lids(data: GNMData, mesh: Float[np.ndarray, "V 3"], sight: _Sight) -> Bool[np.ndarray, "V"]:
+def _closed_lids(
+    data: GNMData, vertices: Float[np.ndarray, "V 3"], mesh: RayCaster, cameras: Sequence[Camera]
+) -> Bool[np.ndarray, "V"]:
     """The skin around the eyes of which no camera sees more than a trace."""
-    closed = np.zeros(len(mesh), bool)
+    closed = np.zeros(len(vertices), bool)
     for ball, lids in zip(eyeball_shells(data), lids_by_eye(data), strict=True):
-        if sight.seen(mesh[ball]).mean() < _OPEN_EYE:
+        if mesh.visible_to_any(vertices[ball], cameras).mean() < _OPEN_EYE:
             closed |= lids > 0
     return closed
 

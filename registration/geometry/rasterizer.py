@@ -5,6 +5,8 @@ with coordinates relative to the mesh's centre; barycentrics are computed in flo
 within 1e-7 of its length may hit or miss; these are some in a million. Lens distortion is ignored.
 """
 
+from collections.abc import Sequence
+
 import lagrange
 import numpy as np
 import torch
@@ -51,6 +53,13 @@ class RayCaster:
         rays = self._origins(camera, len(rows)), (points[rows] - camera.centre).astype(np.float32)
         near, far = NEAR / depth[rows], 1 - tolerance / depth[rows]
         seen[rows] = ~self._caster.occluded(*rays, near.astype(np.float32), far.astype(np.float32))
+        return seen
+
+    def visible_to_any(self, points: Float[np.ndarray, "P 3"], cameras: Sequence[Camera]) -> Bool[np.ndarray, "P"]:
+        """Test which points at least one camera sees, as `visible`."""
+        seen = np.zeros(len(points), bool)
+        for camera in cameras:
+            seen |= self.visible(points, camera)
         return seen
 
     def rasterize(self, camera: Camera) -> tuple[Int[np.ndarray, "H W"], Float[np.ndarray, "H W 3"]]:
