@@ -23,6 +23,7 @@ from rich.table import Table
 
 from bench.photographs import run_command
 from coregister.first_model import build
+from coregister.synthetic.expressions import EXPRESSIONS
 from registration.model import gnm_npz
 from registration.model.landmarks import LandmarkScheme, shipped_schemes
 from registration.storage.registration_folder import load_registration
@@ -64,7 +65,8 @@ def measure(whole: Path, given: str, recipe: str, work: Path) -> tuple[str, Sequ
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--expressions", nargs="+", default=["blink", "half_blink", "neutral"])
+    names = ["blink", "half_blink", "neutral"]
+    parser.add_argument("--expressions", nargs="+", choices=EXPRESSIONS, metavar="NAME", default=names)
     parser.add_argument("--given", nargs="+", choices=GIVEN, default=list(GIVEN))
     parser.add_argument("--seeds", nargs="+", type=int, default=[8])
     parser.add_argument("--recipe", default="draft")
